@@ -205,6 +205,14 @@ def test_copter_neutral_is_where_its_parameters_say() -> None:
     assert copter.gimbal.angles == (0.0, -30.0, 0.0)
 
 
+def test_copter_armed_in_throw_waits_for_the_throw() -> None:
+    _, client = ready_copter()
+    client.command(MavCmd.DO_SET_MODE, 1, CopterMode.THROW)
+    assert client.command(ARM, 1, 21196) == MavResult.ACCEPTED
+    client.run(3.0)
+    assert client.texts == ["Arming motors", "waiting for throw"]
+
+
 @pytest.mark.anyio
 async def test_copter_reboot_closes_its_tcp_connections() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, parameter_count=100)

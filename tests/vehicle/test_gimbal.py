@@ -234,6 +234,18 @@ async def test_home_is_set_where_no_command_int_is_known() -> None:
         assert kinds == [m.CommandInt, m.CommandLong]
 
 
+async def test_home_of_px4_is_set_in_the_one_frame_that_it_takes() -> None:
+    async with simulated_link(SimulatedPx4(boot_time_s=1.0)) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+        home = vehicle.home.value.position
+        there = home.offset(north_m=50.0)
+        wanted = Position(
+            there.latitude_deg, there.longitude_deg, altitude_amsl_m=vehicle.home.value.altitude_amsl_m
+        )
+        await vehicle.set_home(wanted)
+        assert vehicle.home.value.position.distance_to(wanted) < 0.1
+
+
 async def test_what_another_station_is_denied_is_no_reason_to_claim_control() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         flight.copter.faults.ignore(PITCHYAW, times=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode, MavSeverity
@@ -64,6 +65,14 @@ class Throw(_Holding):
 
     number: ClassVar[int] = CopterMode.THROW
     name = "THROW"
+    _told_at = -math.inf
+
+    def update(self, dt: float) -> None:
+        """Says so once after each arming."""
+        if self._told_at < self.copter.motors.armed_at:
+            self._told_at = self.copter.now
+            self.copter.info("waiting for throw")
+        super().update(dt)
 
 
 class AvoidAdsb(_Holding):
