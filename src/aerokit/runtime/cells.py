@@ -59,6 +59,7 @@ class StateCell(Generic[T]):
         "_changes",
         "_clock",
         "_closed_by",
+        "_explain_timeout",
         "_feeds",
         "_is_followed",
         "_known",
@@ -67,7 +68,6 @@ class StateCell(Generic[T]):
         "_source",
         "_stamp",
         "_updated_at",
-        "_explain_timeout",
         "name",
         "waits_for",
     )
