@@ -63,10 +63,11 @@ async def test_one_of_two_links_is_cut_in_flight(choice: Choice) -> None:
                 tasks.start_soon(vehicle.go_to, start.offset(north_m=60 * choice.speedup))
                 await anyio.sleep(2)
                 become(first, DEAD)
-                await anyio.sleep(2)
+                with anyio.fail_after(2 if choice.is_virtual else 5):  # a busy machine takes longer
+                    while not chosen or vehicle.position.age > 1.0:  # noqa: ASYNC110 - ages are not told
+                        await anyio.sleep(0.1)
                 assert [(each.link, each.reason) for each in chosen] == [(second.address, "silent")]
                 assert vehicle.link_state.value is LinkState.CONNECTED
-                assert vehicle.position.age < 1.5
             items = [
                 waypoint(start.latitude_deg + n * 1e-5, start.longitude_deg, altitude_relative_m=20.0)
                 for n in range(40)

@@ -43,7 +43,7 @@ class Candidate:
         """None: nothing was answered yet."""
         self.is_proven: bool = False
         self.was_proven: bool = False
-        """Whether it was proven before the vehicle rebooted, and not doubted since."""
+        """Whether it was proven before the vehicle rebooted or its clock was doubted."""
         self.is_doubted: bool = False
         """Whether somebody else speaks in this system's name there."""
         self.hardware: HardwareId | None = None
@@ -117,6 +117,7 @@ class Candidate:
         """It and the vehicle have told their hardware ids."""
         if is_another:
             self._doubt()
+            self.was_proven = False
         elif self.is_other_hardware:
             self.is_doubted = False
         self.is_other_hardware = is_another
@@ -126,9 +127,13 @@ class Candidate:
         if self._asked_hardware:
             self._times_since += 1
 
+    def forgive_clock(self) -> None:
+        """The vehicle's clock has stood still: that this link told another time meanwhile is no evidence."""
+        self._disagreed = 0
+
     def _doubt(self) -> None:
-        self.is_proven = self.was_proven = False
-        self.is_doubted = True
+        self.was_proven = self.was_proven or self.is_proven
+        self.is_proven, self.is_doubted = False, True
 
     def is_alive(self, now: float) -> bool:
         """Whether something comes over it, and what is written leaves."""

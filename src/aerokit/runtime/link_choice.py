@@ -83,10 +83,13 @@ class LinkChoice:
                 )
                 for other in self.candidates.values():
                     other.forget_proof()
+            elif not self.clock.is_steady:
+                for other in self.candidates.values():
+                    other.forgive_clock()
         else:
             candidate.note_time()
             agrees = self.clock.agrees(at, told_s, round_trip_s)
-            if agrees is False and is_stale:
+            if not agrees and is_stale:
                 # The link in use may be dead, and the vehicle may have stood still or rebooted since.
                 agrees = True if self._recognises(candidate, now) else None
             if agrees is not None:

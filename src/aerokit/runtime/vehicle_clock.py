@@ -32,6 +32,8 @@ class VehicleClock:
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, float]] = deque(maxlen=SAMPLES)
+        self.is_steady: bool = True
+        """Whether what was told last is what was expected."""
         self._former_speed: tuple[float, float] | None = None  # and when it was measured
 
     def note(self, at: float, told_s: float, round_trip_s: float) -> bool:
@@ -40,7 +42,8 @@ class VehicleClock:
         A clock that has stood still for a moment goes on, but later than expected.
         """
         goes_on = not self._samples or self._goes_on(at, told_s, round_trip_s)
-        if not goes_on or self.agrees(at, told_s, round_trip_s) is False:
+        self.is_steady = goes_on and self._fits(at, told_s, round_trip_s) is not False
+        if not self.is_steady:
             if (speed := self._measured_speed) is not None:
                 self._former_speed = speed, at
             self._samples.clear()
@@ -50,8 +53,13 @@ class VehicleClock:
     def agrees(self, at: float, told_s: float, round_trip_s: float) -> bool | None:
         """Whether it is the time that this vehicle should have by now; ``at`` is the middle of the round trip.
 
-        None as long as its speed is not known: that of a simulation may be any.
+        None as long as its speed is not known: that of a simulation may be any. The speed from before a pause or a
+        reboot confirms, and refutes nothing.
         """
+        fits = self._fits(at, told_s, round_trip_s)
+        return None if not fits and self._measured_speed is None else fits
+
+    def _fits(self, at: float, told_s: float, round_trip_s: float) -> bool | None:
         speed = self._speed
         if speed is None:
             return None
