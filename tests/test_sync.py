@@ -383,8 +383,8 @@ def test_a_program_that_forgets_to_close_still_ends() -> None:
 
 
 def test_missions_fences_and_rally_points(vehicle: aerokit.sync.Vehicle) -> None:
-    place = aerokit.Position(47.0, 8.0)
-    mission = Mission([waypoint(47.0, 8.0, altitude_relative_m=20)] * 3)
+    place = vehicle.home.wait_until(lambda _: True, timeout=30).position
+    mission = Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20)] * 3)
     vehicle.mission.upload(mission)
     assert mission.matches(vehicle.mission.download(method="items"))
     assert vehicle.mission.count.value == 3

@@ -256,7 +256,7 @@ CALLS: dict[str, Call] = {
         lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
     ),
     "Vehicle.command_int": Call(
-        lambda s: s.vehicle.command_int(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID, frame=0)
+        lambda s: s.vehicle.command_int(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID, frame=5)
     ),
     "Vehicle.subscribe": Call(_subscribe),
     # ------------------------------------------------------------------------------------- Guided

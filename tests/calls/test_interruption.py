@@ -56,7 +56,7 @@ def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingS
     folder = tmp_path_factory.mktemp("calls")
     with (
         served([copter], "tcpin:127.0.0.1:0", "tcpin:127.0.0.1:0") as address,
-        aerokit.sync.connect(address) as vehicle,
+        aerokit.sync.connect(address, reconnect=True) as vehicle,
     ):
         vehicle.wait_ready()
         blocking = BlockingStage(

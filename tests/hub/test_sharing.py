@@ -26,7 +26,9 @@ from aerokit.testing import run_virtual
 
 KEY = SigningKey.from_passphrase("border")
 DATA = random.Random(7).randbytes(6_000)
-MISSION = Mission([waypoint(47.3977, 8.5455 + number * 1e-4, altitude_relative_m=20) for number in range(40)])
+MISSION = Mission(
+    [waypoint(-35.3632, 149.1652 + number * 1e-4, altitude_relative_m=20) for number in range(40)]
+)
 ORDER = CommandLong(1, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0)
 
 

@@ -5,6 +5,8 @@ The same as `tests/orders` holds simulated vehicles to, on any vehicle; see `tes
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -14,12 +16,16 @@ import pytest
 from any_vehicle import Choice, served
 from order_air import Air, Weather
 
-from aerokit import Vehicle, connect
+from aerokit import Vehicle, connect, fleet
 from aerokit import messages as m
-from aerokit.errors import AerokitError, HeartbeatTimeout, OperationRejected
+from aerokit.errors import AerokitError, FleetError, HeartbeatTimeout, OperationRejected
+from aerokit.fleets.members import MemberState
 from aerokit.links import Link, create_link
+from aerokit.mavlink import Framer
+from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
+from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import VIRTUAL_BACKEND
 
 pytestmark = pytest.mark.anyio
@@ -28,6 +34,7 @@ FAR_M = 400.0
 ANOTHER_STATION = 254
 REBOOT_BY_FORCE = 20190226
 LANDED_ON_GROUND = 1
+STEER = (MavCmd.DO_REPOSITION, MavCmd.DO_SET_MODE)
 
 
 @pytest.fixture
@@ -42,11 +49,12 @@ def _is_a_copter(choice: Choice) -> None:
 
 
 @asynccontextmanager
-async def flying(choice: Choice) -> AsyncIterator[tuple[Vehicle, Air]]:
-    """Some metres up, where it takes orders; the weather is good so far."""
+async def flying(choice: Choice, *, through_air: bool = True) -> AsyncIterator[tuple[Vehicle, Air]]:
+    """Some metres up, where it takes orders; the weather is good so far, if there is any."""
     async with served(choice) as served_at:
-        air = Air(served_at if isinstance(served_at, Link) else create_link(served_at))
-        async with connect(air, timeout=30) as vehicle:
+        link = served_at if isinstance(served_at, Link) else create_link(served_at)
+        air = Air(link)
+        async with connect(air if through_air else link, timeout=30) as vehicle:
             await vehicle.wait_ready(timeout=choice.seconds(120))
             name = "FS_GCS_ENABLE" if choice.kind.is_ardupilot else "NAV_DLL_ACT"
             async with vehicle.parameters.temporarily({name: 1 if choice.kind.is_ardupilot else 2}):
@@ -133,6 +141,46 @@ async def test_a_failsafe_during_an_outage_keeps_the_vehicle(choice: Choice) -> 
                 each.at for each in air.sent if getattr(each.message, "command", 0) == MavCmd.DO_REPOSITION
             ]
             assert not [at for at in orders[1:] if at < back_at]
+
+
+async def test_blocked_program_leaves_the_failsafe_alone(choice: Choice) -> None:
+    """For 14 s, of which the vehicle's HEARTBEATs wait in the socket; the call is cancelled when it goes on."""
+    if not choice.is_binary:
+        pytest.skip("a simulated vehicle would be blocked, too: tests/orders/test_paused_program.py")
+    async with flying(choice, through_air=False) as (vehicle, _):
+        orders: list[int] = []
+        vehicle.connection.tap_sent(lambda raw: orders.append(command_in(raw)))
+        asyncio.get_running_loop().call_later(3.0, time.sleep, 14.0)
+        with anyio.move_on_after(6.0), pytest.raises((HeartbeatTimeout, OperationRejected)):
+            await vehicle.go_to(far(vehicle))
+        await anyio.sleep(3.0)
+        assert [each for each in orders if each in STEER] == [MavCmd.DO_REPOSITION]
+        assert vehicle.mode_name in ("RTL", "LAND")
+
+
+def command_in(raw: bytes) -> int:
+    """The MAV_CMD of a frame; 0 if it is none."""
+    (frame,) = Framer().receive(raw, 0.0)
+    return int(getattr(STANDARD.decode(frame), "command", 0))
+
+
+async def test_fleet_member_of_another_station_is_left_alone(choice: Choice) -> None:
+    """It is flown from before the fleet was opened; another member does not do its part."""
+    silent = SimulatedCopter(system_id=77, boot_time_s=0.0)
+    async with flying(choice) as (vehicle, air), simulated_link(silent) as link:
+        connection = vehicle.connection
+        connection.attached.discard(vehicle.system_id)  # as another program that hears the same vehicle
+        async with fleet({"real": connection, "other": link}, count=2) as both:
+            air.begin()
+            before = vehicle.mode_name
+            assert both.members[f"real/{vehicle.system_id}"].state is MemberState.TAKEN_OVER
+            with pytest.raises(FleetError):
+                await both.barrier(lambda _: False, timeout=3.0)
+            with anyio.move_on_after(2.0):
+                await both.barrier(lambda _: False, timeout=30.0)
+            await anyio.sleep(2.0)
+            assert sent(air, MavCmd.DO_REPOSITION) == sent(air, MavCmd.DO_SET_MODE) == 0
+            assert vehicle.mode_name == before
 
 
 async def test_a_reboot_in_flight_ends_what_was_ordered(choice: Choice) -> None:

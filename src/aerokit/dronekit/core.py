@@ -15,6 +15,7 @@ from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
+from aerokit.protocols.repeatable import attempts_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -275,6 +276,7 @@ class Core:
 
     def command(self, kind: str, command: int, *params: float, **options: Any) -> Order:
         """Order that a command is sent to all components, of which the autopilot's answer counts."""
+        options.setdefault("retries", attempts_of(command, params) - 1)
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
     def send(self, message: Message) -> None:

@@ -94,6 +94,7 @@ class Member:
         ]
         if vehicle.is_silent:
             self._lose(vehicle.describe_link())
+        self.look()  # others may have flown it before
 
     def stop_watching(self) -> None:
         """Listen no more."""

@@ -154,6 +154,8 @@ class _Vehicle:
         telemetry = self._telemetry
         names = self._names.get(type(message).__name__, ())
         if names:
+            if message.received_frame is not None:
+                message.received_frame.received_at = now
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)
