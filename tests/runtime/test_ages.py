@@ -22,8 +22,8 @@ from aerokit.links.base import BaseLink
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import VehicleRebooted, VehicleSilent
-from aerokit.runtime.loop_watch import QUIET_TURNS
+from aerokit.runtime.events import ComputerSlept, VehicleRebooted, VehicleSilent
+from aerokit.runtime.loop_watch import QUIET_TURNS, asleep_s
 from aerokit.vehicle.state.told import MESSAGE_IDS, message_type
 
 pytestmark = pytest.mark.anyio
@@ -197,3 +197,33 @@ async def test_every_cell_after_a_pause_is_as_old_as_its_message(grounded: Fligh
     names = {cell.name for cell in updated}
     assert set(vehicle.telemetry.cells) - names <= {"version"}
     assert {"cameras", "components", "mission.current", "gimbal.attitude", "HEARTBEAT"} <= names
+
+
+async def test_values_are_older_after_the_computer_slept(
+    grounded: Flight, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The loop's clock stood still meanwhile, and a HEARTBEAT had waited."""
+    vehicle, asleep = grounded.vehicle, [0.0]
+    watch = vehicle.connection._intake._loop_watch
+    watch._asleep = lambda: asleep[0]
+    watch._slept_before = 0.0
+    await anyio.sleep(1.0)
+    assert vehicle.armed.age < 1.1
+    ages: list[float] = []
+    with vehicle.connection.subscribe(ComputerSlept) as told:
+        asleep[0] = 600.0
+        grounded.copter.faults.silent = True
+        await anyio.sleep(0.2)
+        ages += [vehicle.armed.age, vehicle.position.age, vehicle.heartbeat_age]
+        assert told.get_nowait() is not None
+    assert min(ages) > 600.0
+    assert not vehicle._helm.is_known
+    assert "the computer slept for 600 s" in caplog.text
+    grounded.copter.faults.silent = False
+    await anyio.sleep(1.5)
+    assert vehicle.armed.age < 1.5
+
+
+def test_time_asleep_is_a_clock_of_the_system() -> None:
+    before = asleep_s()
+    assert asleep_s() - before == pytest.approx(0.0, abs=0.01)

@@ -218,6 +218,11 @@ class StateCell(Generic[T]):
             for sink in tuple(self._sinks):
                 sink.receive(value)
 
+    def grow_older(self, seconds: float) -> None:
+        """Count the time in which the clock stood still: the value is older by that."""
+        self._catch_up()
+        self._updated_at -= seconds
+
     def forget(self) -> None:
         """Make the value unknown again, as after a reboot; whoever waits goes on waiting."""
         self._known = False  # the value itself stays for a thread that has just seen that it is known

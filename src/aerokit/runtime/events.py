@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArmedChanged",
     "ComponentFound",
+    "ComputerSlept",
     "Event",
     "FrameRefused",
     "GimbalControlLost",
@@ -273,6 +274,12 @@ class LinkReport(Event):
 
 class LoopBlocked(Event):
     """The program kept the event loop from running for ``seconds``: nothing was received or sent meanwhile."""
+
+    seconds: float
+
+
+class ComputerSlept(Event):
+    """The computer slept for ``seconds``, while the event loop's clock stood still: values are older by that."""
 
     seconds: float
 

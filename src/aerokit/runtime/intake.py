@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.components import found_by
-from aerokit.runtime.events import LoopBlocked
+from aerokit.runtime.events import ComputerSlept, LoopBlocked
 from aerokit.runtime.loop_watch import LoopWatch
 from aerokit.runtime.peers import Peers
 from aerokit.runtime.routes import MOST_ROUTES
@@ -61,7 +61,7 @@ class Intake:
         self.heard: dict[tuple[int, int], Heartbeat] = {}
         """The last HEARTBEAT of every (system id, component id) on the link."""
         self.taps: Taps = Taps(self._let_all_through)
-        self._loop_watch = LoopWatch(self._on_blocked)
+        self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
         self._is_closed = False
         bus.want(Heartbeat)  # routes and diagnosis need every heartbeat
 
@@ -142,6 +142,10 @@ class Intake:
                 TERMINAL_IPYTHON if stands_still_between_inputs() else BLOCKING_CODE,
             )
         self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
+
+    def _on_slept(self, seconds: float) -> None:
+        logger.warning("the computer slept for %.0f s: what is known of vehicles is older by that", seconds)
+        self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
     def _let_all_through(self) -> None:
         for framer in self._peers:

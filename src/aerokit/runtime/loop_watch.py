@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -20,6 +21,15 @@ QUIET_TURNS = 3
 first in a turn, timers or sockets."""
 
 
+def asleep_s() -> float:
+    """Seconds that the computer has slept since it was started, during which the loop's clock stood still."""
+    if hasattr(time, "CLOCK_BOOTTIME"):
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
+    if hasattr(time, "CLOCK_UPTIME_RAW"):
+        return time.clock_gettime(time.CLOCK_MONOTONIC) - time.clock_gettime(time.CLOCK_UPTIME_RAW)
+    return 0.0  # Windows: its clock goes on
+
+
 class LoopWatch:
     """A timer that is always under way. When it comes late, the program, or the system, kept the loop from running.
     What is read in time puts it off: each time that it wakes a sleeping process costs as much as a few messages.
@@ -27,12 +37,18 @@ class LoopWatch:
     What is read afterwards may have waited since the loop last ran: nobody knows better, so that is when it came, until
     all that had waited has been read. A pause of less than ``PERIOD_S + LATE_AFTER_S`` is not noticed; what is read is
     called younger than it is by so much at most. ``on_blocked`` is told the length of pauses above
-    ``BLOCKED_AFTER_S``.
+    ``BLOCKED_AFTER_S``; ``on_slept`` for how long the computer has slept, which the loop's clock does not show.
     """
 
-    def __init__(self, on_blocked: Callable[[float], None]) -> None:
+    def __init__(
+        self,
+        on_blocked: Callable[[float], None],
+        on_slept: Callable[[float], None],
+        asleep: Callable[[], float] = asleep_s,
+    ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._on_blocked = on_blocked
+        self._on_blocked, self._on_slept = on_blocked, on_slept
+        self._asleep, self._slept_before = asleep, asleep()
         self.late_after: float = math.inf
         """What is read at a later time than this came at :meth:`arrival`, else when it was read."""
         self._ran_at = self._due = self._loop.time()
@@ -59,7 +75,8 @@ class LoopWatch:
 
     def arrival(self, now: float) -> float:
         """When what is read came: now, or, if it may have waited, the earliest time at which it may have come."""
-        if self._oldest is None and now <= self._due + LATE_AFTER_S:
+        has_slept = self._has_slept()
+        if self._oldest is None and not has_slept and now <= self._due + LATE_AFTER_S:
             if self._timer is not None:
                 self._timer.cancel()
             self._set_timer(now)
@@ -70,11 +87,20 @@ class LoopWatch:
     def _tick(self) -> None:
         now = self._loop.time()
         late = now - self._due
-        if late > LATE_AFTER_S:
+        if self._has_slept() or late > LATE_AFTER_S:
             self._fall_behind()
         self._set_timer(now)
         if late > BLOCKED_AFTER_S:
             self._on_blocked(late + PERIOD_S)
+
+    def _has_slept(self) -> bool:
+        before, self._slept_before = self._slept_before, self._asleep()
+        slept_s = self._slept_before - before
+        if slept_s <= LATE_AFTER_S:
+            return False
+        self._ran_at -= slept_s
+        self._on_slept(slept_s)
+        return True
 
     def _set_timer(self, now: float) -> None:
         self._ran_at, self._due = now, now + PERIOD_S

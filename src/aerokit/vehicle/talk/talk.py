@@ -15,6 +15,7 @@ from aerokit.runtime.background import Background
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.runtime.events import (
     ArmedChanged,
+    ComputerSlept,
     LandedStateChanged,
     LinkChosen,
     LinkReport,
@@ -273,6 +274,7 @@ class Talk:
             ),
             bus.attach_event(LinkRestored, lambda _: self.rates.ask_again()),
             bus.attach_event(LinkChosen, self._on_link_chosen),
+            bus.attach_event(ComputerSlept, self._on_computer_slept),
             self.connection.on_end(self._on_end),
         ]
 
@@ -280,6 +282,11 @@ class Talk:
         """An autopilot keeps rates for each of its ports."""
         if event.system_id == self.system_id and event.before is not None:
             self.rates.ask_again()
+
+    def _on_computer_slept(self, event: ComputerSlept) -> None:
+        self.watch.last_heartbeat_at -= event.seconds
+        for cell in (*self.telemetry.cells.values(), *self._cells):
+            cell.grow_older(event.seconds)
 
     def _on_link_report(self, report: LinkReport) -> None:
         self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
