@@ -9,8 +9,8 @@ import anyio
 import pytest
 from fleet_stage import Stage, open_stage
 
-from aerokit.errors import AerokitError
-from aerokit.fleets.members import MemberState
+from aerokit.errors import AerokitError, OperationRejected
+from aerokit.fleets.members import Member, MemberState
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.missions import Mission, land, take_off
@@ -110,3 +110,22 @@ async def test_member_that_flew_before_the_fleet_takes_orders_once_taken_back() 
         assert stage.mode_of(PILOTS) == "LOITER"
         await member.vehicle.hold()
         assert member.is_flown_by_program
+
+
+async def test_disarmed_member_is_ordered_nothing_by_a_policy() -> None:
+    """Two fly, one stands disarmed; one of those that fly fails."""
+    async with open_stage(3, on_error="land_others") as stage:
+        await stage.take_off()
+        await stage.fleet.vehicles["north/3"].land()
+        await stage.fleet.vehicles["north/3"].armed.wait_until(lambda armed: not armed, timeout=30)
+        stage.forget()
+
+        async def fail_first(member: Member) -> None:
+            if member.name == "north/1":
+                raise OperationRejected("it does not")
+            await anyio.sleep(30.0)
+
+        await stage.fleet.do(fail_first)
+        await anyio.sleep(3.0)
+        assert stage.orders_to("north/3") == []
+        assert stage.modes_ordered("north/2") == ["LAND"]

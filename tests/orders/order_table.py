@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
@@ -87,6 +88,7 @@ SET_MODE = int(MavCmd.DO_SET_MODE)
 PITCHYAW = int(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW)
 REPOSITION = int(MavCmd.DO_REPOSITION)
 ARM = int(MavCmd.COMPONENT_ARM_DISARM)
+RTL, LAND = int(MavCmd.NAV_RETURN_TO_LAUNCH), int(MavCmd.NAV_LAND)
 REBOOT = int(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN)
 
 ROWS = (
@@ -210,6 +212,16 @@ ROWS = (
     Row("gimbal.release", lambda v: v.gimbal.release(), int(MavCmd.DO_MOUNT_CONTROL), steers=False),
     Row("posted", _post_place, REPOSITION, modes=(("GUIDED",), ("LOITER",)), on=("ardupilot",)),
     Row("command", _gimbal_up, int(MavCmd.DO_SET_SERVO), steers=False, on=("ardupilot",)),
+    Row("command return", lambda v: v.command(RTL), RTL, modes=(("RTL",), ("RTL",))),
+    Row("command land", lambda v: v.command(LAND), LAND, modes=(("LAND",), ("LAND",))),
+    Row(
+        "command reposition, twice at most",
+        lambda v: v.command(REPOSITION, -1, 1, 0, *(math.nan,) * 4, retries=1),
+        REPOSITION,
+        modes=((), ("LOITER", "OFFBOARD")),
+        on=("px4",),
+    ),
+    Row("command arm", lambda v: v.command(ARM, 1), ARM, place="ground", steers=False),
     Row("parameters.set", _set(("WP_YAW_BEHAVIOR", "NAV_ACC_RAD")), 0, steers=False),
     Row("mission.upload", upload, 0, steers=False),
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import anyio
 import pytest
 from flight_harness import Flight, in_the_air, now, open_px4
@@ -86,3 +88,19 @@ async def test_a_refused_hold_is_told_of_once(caplog: pytest.LogCaptureFixture) 
         (record,) = [each for each in caplog.records if "told to hold" in each.message]
         assert record.message.startswith("the vehicle was told to hold and does not: ")
         assert flight.wire.mode_orders() == [BRAKE]
+
+
+async def test_hold_left_to_be_given_is_not_once_a_pilot_has_the_vehicle() -> None:
+    """Given up in a silence; when the vehicle is heard again, its mode is a pilot's."""
+    async with in_the_air() as flight:
+        asyncio.get_running_loop().call_later(1.5, setattr, flight.copter.faults, "silent", True)
+        with anyio.move_on_after(6.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=200))
+        assert flight.vehicle.is_told_to_hold
+        flight.wire.forget()
+        flight.pilot_takes_over()
+        flight.copter.faults.silent = False
+        await anyio.sleep(5.0)
+        assert flight.wire.mode_orders() == []
+        assert flight.copter.mode.name == "LOITER"
+        assert not flight.vehicle.is_told_to_hold
