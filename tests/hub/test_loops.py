@@ -85,6 +85,7 @@ def test_a_vehicle_that_has_left_its_port_does_not_go_round() -> None:
     for raw in raws:
         stage.pass_on("a", raw)
     stage.router.remove(stage.nodes["a"])
+    passed = 0
     for _ in range(5):
         stage.now += 10
         passed = sum(bool(stage.pass_on("b", raw)) for raw in raws)

@@ -302,6 +302,7 @@ async def run(vehicle: Vehicle, calls: list[Call], speedup: float) -> list[Step]
     """Do the calls one after the other. A PX4 hears a station more often than in its 2.5 s, however fast it is."""
     idle = ("DISARM_DELAY", 0.0) if vehicle.autopilot.runs_prearm_checks else ("COM_DISARM_PRFLT", -1.0)
     await vehicle.parameters.set(*idle)  # off: a real vehicle takes longer to come to rest
+    steps: list[Step] = []
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(_beat, vehicle, 1.0 / speedup)
         runner = _Runner(vehicle, speedup)

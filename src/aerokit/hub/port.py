@@ -64,8 +64,9 @@ class Port:
     ) -> None:
         self.link, self.peer = link, peer
         self.totals = totals
-        self.border, self.guard = border, guard
-        self.is_mute = is_mute
+        self.border: Border | None = border
+        self.guard: IdentityGuard | None = guard
+        self.is_mute: bool = is_mute
         """Whether nothing that comes from here is passed on."""
         self.one_at_a_time = False
         """Whether each frame is written by itself: autopilots read datagrams into small buffers."""

@@ -88,7 +88,7 @@ class Node(Generic[PortT]):
         self.plans: dict[int, Plan[PortT]] = {}
         self.echoes: dict[int, int] = {}
         """Sender → how many more of its frames have come back here than new ones have come."""
-        self.loop_until = -math.inf
+        self.loop_until: float = -math.inf
         """Until then what comes back here is dropped."""
 
 

@@ -11,8 +11,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 __all__ = [
-    *("DUPLICATE_WINDOW_S", "LOOP_MEMORY_S", "LOOP_RUN", "MOST_RECENT", "MOVES_AFTER_S", "REPEATED_WITHIN_S"),
-    *("Recent", "Sender", "is_autopilot"),
+    "DUPLICATE_WINDOW_S",
+    "LOOP_MEMORY_S",
+    "LOOP_RUN",
+    "MOST_RECENT",
+    "MOVES_AFTER_S",
+    "REPEATED_WITHIN_S",
+    "Recent",
+    "Sender",
+    "is_autopilot",
 ]
 
 DUPLICATE_WINDOW_S = 2.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -23,11 +24,11 @@ first in a turn, timers or sockets."""
 
 def asleep_s() -> float:
     """Seconds that the computer has slept since it was started, during which the loop's clock stood still."""
-    if hasattr(time, "CLOCK_BOOTTIME"):
+    if sys.platform == "linux":
         return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
-    if hasattr(time, "CLOCK_UPTIME_RAW"):
+    if sys.platform == "darwin":
         return time.clock_gettime(time.CLOCK_MONOTONIC) - time.clock_gettime(time.CLOCK_UPTIME_RAW)
-    return 0.0  # Windows: its clock goes on
+    return 0.0  # the clock of Windows goes on
 
 
 class LoopWatch:
