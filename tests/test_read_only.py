@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 from typing import Any
+from unittest import mock
 
 import pytest
 from flight_harness import Flight
@@ -48,23 +50,35 @@ def test_no_public_attribute_of_a_blocking_vehicle_can_be_assigned() -> None:
             AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"
         ):
             vehicle.position.latitude_deg  # type: ignore[attr-defined]  # noqa: B018
+        assert copy.copy(vehicle.position).latest is not None
         objects = [vehicle, *(getattr(vehicle, part) for part in PARTS)]
         assert [assigned for each in objects for assigned in assignable(each)] == []
 
 
 def assignable(thing: Any) -> list[str]:
-    """The public names that take another value; it is put back."""
+    """The names of what it tells (cells, properties, parts) that take another value; it is put back."""
     found = []
-    for name in {*dir(type(thing)), *vars(thing)}:
-        is_setter = isinstance(getattr(type(thing), name, None), property) and name in ("signing",)
-        if name.startswith("_") or is_setter:
+    for name in dir(type(thing)):
+        told = inspect.getattr_static(type(thing), name)
+        is_told = not name.startswith("_") and hasattr(type(told), "__get__") and not callable(told)
+        if not is_told or (isinstance(told, property) and told.fset is not None):
             continue
         try:
-            setattr(thing, name, inspect.getattr_static(thing, name))
+            setattr(thing, name, None)
         except AttributeError:
             continue
         found.append(f"{type(thing).__name__}.{name}")
     return found
+
+
+@pytest.mark.anyio
+async def test_own_attributes_and_mocked_methods_can_be_assigned(grounded: Flight) -> None:
+    vehicle: Any = grounded.vehicle
+    for vehicle.note in (1, 2):
+        assert vehicle.note
+    with mock.patch.object(vehicle, "go_to") as go_to:
+        assert vehicle.go_to is go_to
+    assert vehicle.go_to is not go_to
 
 
 @pytest.mark.anyio

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 from aerokit.wording import shown
 
 __all__ = ["ReadOnly"]
@@ -21,15 +23,18 @@ CALLS = {
 
 
 class ReadOnly:
-    """A base of public objects. ``vehicle.mode = "GUIDED"`` raises AttributeError, which names ``set_mode``."""
+    """A base of public objects. ``vehicle.mode = "GUIDED"`` raises AttributeError, which names ``set_mode``.
+
+    What the vehicle tells (cells, properties, parts) is refused; a program may add attributes of its own.
+    """
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name.startswith("_") or not (name in vars(self) or hasattr(type(self), name)):
-            object.__setattr__(self, name, value)  # made in the constructor
-            return
-        found = getattr(type(self), name, None)
-        if isinstance(found, property) and found.fset is not None:
-            found.fset(self, value)
+        found = inspect.getattr_static(type(self), name, None)
+        is_setter = isinstance(found, property) and found.fset is not None
+        if name.startswith("_") or is_setter or callable(found) or not hasattr(type(found), "__get__"):
+            object.__setattr__(
+                self, name, value
+            )  # of the program, or made in the constructor; a method in a mock
             return
         text = f"{type(self).__name__}.{name} = {shown(value)} is not allowed"
         call = CALLS.get(name)

@@ -67,7 +67,14 @@ State = tuple[int, bool, bool]
 
 def _told(flown: Flown, since: int, until: int) -> list[State]:
     """The states that HEARTBEAT told between these two crossings."""
-    return [_state(each) for each in flown.air.heartbeats if since < each.number < until]
+    told = [_state(each) for each in flown.air.heartbeats if since < each.number < until]
+    return [(mode, armed, False) for mode, armed, _ in told] if _ends_flight(flown) else told
+
+
+def _ends_flight(flown: Flown) -> bool:
+    """Whether it lands, returns or disarms: that is meant under a failsafe, too."""
+    modes = flown.case.row.modes[flown.case.autopilot == "px4"]
+    return flown.case.row.name == "disarm" or (bool(modes) and set(modes) <= {"LAND", "RTL"})
 
 
 def _state(heard: Crossing) -> State:
@@ -157,7 +164,7 @@ def _taken(flown: Flown) -> Crossing | None:
         is_new, had_failsafe = has_failsafe and not had_failsafe, has_failsafe
         if each.at < flown.given_at:
             allowed = {name}
-        elif is_new:
+        elif is_new and not _ends_flight(flown):
             return each
         elif name in own:
             allowed = set()

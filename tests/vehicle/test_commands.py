@@ -388,3 +388,23 @@ async def test_pilots_mode_after_a_raw_command_is_told_at_once(flying: Flight) -
     flying.pilot_takes_over(CopterMode.STABILIZE)
     await anyio.sleep(1.2)
     assert "STABILIZE" in flying.vehicle.taken_over
+
+
+async def test_raw_arm_does_not_explain_a_pilots_mode(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 1)
+    await grounded.vehicle.armed.wait_until(bool, timeout=3)
+    assert grounded.vehicle.is_flown_by_program
+    grounded.copter.set_mode(CopterMode.STABILIZE)
+    await anyio.sleep(1.5)
+    assert "STABILIZE" in grounded.vehicle.taken_over
+    assert not grounded.vehicle.is_flown_by_program
+
+
+@pytest.mark.parametrize("name", ["land", "return_to_launch"])
+async def test_landing_lost_under_a_failsafe_is_ordered_again(flying: Flight, name: str) -> None:
+    """ArduCopter only warns: without a second order it hovers until the battery is empty."""
+    flying.copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
+    flying.copter.parameters["BATT_LOW_MAH"] = flying.copter.parameters["BATT_CAPACITY"]
+    await getattr(flying.vehicle, name)()
+    assert len(flying.wire.commands(MavCmd.DO_SET_MODE)) == 2

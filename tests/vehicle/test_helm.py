@@ -9,9 +9,10 @@ from typing import Any, cast
 
 import pytest
 
-from aerokit.autopilots import Mode
+from aerokit.autopilots import Mode, autopilot_for
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavState
+from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S, Helm
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS, Order, Sending
@@ -23,6 +24,9 @@ GUIDED, LOITER, RTL, BRAKE = (
 )
 
 
+COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
+
+
 class Stage:
     """A helm, and heartbeats at the test's word."""
 
@@ -31,7 +35,9 @@ class Stage:
         self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
         self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
         self.state = StateCell[int]("system_status", lambda: self.now, "HEARTBEAT")
-        cells = SimpleNamespace(mode=self.mode, armed=self.armed, system_status=self.state)
+        cells = SimpleNamespace(
+            mode=self.mode, armed=self.armed, system_status=self.state, autopilot=COPTER, is_vtol=False
+        )
         self.helm = Helm(lambda: self.now, cast("Telemetry", cells))
         if mode is not None and armed is not None:
             self.tell(mode, armed)
@@ -338,7 +344,6 @@ def test_order_failsafe_becomes_active_ends_it_for_good(state: int) -> None:
         stage.tell(GUIDED, state=state)
         assert "failsafe" in order.end
         assert sending.end == aside.end == order.end
-        assert not order.end_of_effect
         stage.tell(GUIDED)
         assert "failsafe" in order.end
     assert not stage.helm.order(GUIDED).is_given
@@ -354,3 +359,99 @@ def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
     assert not order.end
     stage.tell(GUIDED, state=MavState.CRITICAL)
     assert "failsafe" in order.end
+
+
+def test_order_worse_failsafe_than_the_known_one_ends_it() -> None:
+    stage = Stage()
+    stage.tell(LOITER, state=MavState.CRITICAL)
+    order = stage.helm.order(GUIDED)
+    stage.tell(GUIDED, state=MavState.EMERGENCY)
+    assert "MAV_STATE_EMERGENCY" in order.end
+
+
+@pytest.mark.parametrize("mode", [RTL, Mode("LAND", 9)])
+def test_order_to_land_or_return_stands_under_a_failsafe(mode: Mode) -> None:
+    stage = Stage()
+    order = stage.helm.order(mode)
+    with stage.helm.sending(order, modes=[mode]) as sending, stage.helm.aside(ends_flight=True) as disarm:
+        stage.tell(LOITER, state=MavState.CRITICAL)
+        assert (order.end, sending.end, disarm.end) == ("", "", "")
+        assert "failsafe" in order.failsafe
+
+
+# --------------------------------------------------------------------------------- who flies it
+
+
+def arm(stage: Stage, *, is_refused: bool = False) -> None:
+    """An order to arm, until its answer."""
+    error = CommandRejected("no", command=400, result=4)
+    with (
+        pytest.raises(CommandRejected) if is_refused else nullcontext(),
+        stage.helm.aside() as order,
+        stage.helm.sending(order, armed=True),
+    ):
+        if is_refused:
+            raise error
+
+
+def test_vehicle_that_the_program_armed_is_flown_by_it_until_a_pilot_takes_it() -> None:
+    stage = Stage(armed=False)
+    arm(stage)
+    stage.tell(LOITER, True, after=0.8)
+    assert stage.helm.is_flown_by_program
+    stage.tell(RTL)
+    assert not stage.helm.is_flown_by_program
+
+
+def test_vehicle_told_armed_long_after_the_answer_is_the_programs_if_nothing_was_told_between() -> None:
+    stage = Stage(armed=False)
+    arm(stage)
+    stage.tell(LOITER, True, after=6.0)  # HEARTBEATs were lost
+    assert stage.helm.is_flown_by_program
+
+
+def test_vehicle_that_a_pilot_armed_after_a_refusal_or_a_disarming_is_his() -> None:
+    stage = Stage(armed=False)
+    arm(stage, is_refused=True)
+    stage.tell(LOITER, True, after=1.0)
+    assert not stage.helm.is_flown_by_program
+    stage = Stage(armed=False)
+    arm(stage)
+    for _ in range(4):
+        stage.tell(LOITER, False)  # he disarmed it at once
+    stage.tell(LOITER, True)
+    assert not stage.helm.is_flown_by_program
+
+
+def test_refused_order_changes_nothing_about_who_flies() -> None:
+    stage = Stage()
+    refused = stage.helm.order(GUIDED)
+    refused.was_refused = True
+    assert not stage.helm.is_flown_by_program
+    stage.helm.order(GUIDED)
+    assert stage.helm.is_flown_by_program
+    refused = stage.helm.order(BRAKE)
+    refused.was_refused = True
+    assert stage.helm.is_flown_by_program
+
+
+def test_failsafe_is_forgiven_when_the_program_takes_the_vehicle_back() -> None:
+    stage = Stage()
+    stage.helm.order(GUIDED)
+    stage.tell(GUIDED)
+    stage.tell(GUIDED, state=MavState.CRITICAL)
+    stage.tell(GUIDED)
+    assert not stage.helm.is_flown_by_program
+    stage.helm.forgive_failsafe()
+    assert stage.helm.is_flown_by_program
+
+
+def test_posted_mode_after_an_order_is_the_programs_own() -> None:
+    stage = Stage()
+    order = stage.helm.order(GUIDED)
+    stage.tell(GUIDED)
+    with stage.helm.posting(["mode"], modes=[RTL]):
+        stage.tell(RTL)
+    assert not order.has_lost_mode
+    stage.tell(LOITER)
+    assert order.has_lost_mode

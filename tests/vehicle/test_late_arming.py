@@ -11,6 +11,7 @@ from flight_harness import Flight, open_flight, open_px4
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.mavlink.messages import CommandAck
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.vehicle.orders.late_arming import LATE_S
 
@@ -168,3 +169,34 @@ def disarm(simulated: SimulatedCopter | SimulatedPx4) -> None:
         simulated.arming.disarm()
     else:
         simulated.arming.disarm("the pilot")
+
+
+async def test_pilot_who_disarms_at_once_and_arms_later_stays_armed(grounded: Flight) -> None:
+    """Our order was accepted and armed it; no HEARTBEAT told that before he disarmed."""
+    await grounded.vehicle.set_mode("STABILIZE")
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    told_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    asyncio.get_running_loop().call_later(0.3, grounded.copter.arming.disarm)
+    with anyio.move_on_after(0.2):
+        await grounded.vehicle.arm()
+    await anyio.sleep(6.0)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+
+
+async def test_answer_that_names_another_station_proves_nothing(grounded: Flight) -> None:
+    """In MAVLink 1 an answer names nobody: it may be to another station's order."""
+    await grounded.vehicle.set_mode("STABILIZE")
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.1):
+        await grounded.vehicle.arm()
+    await anyio.sleep(6.0)
+    assert grounded.copter.arming.arm()
+    grounded.wire.deliver(FrameEncoder(1, 1).encode(CommandAck(ARM, 0, 0, 0, 0, 0)))
+    await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]

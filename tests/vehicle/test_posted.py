@@ -11,7 +11,7 @@ import pytest
 from flight_harness import Flight, in_the_air, now
 
 from aerokit import messages as m
-from aerokit.autopilots import Mode
+from aerokit.autopilots import Mode, autopilot_for
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -21,6 +21,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
+from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import MODE_GRACE_S, Helm
 from aerokit.vehicle.orders.order import Subject, subjects_of
@@ -40,6 +41,9 @@ TAKEN, NEWER, TOLD = (
 )
 
 
+COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
+
+
 class Stage:
     """A helm, heartbeats at the test's word, and orders that stay posted."""
 
@@ -48,7 +52,9 @@ class Stage:
         self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
         self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
         self.state = StateCell[int]("system_status", lambda: self.now, "HEARTBEAT")
-        cells = SimpleNamespace(mode=self.mode, armed=self.armed, system_status=self.state)
+        cells = SimpleNamespace(
+            mode=self.mode, armed=self.armed, system_status=self.state, autopilot=COPTER, is_vtol=False
+        )
         told = cast("Telemetry", cells)
         self.helm = Helm(lambda: self.now, told)
         self.tell(mode, armed)

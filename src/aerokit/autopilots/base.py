@@ -136,7 +136,7 @@ class ModeOrder(Snapshot):
 
 def whole_numbers(params: Sequence[float]) -> list[int]:
     """Parameters of a command that are numbers of modes; what is no number counts as 0."""
-    return [int(each) if math.isfinite(each) else 0 for each in params]
+    return [int(each) if 0 <= each < 2**32 else 0 for each in params]
 
 
 class Autopilot:

@@ -23,7 +23,7 @@ from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 
 __all__ = ["Px4", "px4_custom_mode"]
 
-MAIN_POSCTL, MAIN_AUTO = 3, 4
+MAIN_POSCTL, MAIN_AUTO, SUB_MISSION = 3, 4, 4
 _E = EstimatorStatusFlags
 ESTIMATES_REQUIRED = ATTITUDE_AND_HEIGHT | _E.VELOCITY_HORIZ.value | _E.VELOCITY_VERT.value
 ESTIMATOR_PROBLEMS: Mapping[int, str] = {
@@ -156,6 +156,8 @@ class Px4(Autopilot):
         base, main, sub = whole_numbers((*params, 0.0, 0.0, 0.0)[:3])
         if not base & CUSTOM_MODE_ENABLED:
             return ()
+        if main == MAIN_AUTO and not sub:
+            sub = SUB_MISSION  # which PX4 takes for none
         return (self.mode((main & 0xFF) << 16 | (sub & 0xFF) << 24, CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:

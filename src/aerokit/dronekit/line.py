@@ -53,6 +53,7 @@ class Line:
         """System id of the vehicle, 0 before it was heard."""
         self.listener_thread: ListenerThread = ListenerThread()
         """Where the callbacks of the program run."""
+        self.listener_thread.on_called = loop.proof.feed
         self.loop = loop
         """The event loop's thread."""
         self._held = held

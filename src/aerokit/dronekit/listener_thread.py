@@ -37,6 +37,8 @@ class ListenerThread:
         self._lock = threading.Lock()
         self.is_stopped: bool = False
         """Whether nothing is called any more."""
+        self.on_called: Callable[[], object] = _nothing
+        """What is called when a callback has come back."""
         self.dropped = 0
         """How many calls were dropped because a listener did not come back."""
         self._kept: dict[int, object] = {}
@@ -126,6 +128,7 @@ class ListenerThread:
                 function(*args)
             except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
                 logger.exception("Exception in a callback")
+            self.on_called()
             del function, args  # they would be kept until the next call
 
 

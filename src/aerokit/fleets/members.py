@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from aerokit.fleets.events import MemberBack, MemberFailed, MemberLost, MemberTakenBack, MemberTakenOver
 from aerokit.mavlink.enums import MavState
 from aerokit.runtime.events import VehicleBack, VehicleSilent
+from aerokit.vehicle.orders.order import FAILSAFE_STATES, is_worse
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = ["Member", "MemberState"]
-
-UNDER_FAILSAFE = (MavState.CRITICAL, MavState.EMERGENCY)
 
 
 class MemberState(enum.Enum):
@@ -59,7 +58,8 @@ class Member:
         """How it came to that, in words; empty while it is IN."""
         self._lost_at = 0.0
         self._taken_back: tuple[object, object] | None = None
-        self._minds_failsafe = True
+        self._forgiven_state: int | None = None
+        """The failsafe that was active when the program took it back."""
         self._detach: list[Detach] = []
         self._tell: Callable[[FleetEvent], None] = lambda _: None
         self._on_fallen_out: Callable[[Member], None] = lambda _: None
@@ -126,7 +126,8 @@ class Member:
     def take_back(self) -> None:
         """The program orders it again: what somebody else has done until now does not count."""
         self._taken_back = self._who_steers()
-        self._minds_failsafe = self.vehicle.system_status.latest not in UNDER_FAILSAFE
+        self._forgiven_state = self.vehicle.system_status.latest
+        self.vehicle._helm.forgive_failsafe()
         if self.vehicle.is_silent:
             self._lost_at = self.vehicle.connection.now()
             self._change(MemberState.LOST, self.vehicle.describe_link())
@@ -144,11 +145,11 @@ class Member:
         vehicle = self.vehicle
         if vehicle.is_surely_disarmed:  # on the ground there is nothing to take over
             return ""
-        status = vehicle.system_status.latest
-        if status not in UNDER_FAILSAFE:
-            self._minds_failsafe = True
-        elif self._minds_failsafe:
-            return f"it is under a failsafe (MAV_STATE {MavState(status).name})"
+        state = vehicle.system_status.latest
+        if state not in FAILSAFE_STATES:
+            self._forgiven_state = None
+        elif is_worse(state, self._forgiven_state):
+            return f"it is under a failsafe (MAV_STATE {MavState(state).name})"
         has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
         if has_ended_mission or self._who_steers() == self._taken_back:
             return ""

@@ -218,7 +218,7 @@ class StateCell(Generic[T]):
             for sink in tuple(self._sinks):
                 sink.receive(value)
 
-    def grow_older(self, seconds: float) -> None:
+    def _grow_older(self, seconds: float) -> None:
         """Count the time in which the clock stood still: the value is older by that."""
         self._catch_up()
         self._updated_at -= seconds

@@ -106,7 +106,7 @@ class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name == "_aio":  # not made yet
+            if name.startswith("_"):  # as copy asks for them before anything is made
                 raise AttributeError(name)
             return getattr(self.aio, name)  # which says what was perhaps meant
 

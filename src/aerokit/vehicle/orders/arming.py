@@ -162,7 +162,7 @@ class ArmingActions(Part):
         """
         self._late_arming.stop()
         started = self.connection.now()
-        with self._helm.aside() as order:
+        with self._helm.aside(ends_flight=True) as order:
             await give_arm(self._talk, self._orders, order, False, force=force)
             await self._await_armed(False, order, started, timeout, max_silence_s)
 

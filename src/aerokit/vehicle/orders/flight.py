@@ -234,7 +234,7 @@ class FlightActions(Part):
         def is_deep() -> bool:
             return self._where.is_known_since(order.given_at) and self._where.altitude_relative() < -SURFACE_M
 
-        stays = self._orders.stays_in(order, *order.modes, ends_flight=True)
+        stays = self._orders.stays_in(order, *order.modes)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
@@ -263,14 +263,14 @@ class FlightActions(Part):
 
         def is_back() -> bool:
             is_near = self._where.is_known_since(started) and self._where.distance_to(place) <= near_m
-            return is_near and not order.end_of_effect
+            return is_near and not order.end
 
         with self._talk.streaming("position"):
             await await_progress(
                 self._talk,
                 "return_to_launch",
                 is_done=is_back,
-                trouble=self._orders.stays_in(order, *order.modes, ends_flight=True),
+                trouble=self._orders.stays_in(order, *order.modes),
                 describe=lambda: f"it is {self._where.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,

@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     from aerokit.vehicle.orders.order import Subject
     from aerokit.vehicle.state.telemetry import Telemetry
 
-__all__ = ["KNOWN_S", "MODE_GRACE_S", "Helm"]
+__all__ = ["FIRST_HEARTBEAT_S", "KNOWN_S", "MODE_GRACE_S", "Helm"]
 
 MODE_GRACE_S = 3.0
 """How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
+FIRST_HEARTBEAT_S = 1.5
+"""So long after an order to arm was accepted a HEARTBEAT, at 1 Hz, may still tell what was before."""
 KNOWN_S = 2.5
 """What a vehicle does is known while its last HEARTBEAT is not older: two may be missing. No failsafe of ArduPilot or
 PX4 that minds a silent ground station acts sooner (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s)."""
@@ -47,7 +49,7 @@ class Helm:
         """An order that changes the mode is out and its end is not known: the mode told may be about to change."""
         self.mode_settles_at: float = -math.inf
         """Until then HEARTBEAT may tell the mode of an order that was given up."""
-        self._any_mode_until = self._own_arming_until = -math.inf
+        self._any_mode_until = self._arming_accepted_at = self._disarmed_told_at = -math.inf
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
         self._orders: list[Order] = []
@@ -74,7 +76,9 @@ class Helm:
         self._modes_ordered.extend((self._now(), each.custom_mode) for each in modes)
         if self._posted_modes():
             self.doubt_mode()
-        order = self._new(modes, lambda order: order is self.newest)
+        was_flown = self.is_flown_by_program
+        order = self._new(modes, lambda order: order is self.newest, self._end_flights(modes))
+        order.was_flown_before = was_flown
         order.is_given = self._steers()
         self.newest = order
         self._orders = [order]
@@ -86,8 +90,6 @@ class Helm:
         """The program sends one by itself; without ``modes``, any mode that follows may be its effect."""
         if not modes:
             self._any_mode_until = self._now() + MODE_GRACE_S
-        if "arm" in subjects:
-            self._own_arming_until = self._now() + MODE_GRACE_S
         return self.order(*modes, subjects=subjects)
 
     def note_reboot(self) -> None:
@@ -99,11 +101,11 @@ class Helm:
         self._armed_by_program, self._armed_at = None, math.inf
 
     @contextmanager
-    def aside(self) -> Iterator[Order]:
+    def aside(self, *, ends_flight: bool = False) -> Iterator[Order]:
         """An order that does not steer (speed, home, arming …), for the time of the block."""
         steering = self.newest
         modes = () if steering is None else steering.modes
-        order = self._new(modes, lambda _: self.newest is steering)
+        order = self._new(modes, lambda _: self.newest is steering, ends_flight)
         self._orders.append(order)
         try:
             yield order
@@ -136,9 +138,9 @@ class Helm:
         self._sendings.append(sending)
         try:
             yield sending
+            self._note_accepted(armed)
         finally:
             self._sendings.remove(sending)
-            self._note_arming_ended(armed)
 
     # --------------------------------------------------------------------------------- posted
 
@@ -155,6 +157,7 @@ class Helm:
                 each()
             if self.newest is not None:
                 self.newest.note_newer()
+                self.newest.expect(modes)
         self._note_arming(armed)
         number, now = self.note_newer(subjects), self._now()
         own_modes = {mode for at, mode in self._modes_ordered if at > now - OWN_MODES_S}
@@ -168,13 +171,14 @@ class Helm:
             armed_now=self._telemetry.armed.latest,
             state_now=self._telemetry.system_status.latest,
             moves=subjects[0] == "motion",
+            ends_flight=self._end_flights(modes),
         )
         self._posted.append(posted)
         try:
             yield posted
+            self._note_accepted(armed)
         finally:
             self._posted.remove(posted)
-            self._note_arming_ended(armed)
 
     def note_newer(self, subjects: Iterable[Subject]) -> int:
         """A newer order about these is given: what was posted about them before ends; the number of it."""
@@ -184,10 +188,15 @@ class Helm:
         self._ordered_since_disarmed.update(about)
         return number
 
-    def _note_arming_ended(self, armed: bool | None) -> None:
-        """HEARTBEAT tells an accepted order's effect up to a second later."""
+    def note_own_arming(self, armed: bool) -> None:
+        """The program has sent an order to arm or disarm, and nobody waits for its answer."""
+        self._note_arming(armed)
+        self._note_accepted(armed)
+
+    def _note_accepted(self, armed: bool | None) -> None:
+        """An order to arm was accepted, or its effect told; HEARTBEAT may tell it later."""
         if armed:
-            self._own_arming_until = self._now() + MODE_GRACE_S
+            self._arming_accepted_at = self._now()
 
     def _note_arming(self, armed: bool | None) -> None:
         if armed is None:
@@ -207,8 +216,16 @@ class Helm:
         it from that.
         """
         newest = self.newest
+        if newest is not None and newest.was_refused:
+            return newest.was_flown_before
         order = newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
         return order is not None and not order.taken_by and not order.failsafe
+
+    def forgive_failsafe(self) -> None:
+        """The program orders the vehicle again: a failsafe that is over, or was active then, does not count."""
+        for order in (self.newest, self._armed_by_program):
+            if order is not None:
+                order.forgive_failsafe()
 
     @property
     def is_obeyed(self) -> bool:
@@ -246,7 +263,9 @@ class Helm:
 
     # --------------------------------------------------------------------------------- inside
 
-    def _new(self, modes: Collection[Mode], is_newest: Callable[[Order], bool]) -> Order:
+    def _new(
+        self, modes: Collection[Mode], is_newest: Callable[[Order], bool], ends_flight: bool = False
+    ) -> Order:
         before, mode = self.newest, self._telemetry.mode.latest
         is_under_way = before is not None and mode is not None and before.is_own(mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
@@ -261,7 +280,15 @@ class Helm:
             is_newest=is_newest,
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
+            ends_flight=ends_flight,
         )
+
+    def _end_flights(self, modes: Collection[Mode]) -> bool:
+        """Whether these are modes to land or to return in."""
+        autopilot, is_vtol = self._telemetry.autopilot, self._telemetry.is_vtol
+        ends = {autopilot.mode_for("land", is_vtol=is_vtol), autopilot.mode_for("return", is_vtol=is_vtol)}
+        numbers = {each.custom_mode for each in ends if each is not None}
+        return bool(modes) and {each.custom_mode for each in modes} <= numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
         """What was posted may still bring these about, also when it has been overruled."""
@@ -291,16 +318,18 @@ class Helm:
             self._ordered_since_disarmed.clear()
         if armed and not before:
             self._note_armed_anew()
+        if not armed:
+            self._disarmed_told_at = self._telemetry.armed.updated_at
         for each in self._followers():
             each.note_armed(armed, self._telemetry.armed.updated_at)
 
     def _note_armed_anew(self) -> None:
         self._armed_at = self._telemetry.armed.updated_at
-        is_ordered = (
-            any(each.arms for each in self._sendings)
-            or any(each.armed for each in self._posted)
-            or self._now() < self._own_arming_until
-        )
+        is_under_way = any(each.arms for each in self._sendings) or any(each.armed for each in self._posted)
+        # Disarmed again after an order to arm was accepted, it was armed by somebody else.
+        is_accepted = math.isfinite(self._arming_accepted_at)
+        is_first = self._disarmed_told_at <= self._arming_accepted_at + FIRST_HEARTBEAT_S
+        is_ordered = is_under_way or (is_accepted and is_first)
         newest = self.newest
         modes = () if newest is None or newest.taken_by else newest.modes
         self._armed_by_program = self._new(modes, lambda _: True) if is_ordered else None

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.errors import AerokitError
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import MavCmd
+from aerokit.vehicle.orders.helm import FIRST_HEARTBEAT_S
 from aerokit.vehicle.orders.leftover import Leftover
 
 if TYPE_CHECKING:
@@ -22,9 +23,7 @@ __all__ = ["LATE_S", "LateArming", "give_arm"]
 
 LATE_S = 15.0
 """For so long after an order to arm was given up the vehicle is watched, and disarmed if that order arms it."""
-FIRST_HEARTBEAT_S = 1.5
-"""A vehicle that HEARTBEAT, at 1 Hz, calls armed so soon after the order was sent was armed by it."""
-ACK_S = 1.0
+ACK_S = 3.0
 """How long after a HEARTBEAT that says armed the COMMAND_ACK of the order may come."""
 ARMING_AT_END_S = 1.5
 """How long the end of a block waits for it."""
@@ -60,11 +59,22 @@ class LateArming:
         self._leftover.start(partial(self._look, order, was_armed, self._helm.arming_orders))
 
     async def _look(self, order: Order, was_armed: bool, count: int) -> None:
-        with anyio.move_on_after(LATE_S):
-            await self._disarm_again(order, was_armed, count)
+        armed = self._talk.telemetry.armed
+        disarmed_at = [order.given_at]
+        stop = armed.observe(
+            lambda _, value: None if value else disarmed_at.append(armed.updated_at), every_arrival=True
+        )
+        has_armed = False
+        try:
+            with anyio.move_on_after(LATE_S):
+                has_armed = await self._arms(was_armed)
+        finally:
+            stop()
+        if has_armed:
+            await self._disarm_again(order, count, disarmed_at[-1])
 
-    async def _disarm_again(self, order: Order, was_armed: bool, count: int) -> None:
-        """What was armed before the order, or by somebody else, is left alone."""
+    async def _arms(self, was_armed: bool) -> bool:
+        """Wait until it arms; what was armed before the order is left alone until it has disarmed."""
         armed, since = self._talk.telemetry.armed, self._talk.connection.now()
         try:
             if was_armed:
@@ -72,10 +82,14 @@ class LateArming:
             await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
         except AerokitError as error:
             logger.warning("the link ended while an order to arm may still be carried out: %s", error)
-            return
+            return False
+        return True
+
+    async def _disarm_again(self, order: Order, count: int, disarmed_at: float) -> None:
+        """What somebody else has armed is left alone."""
         if self._helm.arming_orders != count:  # the program has ordered it by a command of its own
             return
-        if not await self._has_armed(order):
+        if not await self._has_armed(order, disarmed_at):
             logger.warning(
                 "the vehicle armed after an order to arm was given up, and nothing shows that this order"
                 " did it: it is left armed"
@@ -84,28 +98,29 @@ class LateArming:
         logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
         with anyio.CancelScope(shield=True):
             try:
-                with self._helm.aside() as order:
+                with self._helm.aside(ends_flight=True) as order:
                     await give_arm(self._talk, self._orders, order, False)
             except AerokitError as error:
                 logger.error(
                     "the vehicle armed after the order was given up, and could not be disarmed: %s", error
                 )
 
-    async def _has_armed(self, order: Order) -> bool:
+    async def _has_armed(self, order: Order, disarmed_at: float) -> bool:
         """Whether it was this order that armed the vehicle, and not a pilot.
 
-        That is certain when the vehicle has accepted the order. Without an answer the time tells, unless somebody
-        else has taken the vehicle.
+        It was when the vehicle has accepted it and has not told since that it is disarmed. Without an answer the time
+        tells, unless somebody else has taken the vehicle.
         """
         told_after = self._talk.telemetry.armed.updated_at - order.given_at
         if not order.end and told_after <= FIRST_HEARTBEAT_S:
             return True
-        if not self._is_accepted():
+        if not self._is_accepted(disarmed_at):
             await anyio.sleep(ACK_S)
-        return self._is_accepted()
+        return self._is_accepted(disarmed_at)
 
-    def _is_accepted(self) -> bool:
-        return self._talk.commands.last_result(MavCmd.COMPONENT_ARM_DISARM) == MavResult.ACCEPTED
+    def _is_accepted(self, disarmed_at: float) -> bool:
+        accepted_at = self._talk.commands.accepted_at(MavCmd.COMPONENT_ARM_DISARM)
+        return disarmed_at <= accepted_at + FIRST_HEARTBEAT_S
 
     def stop(self) -> None:
         """Another order about arming is given."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
 __all__ = [
+    "ARM_ALONE",
     "CHANGED_BY_COMMAND",
     "FAILSAFE_STATES",
     "QUESTIONS",
@@ -31,7 +32,7 @@ Subject = Literal["mode", "motion", "arm"]
 
 _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
-_ARM: tuple[Subject, ...] = ("arm",)
+ARM_ALONE: tuple[Subject, ...] = ("arm",)
 CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: _MODE,
     MavCmd.NAV_LAND: _MODE,
@@ -49,7 +50,7 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_ORBIT: _MOTION,
     MavCmd.DO_REPOSITION: _MOTION,
     MavCmd.DO_PAUSE_CONTINUE: _MOTION,
-    MavCmd.COMPONENT_ARM_DISARM: _ARM,
+    MavCmd.COMPONENT_ARM_DISARM: ARM_ALONE,
 }
 """MAV_CMD → what a program changes that sends it by itself: what an action left to be done must not come after it."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
@@ -92,9 +93,15 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
     return CHANGED_BY_MESSAGE.get(message.NAME, ())
 
 
+def is_worse(state: int, before: int | None) -> bool:
+    """Whether a failsafe is active in this MAV_STATE that was not in the one before, or a worse one."""
+    return state in FAILSAFE_STATES and (before not in FAILSAFE_STATES or state > before)
+
+
 def failsafe_text(state: int) -> str:
     """A clause for error texts."""
-    return f"a failsafe became active (MAV_STATE_{MavState(state).name})"
+    name = MavState(state).name
+    return f"a failsafe became active (MAV_STATE_{name}): the vehicle is left to it, and not told to hold"
 
 
 class Order:
@@ -118,8 +125,13 @@ class Order:
         is_newest: Callable[[Order], bool],
         settles_at: float = -math.inf,
         any_until: float = -math.inf,
+        ends_flight: bool = False,
     ) -> None:
         self.given_at = given_at
+        self.was_refused: bool = False
+        """Whether the vehicle has said no to it: it does what it did before."""
+        self.was_flown_before: bool = False
+        """Whether the vehicle did what this program had ordered before."""
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.taken_by: str = ""
         """What somebody else has done, as a clause; empty: nothing that was told."""
@@ -139,7 +151,7 @@ class Order:
         self._own = {each.custom_mode for each in modes}
         self._is_mode_known = mode_before is not None
         self._was_armed = armed_before
-        self._had_failsafe = state_before in FAILSAFE_STATES
+        self._state_before, self._ends_flight = state_before, ends_flight
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
         self.is_overruled: bool = False
@@ -148,16 +160,9 @@ class Order:
     @property
     def end(self) -> str:
         """Why nothing of it may be sent any more, as a clause; empty while it may."""
-        return self.taken_by or self.failsafe or self.end_of_effect
-
-    @property
-    def end_of_effect(self) -> str:
-        """Why the vehicle no longer does what was ordered, as a clause; empty while it may.
-
-        A failsafe alone is no reason: a vehicle that was told to land goes on landing.
-        """
+        failsafe = "" if self._ends_flight else self.failsafe
         is_over = self.is_overruled or not self._is_newest(self)
-        return self.taken_by or ("another order was given" if is_over else "")
+        return self.taken_by or failsafe or ("another order was given" if is_over else "")
 
     def note_newer(self) -> None:
         """A newer order steers, which is none of these."""
@@ -183,11 +188,21 @@ class Order:
         self._is_mode_known = True
 
     def note_state(self, state: int) -> None:
-        """Take MAV_STATE. A failsafe that was active when the order was given does not end it: the program knew it."""
-        is_active = state in FAILSAFE_STATES
-        if is_active and not self._had_failsafe:
+        """Take MAV_STATE. A failsafe that was active when the order was given does not end it: the program knew it.
+
+        Nor does any end an order to land, to return or to disarm: it is sent again if need be.
+        """
+        if is_worse(state, self._state_before):
             self.failsafe = self.failsafe or failsafe_text(state)
-        self._had_failsafe = is_active
+        self._state_before = state
+
+    def forgive_failsafe(self) -> None:
+        """The program orders the vehicle again, which is still in a mode of this order."""
+        self.failsafe = ""
+
+    def expect(self, modes: Collection[Mode]) -> None:
+        """The program has posted an order that brings these about."""
+        self._own |= {each.custom_mode for each in modes}
 
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed."""

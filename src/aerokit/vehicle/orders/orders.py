@@ -12,7 +12,7 @@ from aerokit.protocols.command import ATTEMPT_TIMEOUT_S
 from aerokit.protocols.repeatable import ATTEMPTS
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS
+from aerokit.vehicle.orders.order import ARM_ALONE, CHANGED_BY_COMMAND, QUESTIONS
 from aerokit.vehicle.orders.progress import await_progress
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ class Orders:
                 await send(command, *params, standing=sending, **options)
             except CommandRejected as error:
                 if not sending.has_worked:
+                    order.was_refused = True
                     await self._talk.settle()
                     raise self._talk.explained(error, started) from None
             except CommandTimeout as error:
@@ -72,7 +73,7 @@ class Orders:
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
         """Who has taken the vehicle is the better answer; an order that cannot be taken back may still arrive."""
-        if order.taken_by or order.failsafe:
+        if order.taken_by or (order.failsafe and order.end):
             return OperationRejected(str(error), reasons=self._talk.texts_since(order.given_at))
         return error
 
@@ -158,8 +159,8 @@ class Orders:
 
         def trouble() -> str | None:
             nonlocal arrived
-            if end := order.end_of_effect if ends_flight else order.end:
-                return end
+            if order.end:
+                return order.end
             if self._talk.telemetry.is_surely_disarmed:
                 return "the vehicle disarmed"
             if self._talk.connection.now() < settles_at:
@@ -217,7 +218,7 @@ class Orders:
     @contextmanager
     def _own_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
         """A program that steers past the actions gives a new order, which ends theirs."""
-        if command in CHANGED_BY_COMMAND:
+        if CHANGED_BY_COMMAND.get(command, ARM_ALONE) != ARM_ALONE:
             yield self._helm.order_of_the_programs_own(CHANGED_BY_COMMAND[command], modes=modes)
         else:
             with self._helm.aside() as order:

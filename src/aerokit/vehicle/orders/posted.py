@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.vehicle.orders.order import FAILSAFE_STATES, failsafe_text
+from aerokit.vehicle.orders.order import failsafe_text, is_worse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -36,6 +36,7 @@ class Posted:
         mode_now: Mode | None,
         armed_now: bool | None,
         state_now: int | None = None,
+        ends_flight: bool = False,
         moves: bool = False,
     ) -> None:
         self.has_worked: bool = False
@@ -50,7 +51,7 @@ class Posted:
         self._own_modes, self._moves = set(own_modes), moves
         self._mode_before = None if mode_now is None else mode_now.custom_mode
         self._armed_before = armed_now
-        self._had_failsafe = state_now in FAILSAFE_STATES
+        self._state_before, self._ends_flight = state_now, ends_flight
 
     @property
     def end(self) -> str:
@@ -63,11 +64,10 @@ class Posted:
         return self._taken_by if self._is_newest() else "a newer order was given meanwhile"
 
     def note_state(self, state: int) -> None:
-        """Take MAV_STATE. To disarm is meant whatever failsafe is active."""
-        is_active = state in FAILSAFE_STATES
-        if is_active and not self._had_failsafe and self.armed is not False:
+        """Take MAV_STATE. To disarm, to land and to return is meant whatever failsafe is active."""
+        if is_worse(state, self._state_before) and not self._ends_flight and self.armed is not False:
             self._taken_by = self._taken_by or failsafe_text(state)
-        self._had_failsafe = is_active
+        self._state_before = state
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""

@@ -13,7 +13,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
 from aerokit.runtime.cells import StateCell
 from aerokit.runtime.subscription import Overflow, Subscription
-from aerokit.vehicle.orders.order import Subject, subjects_of
+from aerokit.vehicle.orders.order import ARM_ALONE, Subject, subjects_of
 from aerokit.vehicle.orders.part import Part
 from aerokit.vehicle.orders.posting import PostedOrder
 from aerokit.vehicle.talk.every_stream import every_stream
@@ -138,7 +138,9 @@ class TalkActions(Part):
         """The program has sent this to the vehicle past it (``connection.send``): it counts as by :meth:`send`."""
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
-        if subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
+        if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
+            self._helm.note_own_arming(message.param1 == 1)
+        elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
             names = self.telemetry.mode_names
             modes: tuple[Mode, ...] = ()
             if not isinstance(message, SetMode):

@@ -84,7 +84,6 @@ class ParameterAccess:
     def forget(self) -> None:
         """The vehicle has started anew, perhaps with another firmware."""
         self.store.forget()
-        self.written.clear()
         self._has_pack = None
 
     # ------------------------------------------------------------------------------- all of them

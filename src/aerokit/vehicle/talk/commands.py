@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
@@ -59,6 +60,7 @@ class CommandSender:
         """Of those that run."""
         self._under_way: dict[_Key, list[float]] = {}
         self._results: dict[_Key, int] = {}
+        self._accepted_at: dict[_Key, float] = {}
         self._is_closed = False
         self._detach = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
@@ -156,9 +158,15 @@ class CommandSender:
         """Whether it has said that it does not know a command, or not in the form that it had."""
         return self.last_result(command, component_id) in UNKNOWN
 
+    def accepted_at(self, command: int) -> float:
+        """When the autopilot last accepted a command of ours, by an answer that names us; −inf: it has not."""
+        return self._accepted_at.get((self._component_id, command), -math.inf)
+
     def forget_result(self, command: int, component_id: int | None = None) -> None:
         """What was answered does not count any more."""
-        self._results.pop((self._component_id if component_id is None else component_id, command), None)
+        key = (self._component_id if component_id is None else component_id, command)
+        self._results.pop(key, None)
+        self._accepted_at.pop(key, None)
 
     def forget_results(self) -> None:
         """The vehicle has rebooted: what it knows may be other commands."""
@@ -245,6 +253,8 @@ class CommandSender:
         is_answer = (run is not None or key in self._under_way) and self.is_for_us(ack)
         if is_answer and ack.result != MavResult.IN_PROGRESS:
             self._results[key] = ack.result
+            if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
+                self._accepted_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
         elif key in self._under_way and ack.result != MavResult.IN_PROGRESS:

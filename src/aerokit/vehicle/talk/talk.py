@@ -286,7 +286,7 @@ class Talk:
     def _on_computer_slept(self, event: ComputerSlept) -> None:
         self.watch.last_heartbeat_at -= event.seconds
         for cell in (*self.telemetry.cells.values(), *self._cells):
-            cell.grow_older(event.seconds)
+            cell._grow_older(event.seconds)
 
     def _on_link_report(self, report: LinkReport) -> None:
         self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
