@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.orders.late_arming import FIRST_HEARTBEAT_S
+from aerokit.vehicle.orders.helm import FIRST_HEARTBEAT_S
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
 KNOWN_S = 2.6

@@ -423,16 +423,20 @@ def test_vehicle_that_a_pilot_armed_after_a_refusal_or_a_disarming_is_his() -> N
     assert not stage.helm.is_flown_by_program
 
 
+def flies(stage: Stage) -> bool:
+    return stage.helm.is_flown_by_program
+
+
 def test_refused_order_changes_nothing_about_who_flies() -> None:
     stage = Stage()
     refused = stage.helm.order(GUIDED)
     refused.was_refused = True
-    assert not stage.helm.is_flown_by_program
+    assert not flies(stage)
     stage.helm.order(GUIDED)
-    assert stage.helm.is_flown_by_program
+    assert flies(stage)
     refused = stage.helm.order(BRAKE)
     refused.was_refused = True
-    assert stage.helm.is_flown_by_program
+    assert flies(stage)
 
 
 def test_failsafe_is_forgiven_when_the_program_takes_the_vehicle_back() -> None:
@@ -441,9 +445,9 @@ def test_failsafe_is_forgiven_when_the_program_takes_the_vehicle_back() -> None:
     stage.tell(GUIDED)
     stage.tell(GUIDED, state=MavState.CRITICAL)
     stage.tell(GUIDED)
-    assert not stage.helm.is_flown_by_program
+    assert not flies(stage)
     stage.helm.forgive_failsafe()
-    assert stage.helm.is_flown_by_program
+    assert flies(stage)
 
 
 def test_posted_mode_after_an_order_is_the_programs_own() -> None:

@@ -22,13 +22,20 @@ QUIET_TURNS = 3
 first in a turn, timers or sockets."""
 
 
+CLOCKS = {
+    "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
+    "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
+}
+"""System → a clock that goes on while the computer sleeps, and the loop's. That of Windows goes on."""
+
+
 def asleep_s() -> float:
     """Seconds that the computer has slept since it was started, during which the loop's clock stood still."""
-    if sys.platform == "linux":
-        return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
-    if sys.platform == "darwin":
-        return time.clock_gettime(time.CLOCK_MONOTONIC) - time.clock_gettime(time.CLOCK_UPTIME_RAW)
-    return 0.0  # the clock of Windows goes on
+    clocks = CLOCKS.get(sys.platform)
+    if clocks is None:
+        return 0.0
+    all_of_it, awake = (time.clock_gettime(getattr(time, each)) for each in clocks)
+    return all_of_it - awake
 
 
 class LoopWatch:
