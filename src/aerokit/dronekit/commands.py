@@ -184,7 +184,9 @@ class CommandSequence:
                 return
             held = self._held = self._held.replace(is_changed=True)  # until it is known to be there
         aio = self._core.check_link()
-        self._core.run(aio.mission.upload, _mission_of(held.items, aio), timeout=timeout)
+        # DroneKit knows no such limit, and its programs run unchanged.
+        options = {"timeout": timeout, "max_distance_m": math.inf}
+        self._core.run(aio.mission.upload, _mission_of(held.items, aio), **options)
         with self._lock:
             self._uploaded = values
             if self._held is held:

@@ -108,10 +108,9 @@ class LoopThread:
     ) -> T:
         """``patience_s``: how long to wait for the end of an interrupted call; None: as long as it takes."""
         call: _Call[T] | None = None
-        waits = object()
-        self.proof.waiting.add(waits)
         try:
             call = _Call(functools.partial(function, *args, **kwargs))
+            self.proof.waiting.add(call)
             self._start(call)
             self.wait_for(call)
         except BaseException as error:
@@ -128,7 +127,7 @@ class LoopThread:
                     raise error from failure
             raise
         finally:
-            self.proof.waiting.discard(waits)
+            self.proof.waiting.discard(call)
             self.proof.feed()
         return call.result()
 
