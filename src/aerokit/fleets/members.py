@@ -153,7 +153,7 @@ class Member:
         has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
         if has_ended_mission or self._who_steers() == self._taken_back:
             return ""
-        is_others = vehicle.is_armed and not vehicle.is_flown_by_program
+        is_others = vehicle.is_armed and vehicle._helm.current is None
         return vehicle.taken_over or ("somebody else has armed it" if is_others else "")
 
     def _who_steers(self) -> tuple[object, object]:

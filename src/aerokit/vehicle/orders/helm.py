@@ -215,11 +215,16 @@ class Helm:
         The program has armed it, or has given an order that steers since somebody else did, and nobody else has taken
         it from that.
         """
-        newest = self.newest
-        if newest is not None and newest.was_refused:
-            return newest.was_flown_before
-        order = newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
+        order = self.current
+        if order is not None and order.was_refused:
+            return order.was_flown_before
         return order is not None and not order.taken_by and not order.failsafe
+
+    @property
+    def current(self) -> Order | None:
+        """The program's order since the vehicle was armed: its newest that steers, or the one that armed it."""
+        newest = self.newest
+        return newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
 
     def forgive_failsafe(self) -> None:
         """The program orders the vehicle again: a failsafe that is over, or was active then, does not count."""

@@ -68,7 +68,7 @@ class ModeActions(Part):
         "a failsafe became active (MAV_STATE_CRITICAL)", which may come some seconds before the mode changes.
         A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
         """
-        order = self._helm.newest
+        order = self._helm.current or self._helm.newest
         if order is None or not order.has_lost_mode:
             return "" if order is None else order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
