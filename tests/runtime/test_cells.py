@@ -321,7 +321,7 @@ async def test_what_works_out_values_is_told_who_watches_and_asked_by_who_looks(
     assert not feed.pending
     assert feed.cell._latest == 6
     feed.cell.changes()
-    assert feed.told == [True, False, True]
+    assert feed.told == [True, False] * 3  # each was dropped at once
 
 
 async def test_repr_is_readable() -> None:
@@ -340,3 +340,19 @@ async def _next(changes: object, skip: int = 0) -> object:
 def _timers() -> list[asyncio.TimerHandle]:
     loop = asyncio.get_running_loop()
     return list(loop._scheduled)  # type: ignore[attr-defined]
+
+
+async def test_cell_that_nobody_follows_any_more_is_not_watched() -> None:
+    """A loop that was left by ``break`` costs nothing afterwards."""
+    cell = make_cell()
+    cell.set(1, HEARTBEAT)
+    for follow in (cell.changes, cell.updates):
+        async for _ in follow():
+            assert cell._is_watched
+            break
+        assert not cell._is_watched
+    one, other = cell.changes(), cell.changes()
+    del one
+    assert cell._is_watched
+    del other
+    assert not cell._is_watched

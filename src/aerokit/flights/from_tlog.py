@@ -98,7 +98,7 @@ class _Reader:
         self._ordered_at, self._hears_orders = -math.inf, False
         self._status = 0
         self._has_battery_status = False
-        self._place = self._local = self._local_target = (NAN, NAN, NAN)
+        self._place = self._local = (NAN, NAN, NAN)
         self._relative = NAN
         self._told_of_breach = False
         self._where_to = Columns(*flight.position_target.names)

@@ -52,7 +52,7 @@ class _UdpLink(BaseLink):
 
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
-        self._scheme, self._host, self._port = scheme, host, port
+        self._host, self._port = host, port
         self._loop: asyncio.AbstractEventLoop | None = None
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # only on loops without add_reader

@@ -61,7 +61,7 @@ class StateCell(Generic[T]):
         "_closed_by",
         "_explain_timeout",
         "_feeds",
-        "_is_followed",
+        "_followers",
         "_known",
         "_latest",
         "_sinks",
@@ -95,7 +95,7 @@ class StateCell(Generic[T]):
         self._arrivals = 0
         self._changes = 0
         self._sinks: list[_Sink[T]] = []
-        self._is_followed = False
+        self._followers = 0
         self._feeds: tuple[Feed, ...] = ()
         self._closed_by: BaseException | None = None
 
@@ -238,7 +238,7 @@ class StateCell(Generic[T]):
     @property
     def _is_watched(self) -> bool:
         """Whether somebody waits for values, observes or follows them, so that each one counts."""
-        return self._is_followed or bool(self._sinks)
+        return bool(self._followers or self._sinks)
 
     def close(self, error: BaseException) -> None:
         """No value will come any more: whoever waits, now or later, gets ``error``. Reading still works."""
@@ -266,10 +266,13 @@ class StateCell(Generic[T]):
         self._tell_feeds()
 
     def _follow(self) -> None:
-        if not self._is_followed:
-            self._catch_up()
-            self._is_followed = True
-            self._tell_feeds()
+        self._catch_up()
+        self._followers += 1
+        self._tell_feeds()
+
+    def _unfollow(self) -> None:
+        self._followers -= 1
+        self._tell_feeds()
 
     def _tell_feeds(self) -> None:
         for feed in self._feeds:
@@ -299,15 +302,20 @@ class StateCell(Generic[T]):
 class Changes(AsyncIterator[T]):
     """An endless asynchronous iterator over a cell; the latest value wins.
 
-    Raises the error that the cell was closed with. It is registered at the cell only while it waits.
+    Raises the error that the cell was closed with. It is registered at the cell only while it waits. Until it is
+    dropped, each value is decoded as it comes.
     """
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
-        self._cell = cell
         cell._follow()
+        self._cell = cell
         self._every_arrival = every_arrival
         self._read_at = self._count() - (1 if cell.is_known else 0)
         self._missed = 0
+
+    def __del__(self) -> None:
+        if hasattr(self, "_cell"):
+            self._cell._unfollow()
 
     @property
     def missed(self) -> int:

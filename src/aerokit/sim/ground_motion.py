@@ -109,11 +109,6 @@ class GroundMotion(Motion):
         self.speed_m_s = 0.0
         self.stop()
 
-    @property
-    def is_standing(self) -> bool:
-        """Whether the wheels do not turn."""
-        return abs(self.speed_m_s) < 0.01 and self._wanted_speed == 0.0
-
     def _turn_rate(self) -> float:
         wheels, rate = self.wheels, self._rate
         if self._heading is not None:

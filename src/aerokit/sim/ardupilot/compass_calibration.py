@@ -33,13 +33,12 @@ class CompassCalibration:
         self._mask = 0
         self._started_at = math.inf
         self._saves = False
-        self._is_saved = False
         self._next = 0
         self._reported = 0
 
     def reset(self) -> None:
         """Give up, as a reboot does."""
-        self._mask, self._started_at, self._is_saved = 0, math.inf, False
+        self._mask, self._started_at = 0, math.inf
 
     @property
     def is_running(self) -> bool:
@@ -72,7 +71,7 @@ class CompassCalibration:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
         self._mask = whole(command.param1) & _ALL or _ALL
-        self._started_at, self._saves, self._is_saved = self._vehicle.now, command.param3 != 0.0, False
+        self._started_at, self._saves = self._vehicle.now, command.param3 != 0.0
         return MavResult.ACCEPTED
 
     def _accept(self, command: Command) -> int:

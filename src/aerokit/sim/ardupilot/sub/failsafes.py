@@ -37,7 +37,6 @@ class SubFailsafes(Failsafes):
         self.pressure: _HullLimit = _HullLimit("pressure", "FS_PRESS")
         self.temperature: _HullLimit = _HullLimit("temperature", "FS_TEMP")
         self._gcs_warned_at = self._leak_warned_at = -math.inf
-        self._radio_heard_before = True
 
     @property
     def is_any_active(self) -> bool:
