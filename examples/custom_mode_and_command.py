@@ -21,7 +21,7 @@ async def main(address: str) -> None:
             print(f"mode {vehicle.mode.value}")
         try:
             await vehicle.set_mode("FASTER")
-        except errors.LocalProtocolError as error:
+        except errors.InvalidArgument as error:
             print(error)
 
         with vehicle.subscribe(messages.AutopilotVersion) as versions:

@@ -6,7 +6,7 @@ import pytest
 from flight_harness import Flight
 
 from aerokit.cli import main
-from aerokit.errors import LocalProtocolError, ParameterRejected
+from aerokit.errors import InvalidArgument, ParameterRejected
 from aerokit.links import parse_address
 from aerokit.sim.kinds import kind_class
 from aerokit.wording import did_you_mean, shown
@@ -41,12 +41,12 @@ def test_commands_and_options(arguments: list[str], meant: str, capsys: pytest.C
     ],
 )
 def test_schemes_and_options_of_addresses(address: str, meant: str) -> None:
-    with pytest.raises(LocalProtocolError, match=f"did you mean {meant}"):
+    with pytest.raises(InvalidArgument, match=f"did you mean {meant}"):
         parse_address(address)
 
 
 def test_kinds() -> None:
-    with pytest.raises(LocalProtocolError, match="did you mean 'rover'"):
+    with pytest.raises(InvalidArgument, match="did you mean 'rover'"):
         kind_class("rowver")
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import geo
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 latitudes = st.floats(-85, 85)
 longitudes = st.floats(-180, 179.9)
@@ -54,7 +54,7 @@ def test_across_the_date_line() -> None:
     ],
 )
 def test_what_is_no_place_is_refused_by_name(latitude: Any, longitude: Any, text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         geo.check_place(latitude, longitude)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink import Dialect
 from aerokit.missions import Plan, read_plan_file
 from aerokit.missions.plan_file import format_plan, parse_plan
@@ -137,7 +137,7 @@ def deepest_plan() -> Plan:
 
 
 def test_a_plan_that_is_nested_too_deep_to_be_written_again() -> None:
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         format_plan(deepest_plan())
 
 
@@ -210,7 +210,7 @@ def test_values_of_an_enum_have_64_bits(tmp_path: Path) -> None:
 def test_a_dialect_that_is_wrong(text: str, complaint: str, tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
     path.write_text(text)
-    with pytest.raises(LocalProtocolError, match=complaint):
+    with pytest.raises(InvalidArgument, match=complaint):
         Dialect.from_xml(path)
 
 

@@ -181,7 +181,7 @@ def test_commands_and_their_refusals(vehicle: aerokit.sync.Vehicle, copter: Simu
 
 
 def test_exceptions_come_through_as_they_are(vehicle: aerokit.sync.Vehicle) -> None:
-    with pytest.raises(errors.LocalProtocolError, match="FASTER"):
+    with pytest.raises(errors.InvalidArgument, match="FASTER"):
         vehicle.set_mode("FASTER")
     with pytest.raises(errors.OperationRejected, match="not armed"):
         vehicle.take_off(5)
@@ -320,13 +320,13 @@ def test_close_on_the_loop_thread(copter: SimulatedCopter) -> None:
 
 
 def test_a_connect_that_fails_leaves_no_thread() -> None:
-    with pytest.raises(errors.LocalProtocolError):
+    with pytest.raises(errors.InvalidArgument):
         aerokit.sync.connect("nonsense")
     with pytest.raises(errors.LinkOpenError):
         aerokit.sync.connect(f"tcp:127.0.0.1:{unused_port()}")
     with pytest.raises(errors.ConnectFailed):
         aerokit.sync.connect("udpin:127.0.0.1:0", timeout=0.05)
-    with pytest.raises(errors.LocalProtocolError):
+    with pytest.raises(errors.InvalidArgument):
         aerokit.sync.open_connection("nonsense")
 
 

@@ -12,7 +12,7 @@ from ctrl_c import interrupt_soon
 from served_copter import served
 
 import aerokit.sync
-from aerokit.errors import LocalProtocolError, ParameterRejected, RollbackFailed
+from aerokit.errors import InvalidArgument, ParameterRejected, RollbackFailed
 from aerokit.events import SettingChanged
 from aerokit.sim import SimulatedCamera, SimulatedCopter
 from aerokit.sync.twins import Settings
@@ -105,7 +105,7 @@ def test_settings_of_a_camera() -> None:
         assert settings.set("CAM_WBMODE", "Sunny").value == settings.get("CAM_WBMODE") == 4
         assert settings.options("CAM_WBMODE") == {"Auto": 0, "Sunny": 4, "Cloudy": 5}
         assert settings.excluded_by("CAM_ISO") == ("CAM_EXPMODE = Auto",)
-        with pytest.raises(LocalProtocolError, match="excluded by"):
+        with pytest.raises(InvalidArgument, match="excluded by"):
             settings.set("CAM_ISO", 400)
         with vehicle.subscribe(SettingChanged, capacity=4) as changes:
             settings.set("CAM_OWNER", "me")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import aerokit
-from aerokit.errors import BusyError, LinkLost, LinkOpenError, LocalProtocolError, NotSupported
+from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError, NotSupported
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.video import open_video
 
@@ -167,7 +167,7 @@ async def test_one_reader(tmp_path: Path) -> None:
     "wrong", [{"uri": ""}, {"uri": "x", "timeout": 0.0}, {"uri": "x", "silence_s": -1.0}]
 )
 async def test_wrong_arguments(wrong: dict[str, Any]) -> None:
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         async with open_video(**wrong):
             pass
 

@@ -12,7 +12,7 @@ from served_copter import served_copter
 
 import aerokit
 import aerokit.sync
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 ASYNCHRONOUS: dict[str, Any] = {"connect": aerokit.connect, "open_connection": aerokit.open_connection}
 BLOCKING: dict[str, Any] = {
@@ -56,7 +56,7 @@ def test_the_asynchronous_one_without_asyncio_says_what_to_do(name: str) -> None
     """As trio runs a coroutine."""
     opened: Any = ASYNCHRONOUS[name]("udpin:127.0.0.1:0")
     with pytest.raises(
-        LocalProtocolError, match=rf"{name}\(…\) runs on asyncio, and .* use aerokit.sync"
+        InvalidArgument, match=rf"{name}\(…\) runs on asyncio, and .* use aerokit.sync"
     ) as caught:
         opened.__aenter__().send(None)
     assert caught.value.__suppress_context__

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from aerokit import Position, messages
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.missions import Fence, Mission, RallyPoints
 from aerokit.vehicle.orders.setpoints import (
     AttitudeSetpoint,
@@ -209,6 +209,6 @@ def _arguments(
 
 def refusal_of(misuse: Misuse, error: BaseException | None) -> str | None:
     """What is wrong with how it was refused; None when nothing is."""
-    if not isinstance(error, LocalProtocolError):
+    if not isinstance(error, InvalidArgument):
         return f"{misuse!r}: {error!r}"
     return None if misuse.parameter in str(error) else f"{misuse!r} is not named: {error}"

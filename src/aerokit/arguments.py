@@ -16,7 +16,7 @@ from numbers import Integral, Real
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.wording import one, shown
 
 __all__ = ["checked", "checks_arguments"]
@@ -57,7 +57,7 @@ _SECONDS: dict[str, Rule] = {
 
 
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
-    """Have all public methods of a class check their arguments; LocalProtocolError names the first wrong one."""
+    """Have all public methods of a class check their arguments; InvalidArgument names the first wrong one."""
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):
             setattr(cls, name, checked(member, times_are_above_zero=True))
@@ -131,7 +131,7 @@ def _is_time(parameter: inspect.Parameter) -> bool:
 def _complain_unless(rule: Rule, name: str, value: object) -> None:
     check, allowed = rule
     if not check(value):
-        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: {allowed}")
+        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: {allowed}")
 
 
 # ------------------------------------------------------------------------------------- annotations

@@ -8,7 +8,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -40,7 +40,7 @@ class _Block(AbstractAsyncContextManager[T]):
         try:
             asyncio.get_running_loop()
         except RuntimeError:  # trio.run, for example
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{self._name}(…) runs on asyncio, and no event loop of asyncio is running here: start the program by"
                 " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"
             ) from None
@@ -48,7 +48,7 @@ class _Block(AbstractAsyncContextManager[T]):
             return await self._block.__aenter__()
         except (
             LinkOpenError,
-            LocalProtocolError,
+            InvalidArgument,
         ) as error:  # where in here it came from says nothing to a program
             raise error.with_traceback(None) from error.__cause__
 

@@ -20,10 +20,10 @@ __all__ = [
     "FleetError",
     "GimbalTaken",
     "HeartbeatTimeout",
+    "InvalidArgument",
     "LinkError",
     "LinkLost",
     "LinkOpenError",
-    "LocalProtocolError",
     "MissionRejected",
     "MissionTimeout",
     "NotSupported",
@@ -223,11 +223,11 @@ class SetpointStreamStopped(OperationRejected):
 # ------------------------------------------------------------------------------- protocol, state
 
 
-class LocalProtocolError(AerokitError, ValueError):
-    """We were asked to send nonsense; the text says which field, which value and what is allowed. Nothing was sent."""
+class InvalidArgument(AerokitError, ValueError):
+    """An argument cannot be right: the text says which, its value, and what is allowed. Nothing was sent."""
 
 
-class FileFormatError(LocalProtocolError):
+class FileFormatError(InvalidArgument):
     """A file on this computer is damaged or of another kind; the text names file, place and what was expected."""
 
 

@@ -6,7 +6,7 @@ import math
 from numbers import Real
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from geographiclib.geodesic import Geodesic
@@ -47,10 +47,10 @@ def north_east_m(
 
 
 def check_place(latitude_deg: float, longitude_deg: float) -> None:
-    """Raise :class:`LocalProtocolError`, which names the field, unless this is a place on earth."""
+    """Raise :class:`InvalidArgument`, which names the field, unless this is a place on earth."""
     for name, value, limit in (("latitude_deg", latitude_deg, 90), ("longitude_deg", longitude_deg, 180)):
         if not isinstance(value, (float, int, Real)) or not -limit <= value <= limit:
-            raise LocalProtocolError(f"{name} = {value!r} is not allowed: -{limit} to {limit} degrees")
+            raise InvalidArgument(f"{name} = {value!r} is not allowed: -{limit} to {limit} degrees")
 
 
 def wrap_360(angle_deg: float) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit import geo
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ class Position(Snapshot):
     """A place: degrees (WGS 84) and metres; ``Position(47.3977, 8.5456, altitude_relative_m=30)``.
 
     ``altitude_amsl_m`` is above mean sea level, ``altitude_relative_m`` above home; None is not known (as a
-    target: not given). Raises :class:`LocalProtocolError` when it is no place on earth.
+    target: not given). Raises :class:`InvalidArgument` when it is no place on earth.
     """
 
     latitude_deg: float
@@ -51,7 +51,7 @@ class Position(Snapshot):
             if altitude is not None and not (
                 isinstance(altitude, (float, int, Real)) and math.isfinite(altitude)
             ):
-                raise LocalProtocolError(f"{name} = {altitude!r} is not a finite number")
+                raise InvalidArgument(f"{name} = {altitude!r} is not a finite number")
 
 
 def _add(altitude: float | None, up_m: float) -> float | None:

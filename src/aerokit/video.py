@@ -14,7 +14,7 @@ import anyio
 
 from aerokit.arguments import checks_arguments
 from aerokit.async_block import async_block
-from aerokit.errors import BusyError, LinkLost, LinkOpenError, LocalProtocolError, NotSupported
+from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError, NotSupported
 from aerokit.snapshot import Snapshot
 from aerokit.vehicle.checks import check_range
 
@@ -75,17 +75,17 @@ async def open_video(
 
     Raises:
         NotSupported: PyAV is not installed.
-        LocalProtocolError: the URI is empty, a time is out of range, or an option is no text.
+        InvalidArgument: the URI is empty, a time is out of range, or an option is no text.
         LinkOpenError: the stream cannot be opened, or has no video.
     """
     if not uri:
-        raise LocalProtocolError("uri = '' is not allowed: the address of a stream, or the path of a file")
+        raise InvalidArgument("uri = '' is not allowed: the address of a stream, or the path of a file")
     check_range("timeout", timeout, 0, 3600, above=True)
     check_range("silence_s", silence_s, 0, 3600, above=True)
     stream = VideoStream(uri, vehicle)
     for name, value in (options or {}).items():
         if not isinstance(name, str) or not isinstance(value, str):
-            raise LocalProtocolError(f"options: {name!r} = {value!r} is not allowed: texts")
+            raise InvalidArgument(f"options: {name!r} = {value!r} is not allowed: texts")
     own = LIVE if "://" in uri else {}
     thread = _Reader(uri, {**own, **(options or {})}, (timeout, silence_s), stream)
     try:

@@ -12,7 +12,7 @@ from pymavlink import mavutil
 
 from aerokit.autopilots import Autopilot, Mode, ModeOrder, Purpose, autopilot_for, px4_custom_mode
 from aerokit.autopilots.modes import base_mode_name, is_armed
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import Heartbeat
 
 ARDUPILOT, PX4 = 3, 12
@@ -127,12 +127,12 @@ def test_an_unknown_number_has_a_name_that_parses(number: int) -> None:
 
 def test_an_unknown_name_raises_with_the_known_ones() -> None:
     with pytest.raises(
-        LocalProtocolError, match=r"'guidde' is not known \(did you mean 'GUIDED'\?\).*RTL, CIRCLE"
+        InvalidArgument, match=r"'guidde' is not known \(did you mean 'GUIDED'\?\).*RTL, CIRCLE"
     ):
         ardupilot("copter").find_mode("guidde")
-    with pytest.raises(LocalProtocolError, match="0 to 4294967295"):
+    with pytest.raises(InvalidArgument, match="0 to 4294967295"):
         ardupilot("copter").find_mode(-1)
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         ardupilot("copter").find_mode("")
 
 
@@ -143,7 +143,7 @@ def test_modes_the_vehicle_told_are_found_by_their_names() -> None:
     extra = {127: "Drone show"}
     assert copter.find_mode("drone_show", extra) == Mode("Drone show", 127)
     assert copter.mode(127, 81, extra).name == "Drone show"
-    with pytest.raises(LocalProtocolError, match="Drone show"):
+    with pytest.raises(InvalidArgument, match="Drone show"):
         copter.find_mode("nonsense", extra)
 
 
@@ -206,5 +206,5 @@ def test_armed_is_one_flag_of_base_mode() -> None:
 def test_a_custom_mode_has_32_bits(number: int) -> None:
     assert autopilot_for(heartbeat(2)).find_mode(number).custom_mode == number
     for wrong in (-1, 1 << 32):
-        with pytest.raises(LocalProtocolError, match=f"mode = {wrong}: .* from 0 to 4294967295"):
+        with pytest.raises(InvalidArgument, match=f"mode = {wrong}: .* from 0 to 4294967295"):
             autopilot_for(heartbeat(2)).find_mode(wrong)

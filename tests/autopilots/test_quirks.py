@@ -9,7 +9,7 @@ import pytest
 from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.autopilots.health import PREARM_CHECK
 from aerokit.autopilots.streams import ARDUPILOT_GROUPS
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import AutopilotVersion, Heartbeat
@@ -43,7 +43,7 @@ def test_px4_takes_off_above_the_sea_and_loiters() -> None:
     assert all(math.isnan(plan.params[i]) for i in (3, 4, 5))
     assert plan.mode_after == px4.find_mode("LOITER")
     assert px4.take_off_needs_home()
-    with pytest.raises(LocalProtocolError, match="altitude of home"):
+    with pytest.raises(InvalidArgument, match="altitude of home"):
         px4.take_off(20, None, is_vtol=False)
 
 

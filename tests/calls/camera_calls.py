@@ -185,14 +185,14 @@ def _unable(name: str) -> Callable[[Stage], Awaitable[object]]:
 
 CAMERA: Table = {
     **{
-        (f"Camera.{name}", "LocalProtocolError"): P(
+        (f"Camera.{name}", "InvalidArgument"): P(
             _now(call(name, *args)) if name in BLOCKS else call(name, *args)
         )
         for name, args in IMPOSSIBLE.items()
     },
-    ("Camera.start_video", "LocalProtocolError"): P(call("start_video", status_hz=99.0)),
-    ("Camera.video", "LocalProtocolError"): P(_now(call("video", status_hz=99.0))),
-    ("Vehicle.camera_at", "LocalProtocolError"): P(_now(lambda stage: stage.vehicle.camera_at(0))),
+    ("Camera.start_video", "InvalidArgument"): P(call("start_video", status_hz=99.0)),
+    ("Camera.video", "InvalidArgument"): P(_now(call("video", status_hz=99.0))),
+    ("Vehicle.camera_at", "InvalidArgument"): P(_now(lambda stage: stage.vehicle.camera_at(0))),
     **{
         (f"Camera.{name}", "CommandRejected"): P(call(name), before=_refuses(command))
         for name, command in COMMANDS.items()

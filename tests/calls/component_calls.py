@@ -142,7 +142,7 @@ async def _no_id(stage: Stage) -> None:
 P = Provocation
 
 COMPONENTS: Table = {
-    ("Vehicle.component", "LocalProtocolError"): P(_no_id),
+    ("Vehicle.component", "InvalidArgument"): P(_no_id),
     ("Component.information", "CommandRejected"): P(_call("information"), before=_with()),
     ("Component.information", "OperationTimeout"): P(_call("information"), before=_with(_silent)),
     ("Component.request", "CommandRejected"): P(_call("request", m.FlightInformation), before=_with()),
@@ -153,7 +153,7 @@ COMPONENTS: Table = {
     ("Component.metadata", "FileFormatError"): P(_metadata, **_px4(b"no JSON")),
     ("Component.metadata", "FileError"): P(_metadata, **_px4(None)),
     ("Component.metadata", "FileTimeout"): P(_metadata, **_px4(b"{}", is_deaf=True)),
-    ("Component.fetch", "LocalProtocolError"): P(_call("fetch", "gopher://a"), before=_with()),
+    ("Component.fetch", "InvalidArgument"): P(_call("fetch", "gopher://a"), before=_with()),
     ("Component.fetch", "FileFormatError"): P(_call("fetch", ADDRESS), before=_with(_too_large)),
     ("Component.fetch", "FileError"): P(_call("fetch", "mftp:///nowhere"), before=_with()),
     ("Component.fetch", "FileTimeout"): P(

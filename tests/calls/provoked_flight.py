@@ -109,13 +109,13 @@ def _actions() -> Table:
     command = _method("command", Cmd.DO_SET_HOME, 1)
     command_int = _method("command_int", Cmd.DO_SET_HOME, 1, frame=0)
     rows: Table = {
-        ("Vehicle.command", "LocalProtocolError"): P(_method("command", -1)),
+        ("Vehicle.command", "InvalidArgument"): P(_method("command", -1)),
         ("Vehicle.command", "CommandRejected"): P(command, before=refused(Cmd.DO_SET_HOME)),
         ("Vehicle.command", "CommandTimeout"): P(command, before=ignored(Cmd.DO_SET_HOME)),
-        ("Vehicle.command_int", "LocalProtocolError"): P(_method("command_int", 1, frame=999)),
+        ("Vehicle.command_int", "InvalidArgument"): P(_method("command_int", 1, frame=999)),
         ("Vehicle.command_int", "CommandRejected"): P(command_int, before=refused(Cmd.DO_SET_HOME)),
         ("Vehicle.command_int", "CommandTimeout"): P(command_int, before=ignored(Cmd.DO_SET_HOME)),
-        ("Vehicle.arm", "LocalProtocolError"): P(_method("arm", mode="NONE")),
+        ("Vehicle.arm", "InvalidArgument"): P(_method("arm", mode="NONE")),
         ("Vehicle.arm", "CommandRejected"): P(_method("arm"), grounded, refused(arm)),
         ("Vehicle.arm", "CommandTimeout"): P(_method("arm"), grounded, ignored(arm)),
         ("Vehicle.arm", "OperationRejected"): later(
@@ -139,27 +139,25 @@ def _actions() -> Table:
         ("Vehicle.wait_ready", "OperationTimeout"): P(
             _method("wait_ready", timeout=1), before=_forget("home")
         ),
-        ("Vehicle.set_speed", "LocalProtocolError"): P(_method("set_speed", -1)),
+        ("Vehicle.set_speed", "InvalidArgument"): P(_method("set_speed", -1)),
         ("Vehicle.set_speed", "CommandRejected"): P(
             _method("set_speed", 3), airborne, refused(Cmd.DO_CHANGE_SPEED)
         ),
-        ("Vehicle.send", "LocalProtocolError"): P(
-            _now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))
-        ),
+        ("Vehicle.send", "InvalidArgument"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
         ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),
-        ("Vehicle.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.subscribe())),
-        ("Vehicle.streams", "LocalProtocolError"): P(_now(_stream_never)),
-        ("Vehicle.message", "LocalProtocolError"): P(
+        ("Vehicle.subscribe", "InvalidArgument"): P(_now(lambda s: s.vehicle.subscribe())),
+        ("Vehicle.streams", "InvalidArgument"): P(_now(_stream_never)),
+        ("Vehicle.message", "InvalidArgument"): P(
             _now(lambda s: s.vehicle.message(messages.Attitude, rate_hz=5000))
         ),
         ("Vehicle.setup_signing", "NotSupported"): P(_sign, grounded, _old, alone=True),
         ("Vehicle.setup_signing", "OperationRejected"): P(_sign, armed),
         ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, falls_silent),
         ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
-        ("Vehicle.set_mode", "LocalProtocolError"): P(_method("set_mode", "NONE")),
-        ("Vehicle.set_heading", "LocalProtocolError"): P(_method("set_heading", 999), airborne),
-        ("Vehicle.set_home", "LocalProtocolError"): P(_method("set_home", Position(1, 1))),
+        ("Vehicle.set_mode", "InvalidArgument"): P(_method("set_mode", "NONE")),
+        ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
+        ("Vehicle.set_home", "InvalidArgument"): P(_method("set_home", Position(1, 1))),
         ("Vehicle.set_home", "CommandRejected"): P(_method("set_home"), before=refused(Cmd.DO_SET_HOME)),
         ("Vehicle.set_home", "CommandTimeout"): P(_method("set_home"), before=ignored(Cmd.DO_SET_HOME)),
         ("Vehicle.set_home", "OperationTimeout"): P(
@@ -181,18 +179,18 @@ def _actions() -> Table:
         ("Vehicle.stop_looking", "CommandTimeout"): P(
             _method("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
         ),
-        ("Vehicle.posted", "LocalProtocolError"): P(lambda s: _post(s, [])),
-        ("PostedOrder.command", "LocalProtocolError"): P(lambda s: _post(s, ["arm"], -1, armed=True)),
+        ("Vehicle.posted", "InvalidArgument"): P(lambda s: _post(s, [])),
+        ("PostedOrder.command", "InvalidArgument"): P(lambda s: _post(s, ["arm"], -1, armed=True)),
         ("PostedOrder.command", "CommandRejected"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, refused(arm)
         ),
         ("PostedOrder.command", "CommandTimeout"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)
         ),
-        ("PostedOrder.command_int", "LocalProtocolError"): P(lambda s: _post_int(s, 999)),
+        ("PostedOrder.command_int", "InvalidArgument"): P(lambda s: _post_int(s, 999)),
         ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
         ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),
-        ("PostedOrder.set_mode", "LocalProtocolError"): P(lambda s: _post_mode(s, "GUIDED")),
+        ("PostedOrder.set_mode", "InvalidArgument"): P(lambda s: _post_mode(s, "GUIDED")),
         ("PostedOrder.set_mode", "CommandRejected"): P(_post_mode, before=refused(Cmd.DO_SET_MODE)),
         ("PostedOrder.set_mode", "CommandTimeout"): P(_post_mode, grounded, ignored(Cmd.DO_SET_MODE)),
         ("PostedOrder.set_mode", "OperationTimeout"): P(_post_mode, grounded, accepted(Cmd.DO_SET_MODE)),
@@ -205,13 +203,13 @@ def _actions() -> Table:
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
         ),
-        ("Vehicle.go_to", "LocalProtocolError"): P(
+        ("Vehicle.go_to", "InvalidArgument"): P(
             _method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne
         ),
         ("Vehicle.go_to", "ValueUnknownError"): P(
             _method("go_to", Position(0, 0)), airborne, _forget("position")
         ),
-        ("Vehicle.take_off", "LocalProtocolError"): P(_method("take_off", -1)),
+        ("Vehicle.take_off", "InvalidArgument"): P(_method("take_off", -1)),
         ("Vehicle.take_off", "NotSupported"): P(_method("take_off", 5), armed, no_modes, alone=True),
         ("Vehicle.take_off", "OperationRejected"): P(_method("take_off", 5), grounded),
         ("Vehicle.take_off", "CommandTimeout"): P(_method("take_off", 5), armed, ignored(Cmd.NAV_TAKEOFF)),
@@ -332,7 +330,7 @@ def _parts() -> Table:
     return rows | {
         ("SetpointStream", stopped): P(lambda s: _stop(s, _nothing), airborne),
         ("SetpointStream.set", stopped): P(lambda s: _stop(s, _set_after_the_end), airborne),
-        ("SetpointStream.set", "LocalProtocolError"): P(_set_too_much, airborne),
+        ("SetpointStream.set", "InvalidArgument"): P(_set_too_much, airborne),
         ("SetpointStream.fly", stopped): later(lambda s: _fly(s), pilot, 1.0),
         ("StateCell.fresh", "StaleValueError"): P(_old_value, grounded),
         ("StateCell.fresh", "ValueUnknownError"): P(
@@ -342,7 +340,7 @@ def _parts() -> Table:
             lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
         ),
         ("Subscription.get", "OperationTimeout"): P(lambda s: _read(s, timeout=1)),
-        ("Subscription.get", "LocalProtocolError"): P(_read_closed),
+        ("Subscription.get", "InvalidArgument"): P(_read_closed),
         ("Subscription.get", "ConnectionClosed"): later(
             _read, lambda s: s.vehicle.connection.close(), 0.1, alone=True
         ),
@@ -398,7 +396,7 @@ def _connections() -> Table:
     nowhere = "/nowhere/at/all.tlog"
     ping = messages.Ping(0, 0, 0, 0)
     rows: Table = {
-        ("connect", "LocalProtocolError"): P(lambda s: _connect(s, "udp:nowhere:port")),
+        ("connect", "InvalidArgument"): P(lambda s: _connect(s, "udp:nowhere:port")),
         ("connect", "BusyError"): P(lambda s: _connect(s, s.vehicle.connection)),
         ("connect", "LinkOpenError"): P(lambda s: _connect(s, record=nowhere)),
         ("connect", "LinkLost"): P(
@@ -406,22 +404,20 @@ def _connections() -> Table:
         ),
         ("connect", "ConnectionClosed"): P(lambda s: _connect_and(s, lambda each: each.close())),
         ("connect", "ConnectFailed"): P(lambda s: _connect(s, system_id=77, timeout=3)),
-        ("open_connection", "LocalProtocolError"): P(lambda s: _open(s, "nonsense:")),
+        ("open_connection", "InvalidArgument"): P(lambda s: _open(s, "nonsense:")),
         ("open_connection", "LinkOpenError"): P(lambda s: _open(s, "tcp:127.0.0.1:9")),
         ("open_connection", "BusyError"): P(lambda s: _used(s, now=True)),
         ("open_connection", "ConnectionClosed"): P(lambda s: _used(s, now=False)),
-        ("Connection.check_types", "LocalProtocolError"): P(
+        ("Connection.check_types", "InvalidArgument"): P(
             _now(lambda s: s.vehicle.connection.check_types(()))
         ),
-        ("Connection.subscribe", "LocalProtocolError"): P(_now(lambda s: s.vehicle.connection.subscribe())),
+        ("Connection.subscribe", "InvalidArgument"): P(_now(lambda s: s.vehicle.connection.subscribe())),
         ("Connection.record", "LinkOpenError"): P(_now(lambda s: s.vehicle.connection.record(nowhere))),
         ("Connection.record", "BusyError"): P(_record_twice, alone=True),
-        ("Connection.send", "LocalProtocolError"): P(
+        ("Connection.send", "InvalidArgument"): P(
             _now(lambda s: s.vehicle.connection.send(messages.Ping(0, 0, 999, 0)))
         ),
-        ("Connection.write_raw", "LocalProtocolError"): P(
-            _now(lambda s: s.vehicle.connection.write_raw(b"no"))
-        ),
+        ("Connection.write_raw", "InvalidArgument"): P(_now(lambda s: s.vehicle.connection.write_raw(b"no"))),
     }
     frame = bytes.fromhex("fe0900ff00000000000006080003030000")
     for name, function in {

@@ -164,9 +164,9 @@ def _look_north(stage: Stage) -> Any:
 
 def _table() -> Table:
     rows: Table = {
-        ("Gimbal.point", "LocalProtocolError"): P(_call("point", 999, 0)),
-        ("Gimbal.look_at", "LocalProtocolError"): P(lambda s: _look(s, tolerance_deg=99), airborne),
-        ("Gimbal.look_at_system", "LocalProtocolError"): P(_call("look_at_system", 0)),
+        ("Gimbal.point", "InvalidArgument"): P(_call("point", 999, 0)),
+        ("Gimbal.look_at", "InvalidArgument"): P(lambda s: _look(s, tolerance_deg=99), airborne),
+        ("Gimbal.look_at_system", "InvalidArgument"): P(_call("look_at_system", 0)),
         ("Gimbal.look_at", "NotSupported"): P(_place_of, airborne),
         ("Gimbal.look_at", "ValueUnknownError"): P(
             _look_north, airborne, lambda s: s.vehicle.home.forget(), on="px4"
@@ -188,20 +188,20 @@ def _table() -> Table:
         ("Gimbal.information", "CommandTimeout"): P(
             _call("information"), grounded, ignored(Cmd.REQUEST_MESSAGE), alone=True
         ),
-        ("Gimbal.rates", "LocalProtocolError"): P(_rates(pitch_deg_s=9e9)),
-        ("GimbalRates", "LocalProtocolError"): P(_rates(yaw_deg_s=math.nan)),
+        ("Gimbal.rates", "InvalidArgument"): P(_rates(pitch_deg_s=9e9)),
+        ("GimbalRates", "InvalidArgument"): P(_rates(yaw_deg_s=math.nan)),
         ("GimbalRates", "NotSupported"): P(
             _rates(), before=refused(PITCHYAW, MavResult.UNSUPPORTED), alone=True
         ),
         ("GimbalRates", "CommandRejected"): P(_rates(), before=refused(PITCHYAW)),
         ("GimbalRates", "CommandTimeout"): P(_rates(), grounded, ignored(PITCHYAW)),
         ("GimbalRates", "GimbalTaken"): P(_rates_after_it_was_taken, grounded, _fitted()),
-        ("GimbalRates.set", "LocalProtocolError"): P(_rates(_setting(9e9)), before=_fitted()),
+        ("GimbalRates.set", "InvalidArgument"): P(_rates(_setting(9e9)), before=_fitted()),
         ("GimbalRates.set", "SetpointStreamStopped"): P(_rates(_setting(0.0, after_s=2.0)), before=_fitted()),
         ("GimbalRates.set", "GimbalTaken"): P(
             lambda s: _fed_after_it_was_taken(s, _setting(1.0)), grounded, _fitted()
         ),
-        ("GimbalRates.turn", "LocalProtocolError"): P(_rates(_turning(9e9, 0, 1)), before=_fitted()),
+        ("GimbalRates.turn", "InvalidArgument"): P(_rates(_turning(9e9, 0, 1)), before=_fitted()),
         ("GimbalRates.turn", "SetpointStreamStopped"): P(
             _rates(_turning(0, 0, 1, after_s=2.0)), before=_fitted()
         ),
@@ -224,7 +224,7 @@ def _table() -> Table:
         ("GimbalControl.until_lost", "LinkLost"): P(
             lambda s: _ended(s, lost), grounded, _fitted(), alone=True
         ),
-        ("Gimbals.get", "LocalProtocolError"): P(lambda s: _get(s, 0)),
+        ("Gimbals.get", "InvalidArgument"): P(lambda s: _get(s, 0)),
         ("Gimbals.get", "BusyError"): P(lambda s: _get(s, 250), before=_many, alone=True),
         ("Gimbals.discover", "ConnectionClosed"): P(lambda s: _discover(s, _closed), alone=True),
         ("Gimbals.discover", "LinkLost"): P(lambda s: _discover(s, lost), alone=True),

@@ -82,7 +82,7 @@ SETTINGS: Table = {
     ("Settings.fetch_definition", "NotSupported"): P(_call("fetch_definition"), _names("")),
     ("Settings.fetch_definition", "CommandRejected"): P(_call("fetch_definition"), _refuses_to_tell),
     ("Settings.fetch_definition", "OperationTimeout"): P(_call("fetch_definition", **HURRY), _silent),
-    ("Settings.fetch_definition", "LocalProtocolError"): P(_call("fetch_definition", "gopher://a")),
+    ("Settings.fetch_definition", "InvalidArgument"): P(_call("fetch_definition", "gopher://a")),
     ("Settings.fetch_definition", "FileFormatError"): P(_call("fetch_definition"), _damaged),
     ("Settings.fetch_definition", "FileError"): P(_call("fetch_definition", "mftp:///nowhere")),
     ("Settings.fetch_definition", "FileTimeout"): P(_call("fetch_definition", **PATIENCE), _loses_files),
@@ -96,13 +96,13 @@ SETTINGS: Table = {
         (f"Settings.{name}", error): each
         for name in ("get", "read")
         for error, each in {
-            "LocalProtocolError": P(_call(name, "CAM MODE")),
+            "InvalidArgument": P(_call(name, "CAM MODE")),
             "ParameterRejected": P(_call(name, "CAM_NOPE")),
             "ParameterTimeout": P(_call(name, "CAM_EV", **PATIENCE), _silent),
             "OperationTimeout": P(_call(name, "CAM_EV", **HURRY), _silent),
         }.items()
     },
-    ("Settings.set", "LocalProtocolError"): P(_call("set", "CAM_WBMODE", -1)),
+    ("Settings.set", "InvalidArgument"): P(_call("set", "CAM_WBMODE", -1)),
     ("Settings.set", "ParameterRejected"): P(_call("set", "CAM_WBMODE", 77)),
     ("Settings.set", "ParameterTimeout"): P(_call("set", "CAM_EV", 1.0, **PATIENCE), _silent),
     ("Settings.set", "OperationTimeout"): P(_call("set", "CAM_EV", 1.0, **HURRY), _silent),

@@ -114,7 +114,7 @@ def _parameters() -> Table:
         ("Transaction", "RollbackFailed"): P(
             lambda s: _silent_in(s, s.vehicle.parameters.transaction(**PATIENCE))
         ),
-        ("Transaction.set", "LocalProtocolError"): P(lambda s: _in_transaction(s, s.parameter, math.nan)),
+        ("Transaction.set", "InvalidArgument"): P(lambda s: _in_transaction(s, s.parameter, math.nan)),
         ("Transaction.set", "ParameterRejected"): P(lambda s: _in_transaction(s, "NOSUCH_PARAM", 1)),
         ("Transaction.set", "ParameterTimeout"): P(
             lambda s: _in_transaction(s, s.parameter, 1), before=falls_silent
@@ -139,7 +139,7 @@ def _parameters() -> Table:
         key = f"Parameters.{name}"
         rows[key, "OperationTimeout"] = P(do(*args, **HURRY, **options), before=_unknown_and_silent)
         if wrong is not None:
-            rows[key, "LocalProtocolError"] = P(do(*wrong))
+            rows[key, "InvalidArgument"] = P(do(*wrong))
             rows[key, "ParameterTimeout"] = P(do(*args, **PATIENCE), before=_unknown_and_silent)
         if unknown is not None:
             rows[key, "ParameterRejected"] = P(do(*unknown))
@@ -211,7 +211,7 @@ def _plans(part: str) -> Table:
     ):
         key = f"{owner}.{name}"
         rows |= {
-            (key, "LocalProtocolError"): P(_of(part, name, *args, patience_s=-1)),
+            (key, "InvalidArgument"): P(_of(part, name, *args, patience_s=-1)),
             (key, "MissionRejected"): P(
                 _of(part, name, *args, **options), grounded, _answering(asked, 1, kind)
             ),
@@ -240,7 +240,7 @@ def _flown() -> Table:
     current, start, mode = Cmd.DO_SET_MISSION_CURRENT, Cmd.MISSION_START, Cmd.DO_SET_MODE
     mission = "mission"
     rows: Table = {
-        ("MissionControl.set_current", "LocalProtocolError"): P(_of(mission, "set_current", -1)),
+        ("MissionControl.set_current", "InvalidArgument"): P(_of(mission, "set_current", -1)),
         ("MissionControl.set_current", "CommandRejected"): P(
             _of(mission, "set_current", 2), on_mission, refused(current)
         ),
@@ -250,8 +250,8 @@ def _flown() -> Table:
         ("MissionControl.set_current", "OperationTimeout"): P(
             _of(mission, "set_current", 2), on_mission, ignored(current)
         ),
-        ("MissionControl.start", "LocalProtocolError"): P(_of(mission, "start", -1)),
-        ("MissionControl.resume", "LocalProtocolError"): P(_of(mission, "resume", timeout=-1)),
+        ("MissionControl.start", "InvalidArgument"): P(_of(mission, "start", -1)),
+        ("MissionControl.resume", "InvalidArgument"): P(_of(mission, "resume", timeout=-1)),
         ("MissionControl.pause", "OperationRejected"): P(_of(mission, "pause"), airborne),
         ("MissionControl.pause", "CommandRejected"): P(_of(mission, "pause"), on_mission, refused(mode)),
         ("MissionControl.pause", "OperationTimeout"): P(_of(mission, "pause"), on_mission, ignored(mode)),
@@ -323,7 +323,7 @@ def _files() -> Table:
         key = f"Files.{name}"
         right: tuple[Any, ...] = (*before, there, *after)
         rows |= {
-            (key, "LocalProtocolError"): P(_of("files", name, *before, "", *after)),
+            (key, "InvalidArgument"): P(_of("files", name, *before, "", *after)),
             (key, "FileError"): P(_of("files", name, *right), before=REFUSING),
             (key, "FileTimeout"): P(_of("files", name, *right, **PATIENCE), before=falls_silent),
         }
@@ -344,7 +344,7 @@ def _logs() -> Table:
     }
     for name, after in (("download", (Stage.local,)), ("read", ())):
         rows |= {
-            (f"Logs.{name}", "LocalProtocolError"): P(_of("logs", name, -1, *after)),
+            (f"Logs.{name}", "InvalidArgument"): P(_of("logs", name, -1, *after)),
             (f"Logs.{name}", "FileError"): P(_of("logs", name, 77, *after), grounded),
             (f"Logs.{name}", "FileTimeout"): P(
                 _of("logs", name, 1, *after, **PATIENCE), grounded, falls_silent

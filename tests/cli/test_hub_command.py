@@ -12,7 +12,7 @@ from cli_harness import ctrl_c, records
 from aerokit.cli import main
 from aerokit.cli.hub import _endpoints
 from aerokit.cli.main import make_parser
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.hub import Endpoint
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Heartbeat
@@ -42,7 +42,7 @@ def test_endpoints_and_what_may_pass() -> None:
 
 def test_signing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AEROKIT_SIGNING_KEY", raising=False)
-    with pytest.raises(LocalProtocolError, match="--signed needs a key"):
+    with pytest.raises(InvalidArgument, match="--signed needs a key"):
         endpoints("a=pty", "--signed", "a")
     (tmp_path / "key").write_text("a passphrase")
     found = endpoints("a=pty", "b=pty", "--signed", "a", "--signing-key", str(tmp_path / "key"))

@@ -17,7 +17,7 @@ from defusedxml import ElementTree
 from aerokit import messages as m
 from aerokit.cli import main
 from aerokit.convert import convert
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -205,7 +205,7 @@ def test_nothing_is_overwritten_unasked_and_nothing_half_written_stays(
     folder.mkdir()
     (folder / "mine.txt").write_text("mine")
     for target in (there, folder):
-        with pytest.raises(LocalProtocolError, match="there already"):
+        with pytest.raises(InvalidArgument, match="there already"):
             convert(log, target)
     assert there.read_text() == "mine"
 
@@ -249,7 +249,7 @@ def test_what_is_no_log_or_no_format_is_said(log: Path, tmp_path: Path) -> None:
     for source, target, error, says in [
         (text, "out.csv", FileFormatError, "no MAVLink"),
         (tmp_path / "log.txt", "out.csv", FileFormatError, ".tlog"),
-        (log, "out.xlsx", LocalProtocolError, ".mcap"),
+        (log, "out.xlsx", InvalidArgument, ".mcap"),
         (tmp_path / "missing.tlog", "out.csv", FileNotFoundError, "missing"),
     ]:
         with pytest.raises(error, match=says):

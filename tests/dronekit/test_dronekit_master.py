@@ -16,7 +16,7 @@ from pymavlink import mavutil
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.master import Master
 from aerokit.dronekit.mavlink import MAVConnection
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.from_pymavlink import from_pymavlink
 from aerokit.mavlink.message_factory import MessageFactory
@@ -117,9 +117,9 @@ def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None
 
 def test_wrong_values_are_found_when_they_are_sent(factory: MessageFactory) -> None:
     message = factory.mission_set_current_encode(1, 1, None)
-    with pytest.raises(LocalProtocolError, match=r"MISSION_SET_CURRENT\.seq"):
+    with pytest.raises(InvalidArgument, match=r"MISSION_SET_CURRENT\.seq"):
         from_pymavlink(message)
-    with pytest.raises(LocalProtocolError, match="play_tune_encode: a text must be"):
+    with pytest.raises(InvalidArgument, match="play_tune_encode: a text must be"):
         factory.play_tune_encode(1, 1, None)
     with pytest.raises(TypeError):
         factory.mission_set_current_encode(1, 1)
@@ -268,7 +268,7 @@ def test_nonsense_is_not_sent(connected: Connected) -> None:
     master, vehicle = connected
     with pytest.raises(KeyError, match="NOPE"):
         master.set_mode("NOPE")
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         master.waypoint_count_send(70_000)
     master.mav.ping_send(1, 77, 0, 0)
     assert vehicle.received("PING").seq == 77

@@ -21,7 +21,7 @@ from pymavlink import mavutil
 
 from aerokit import messages
 from aerokit.dronekit.observers import message_of
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -403,7 +403,7 @@ def tune(text: Any) -> Any:
     ],
 )
 def test_nonsense_is_refused(message: Any, said: str) -> None:
-    with pytest.raises(LocalProtocolError, match=said) as caught:
+    with pytest.raises(InvalidArgument, match=said) as caught:
         from_pymavlink(message, 1)
     assert isinstance(caught.value, ValueError)
 
@@ -411,5 +411,5 @@ def test_nonsense_is_refused(message: Any, said: str) -> None:
 def test_a_missing_field_is_named() -> None:
     message = command()
     del message.param3
-    with pytest.raises(LocalProtocolError, match=r"COMMAND_LONG.param3 .*missing"):
+    with pytest.raises(InvalidArgument, match=r"COMMAND_LONG.param3 .*missing"):
         from_pymavlink(message)

@@ -16,7 +16,7 @@ from aerokit.dronekit.commands import CommandSequence
 from aerokit.dronekit.connect import connect
 from aerokit.dronekit.values import LocationGlobal
 from aerokit.dronekit.vehicle import Vehicle
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 TAKE_OFF, LAND, RETURN, JUMP, SPEED = 22, 21, 20, 177, 178
 
@@ -55,7 +55,7 @@ def test_what_cannot_be_right_is_told_before_anything_is_sent(
     told = ("latitude", "could not convert", "NoneType", "MAV_FRAME", "invalid literal")
     for (field, value), text in zip(wrong.items(), told, strict=True):
         cmds[0] = waypoint(**{field: value})
-        with pytest.raises(LocalProtocolError, match=text):
+        with pytest.raises(InvalidArgument, match=text):
             cmds.upload()
     assert transfers(controller, before) == []
 
@@ -160,7 +160,7 @@ def test_next_is_told_and_chosen(three: Pair) -> None:
     assert controller.wait_for("MISSION_SET_CURRENT").seq == 2
     assert next_becomes(cmds, 2, lambda: None)
     assert next_becomes(cmds, 3, lambda: controller.tell("MISSION_CURRENT", seq=3))
-    with pytest.raises(LocalProtocolError, match="next = -1"):
+    with pytest.raises(InvalidArgument, match="next = -1"):
         cmds.next = -1
     with pytest.raises(TypeError):
         cmds.next = "x"  # type: ignore[assignment]

@@ -11,7 +11,7 @@ import pytest
 
 from aerokit.dronekit import runner
 from aerokit.dronekit.sitl import SITL, start_default
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 
 OWN = """\
 import dronekit_sitl
@@ -84,9 +84,9 @@ def test_a_taken_port_is_an_error_and_a_second_launch_needs_restart() -> None:
 
 
 def test_half_a_place_and_unknown_systems_are_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="both lat and lon"):
+    with pytest.raises(InvalidArgument, match="both lat and lon"):
         start_default(lat=1.0)
-    with pytest.raises(LocalProtocolError, match="not one of"):
+    with pytest.raises(InvalidArgument, match="not one of"):
         SITL().download("boat", "stable")
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.fleets.apart import Route, conflicts_of, in_corridors, in_layers
 from aerokit.fleets.nearness import local_places, near_pairs
 from aerokit.fleets.paths import Path, PathPoint, Place, horizontal_distance, least_distance
@@ -198,13 +198,13 @@ def test_horizontal_distance_leaves_heights_out() -> None:
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="min_distance_m"):
+    with pytest.raises(InvalidArgument, match="min_distance_m"):
         in_layers([], {}, 0)
-    with pytest.raises(LocalProtocolError, match="speed_m_s"):
+    with pytest.raises(InvalidArgument, match="speed_m_s"):
         Path.straight("a", (0, 0, 0), (1, 0, 0), 0)
-    with pytest.raises(LocalProtocolError, match="goes back in time"):
+    with pytest.raises(InvalidArgument, match="goes back in time"):
         Path("a", [PathPoint(1, 0, 0, 0), PathPoint(0, 0, 0, 0)])
-    with pytest.raises(LocalProtocolError, match="has no points"):
+    with pytest.raises(InvalidArgument, match="has no points"):
         Path("a", [])
-    with pytest.raises(LocalProtocolError, match="finite"):
+    with pytest.raises(InvalidArgument, match="finite"):
         PathPoint(math.nan, 0, 0, 0)

@@ -11,7 +11,7 @@ import pytest
 from fleet_stage import open_stage
 from flight_harness import now
 
-from aerokit.errors import FleetError, LocalProtocolError, OperationTimeout
+from aerokit.errors import FleetError, InvalidArgument, OperationTimeout
 from aerokit.fleets.events import (
     MemberBack,
     MemberFailed,
@@ -169,7 +169,7 @@ async def test_a_function_that_makes_no_sense_ends_in_holding() -> None:
     async with open_stage(2, on_error=decide) as stage:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
-        with pytest.raises(LocalProtocolError, match="the policy decided 'explode'"):
+        with pytest.raises(InvalidArgument, match="the policy decided 'explode'"):
             await stage.fleet.go_to(north(100))
         assert stage.mode_of("north/2") == "BRAKE"
 
@@ -314,7 +314,7 @@ async def test_do_takes_a_method_or_a_function_with_its_own_deadline() -> None:
         assert result["north/1"] == "north/1"
         assert isinstance(result["north/2"], OperationTimeout)
         for wrong in ("explode", "_holding.hold", "position"):
-            with pytest.raises(LocalProtocolError, match="action"):
+            with pytest.raises(InvalidArgument, match="action"):
                 await stage.fleet.do(wrong)
 
 
@@ -339,7 +339,7 @@ async def test_what_cannot_be_ordered_stops_nobody() -> None:
             stage.fleet.set_mode("NOPE"),
             stage.fleet.go_to({}, speed_m_s=0),
         ):
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 await wrong
         assert (await flying).is_complete
 

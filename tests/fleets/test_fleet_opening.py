@@ -14,7 +14,7 @@ from aerokit.errors import (
     BusyError,
     ConnectFailed,
     FleetError,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     SubscriptionOverflow,
 )
@@ -49,13 +49,11 @@ async def test_connections_vehicles_and_links_become_one_fleet() -> None:
             assert [each.name for each in fleet.role("eyes")] == ["scout"]
             assert "north/2" in fleet
             assert len(fleet["*/[19]"]) == 2
-            with pytest.raises(
-                LocalProtocolError, match="group = 'three' is not allowed: the groups are two"
-            ):
+            with pytest.raises(InvalidArgument, match="group = 'three' is not allowed: the groups are two"):
                 fleet.group("three")
-            with pytest.raises(LocalProtocolError, match="role = 'x' is not allowed: the roles are eyes"):
+            with pytest.raises(InvalidArgument, match="role = 'x' is not allowed: the roles are eyes"):
                 fleet.role("x")
-            with pytest.raises(LocalProtocolError, match=r"'east/\*' is no member"):
+            with pytest.raises(InvalidArgument, match=r"'east/\*' is no member"):
                 fleet["east/*"]
         assert connection.is_open
         assert not vehicle.is_silent
@@ -81,10 +79,10 @@ async def test_one_that_the_program_has_already_is_not_found_twice() -> None:
         with pytest.raises(BusyError):
             async with aerokit.fleet(connection, system_ids=[1]):
                 raise AssertionError
-        with pytest.raises(LocalProtocolError, match="'a' and 'b' are the same vehicle"):
+        with pytest.raises(InvalidArgument, match="'a' and 'b' are the same vehicle"):
             async with aerokit.fleet({"a": own, "b": own}):
                 raise AssertionError
-        with pytest.raises(LocalProtocolError, match="two vehicles are called 'north/2'"):
+        with pytest.raises(InvalidArgument, match="two vehicles are called 'north/2'"):
             async with aerokit.fleet({"north/2": own, "north": connection}):
                 raise AssertionError
 
@@ -142,13 +140,13 @@ async def test_named_ones_that_are_not_heard_are_told_of_once(caplog: pytest.Log
 )
 async def test_wrong_arguments_are_refused(options: dict[str, Any], match: str) -> None:
     async with simulated_link(copters(1)) as link:
-        with pytest.raises(LocalProtocolError, match=match):
+        with pytest.raises(InvalidArgument, match=match):
             async with aerokit.fleet({"north": link}, **options):
                 raise AssertionError
 
 
 async def test_a_fleet_of_nobody_is_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="needs an address"):
+    with pytest.raises(InvalidArgument, match="needs an address"):
         async with aerokit.fleet():
             raise AssertionError
 
@@ -179,9 +177,9 @@ async def test_one_stream_has_the_events_and_states_of_all() -> None:
                 async for _ in few:
                     pass
         for wrong in ((), ("height",)):
-            with pytest.raises(LocalProtocolError, match="is no state"):
+            with pytest.raises(InvalidArgument, match="is no state"):
                 stage.fleet.states(*wrong)
-        with pytest.raises(LocalProtocolError, match="a class of Event"):
+        with pytest.raises(InvalidArgument, match="a class of Event"):
             stage.fleet.events(int)  # type: ignore[arg-type]
 
 
@@ -247,13 +245,13 @@ async def test_arguments_of_wrong_types_are_refused_and_nothing_is_sent() -> Non
             ("events", (), {"capacity": 0}),
         ]
         for name, arguments, options in wrong:
-            with pytest.raises((LocalProtocolError, FleetError)) as caught:
+            with pytest.raises((InvalidArgument, FleetError)) as caught:
                 done = getattr(fleet, name)(*arguments, **options)
                 done = await done if hasattr(done, "__await__") else done
                 if isinstance(done, FleetResult):
                     done.raise_for_errors()
             errors = caught.value.errors.values() if isinstance(caught.value, FleetError) else ()
-            assert all(isinstance(each, (LocalProtocolError, OperationRejected)) for each in errors), name
+            assert all(isinstance(each, (InvalidArgument, OperationRejected)) for each in errors), name
         assert not stage.orders_to("north/1")
         assert not stage.orders_to("north/2")
 
@@ -276,7 +274,7 @@ def test_rules_take_nothing_else() -> None:
     assert Rules(lambda _: None, {}).decide(failure) == {}
     assert Rules(lambda _: "land_others", {}).decide(failure) == {"b": "land", "c": "land"}
     for decided in ({"x": "land"}, {"b": "jump"}, "halt", 7):
-        with pytest.raises(LocalProtocolError, match="the policy decided"):
+        with pytest.raises(InvalidArgument, match="the policy decided"):
             Rules(lambda _, it=decided: it, {}).decide(failure)  # type: ignore[misc]
 
 
@@ -294,7 +292,7 @@ def test_the_blocking_twin_flies_a_fleet() -> None:
             assert isinstance(fleet.vehicles["north/1"], sync.Vehicle)
             assert fleet.vehicles["north/1"].is_armed
             assert fleet["north/*"].land()["north/1"] is None
-        with pytest.raises(LocalProtocolError):
+        with pytest.raises(InvalidArgument):
             sync.fleet({"north": served.address}, count=0)
 
 

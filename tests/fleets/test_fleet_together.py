@@ -12,7 +12,7 @@ from fleet_stage import HOME, Stage, open_stage
 from aerokit import messages as m
 from aerokit.errors import (
     FleetError,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     SetpointStreamStopped,
     ValueUnknownError,
@@ -64,7 +64,7 @@ async def test_ways_that_cross_are_refused_and_nothing_is_sent() -> None:
         with pytest.raises(OperationRejected, match="north/2"):
             await stage.fleet.go_to(onto)
         assert not stage.orders_to("north/1")
-        with pytest.raises(LocalProtocolError, match="speed_m_s"):
+        with pytest.raises(InvalidArgument, match="speed_m_s"):
             stage.fleet.plan_apart(onto, by="corridors")
 
 
@@ -212,7 +212,7 @@ async def test_when_the_leader_is_taken_over_the_followers_hold(policy: str) -> 
 
 async def test_errors_of_form_call_it_form_and_name_who_is_not_where_one_knows() -> None:
     async with open_stage(3, min_distance_m=5.0, on_error="go_on") as stage:
-        with pytest.raises(LocalProtocolError, match="there are no groups"):
+        with pytest.raises(InvalidArgument, match="there are no groups"):
             stage.fleet.group("alpha")
         await stage.take_off()
         line = Formation.line(["north/2"], 8.0, frame="north")
@@ -336,7 +336,7 @@ async def test_formations_that_make_no_sense_are_refused() -> None:
             (Formation({"north/2": Offset(3)}), "north/1", "3.0 m apart"),
         ]
         for formation, leader, match in wrong:
-            with pytest.raises(LocalProtocolError, match=match):
+            with pytest.raises(InvalidArgument, match=match):
                 stage.fleet.following(formation, leader=leader)
 
 
@@ -344,7 +344,7 @@ def test_offsets_turn_with_the_heading() -> None:
     ahead = Formation({"a": Offset(10, 2, 1)}, "heading")
     east = ahead.offset_of("a", 90.0)
     assert (east.north_m, east.east_m, east.up_m) == pytest.approx((-2, 10, 1))
-    with pytest.raises(LocalProtocolError, match="heading"):
+    with pytest.raises(InvalidArgument, match="heading"):
         ahead.offset_of("a", None)
     assert follow_velocity((10, 0, 0), (1, 0, 0), gain=0.5, max_speed_m_s=100) == (6, 0, 0)
     assert math.hypot(*follow_velocity((100, 100, 0), (0, 0, 0), gain=1, max_speed_m_s=7)) == pytest.approx(7)
@@ -359,7 +359,7 @@ async def test_corrections_go_out_once_for_each_link() -> None:
             sent = wire.all(m.GpsRtcmData)
             assert b"".join(each.data[: each.len] for each in sent) == message
             assert [each.flags & 7 for each in sent] == [0b001, 0b011]
-        with pytest.raises(LocalProtocolError, match="0 bytes"):
+        with pytest.raises(InvalidArgument, match="0 bytes"):
             stage.fleet.send_corrections(b"")
 
 
@@ -386,7 +386,7 @@ def test_rtcm_messages_are_told_apart() -> None:
     one, other = b"\xd3\x00\x02ab123", b"\xd3\x00\x00456"
     assert list(rtcm_messages(one + other)) == [one, other]
     assert list(rtcm_messages(b"no rtcm")) == [b"no rtcm"]
-    with pytest.raises(LocalProtocolError, match="721"):
+    with pytest.raises(InvalidArgument, match="721"):
         fragments(bytes(721), 0)
 
 
@@ -483,9 +483,9 @@ async def test_place_or_mission_too_far_away_is_refused_before_anybody_flies() -
     async with open_stage(2) as stage:
         await stage.take_off()
         near = stage.fleet.vehicles["north/1"].position.value.offset(north_m=20.0)
-        with pytest.raises(LocalProtocolError, match=r"targets\['north/2'\] = .*max_distance_m"):
+        with pytest.raises(InvalidArgument, match=r"targets\['north/2'\] = .*max_distance_m"):
             await stage.fleet.go_to({"north/1": near, "north/2": far})
         mission = Mission([waypoint(-47.0, -81.0, altitude_relative_m=20.0)])
-        with pytest.raises(LocalProtocolError, match=r"missions\['north/2'\] = .*max_distance_m"):
+        with pytest.raises(InvalidArgument, match=r"missions\['north/2'\] = .*max_distance_m"):
             await stage.fleet.upload({"north/2": mission})
         assert stage.orders_to("north/1") == stage.orders_to("north/2") == []

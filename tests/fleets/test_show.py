@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import messages as m
-from aerokit.errors import FileFormatError, FleetError, LocalProtocolError, OperationRejected
+from aerokit.errors import FileFormatError, FleetError, InvalidArgument, OperationRejected
 from aerokit.fleets.opening import fleet
 from aerokit.fleets.paths import Path, PathPoint, Place
 from aerokit.fleets.show import Show, state_at
@@ -116,7 +116,7 @@ async def test_a_show_that_cannot_be_is_refused() -> None:
         near = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 3, 5)})
         with pytest.raises(OperationRejected, match=r"within 2\.\d m"):
             await stage.fleet.fly_show(near, ORIGIN)
-        with pytest.raises(LocalProtocolError, match="'x' is not one of"):
+        with pytest.raises(InvalidArgument, match="'x' is not one of"):
             await stage.fleet.fly_show(Show.from_points({"x": circle(0, 0, 5)}), ORIGIN)
         stage.copters["north/2"].faults.silent = True
         far = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 30, 5)})
@@ -178,7 +178,7 @@ def test_a_show_is_read_as_it_was_written(tmp_path: FilePath) -> None:
     assert show.duration_s == 1.5
     assert show.top_speed_m_s("a") == pytest.approx(2 / 3)
     assert list(show.renamed({"a": "north/1", 'b,"c': "north/2"}).tracks) == ["north/1", "north/2"]
-    with pytest.raises(LocalProtocolError, match="names"):
+    with pytest.raises(InvalidArgument, match="names"):
         show.renamed({"a": "x", 'b,"c': "x"})
 
 

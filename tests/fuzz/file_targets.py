@@ -9,7 +9,7 @@ from pathlib import Path
 
 from target import Target
 
-from aerokit.errors import FileFormatError, LocalProtocolError, RemoteProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import Dialect
 from aerokit.missions import Mission
 from aerokit.missions.pack import unpack_items
@@ -38,7 +38,7 @@ def fuzz_plan(data: bytes) -> None:
     for each in (plan, plan.replace(mission=Mission(), source=plan.source), plan.replace(source="")):
         try:
             text = format_plan(each)
-        except LocalProtocolError:
+        except InvalidArgument:
             continue
         assert parse_plan(text) == each
 
@@ -48,7 +48,7 @@ def fuzz_waypoints(data: bytes) -> None:
     try:
         mission = parse_waypoints(data.decode(errors="surrogateescape"))
         text = format_waypoints(mission)
-    except LocalProtocolError:
+    except InvalidArgument:
         return
     again = parse_waypoints(text)
     assert len(again.items) == len(mission.items)
@@ -63,7 +63,7 @@ def fuzz_parameter_file(data: bytes) -> None:
     for form in ("missionplanner", "mavproxy", "qgroundcontrol"):
         try:
             text = parameter_file_text(file, form)
-        except LocalProtocolError:
+        except InvalidArgument:
             continue
         again = parse_parameter_file(text)
         assert again.keys() == file.keys()
@@ -80,7 +80,7 @@ def fuzz_parameter_pack(data: bytes) -> None:
         return
     try:
         packed = pack_parameters(table.values())
-    except LocalProtocolError:  # NaN
+    except InvalidArgument:  # NaN
         return
     magic, count, length = read_header(packed)
     assert length == len(packed)
@@ -119,7 +119,7 @@ def fuzz_camera_definition(data: bytes) -> None:
                 1 << 70,
                 *(one.value for one in camera.options(name, told)),
             ):
-                with suppress(LocalProtocolError):
+                with suppress(InvalidArgument):
                     sent = camera.checked(name, value, told)
                     assert setting_value(setting_bytes(sent, each.wire_type), each.wire_type) == sent
 
@@ -131,7 +131,7 @@ def fuzz_dialect(data: bytes) -> None:
         path.write_bytes(data)
         try:
             dialect = Dialect.from_xml(path)
-        except LocalProtocolError:
+        except InvalidArgument:
             return
     for message_class in dialect:
         message = message_class.decode(bytes(3))

@@ -6,7 +6,7 @@ import io
 
 from target import Target
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links import parse_address
 from aerokit.links.create import create_link
 from aerokit.mavlink import STANDARD, Framer
@@ -46,7 +46,7 @@ def decode(message: Message) -> None:
     assert len(message.to_dict()) == len(message.FIELDS)
     try:
         again = type(message).decode(message.encode())
-    except LocalProtocolError:  # what was no UTF-8 takes more room than it had
+    except InvalidArgument:  # what was no UTF-8 takes more room than it had
         assert any("\ufffd" in str(value) for value in message.to_dict().values())
         return
     assert again == message
@@ -89,7 +89,7 @@ def fuzz_recording(data: bytes) -> None:
     """Any recording as a vehicle: it plays, or says that there is none."""
     try:
         vehicle = RecordedVehicle(io.BytesIO(data))
-    except LocalProtocolError:
+    except InvalidArgument:
         return
     for second in range(20):
         vehicle.step(float(second))
@@ -100,7 +100,7 @@ def fuzz_address(data: bytes) -> None:
     """Any text: an address that says the same when it is written again, or our error."""
     try:
         address = parse_address(data.decode(errors="surrogateescape"))
-    except LocalProtocolError:
+    except InvalidArgument:
         return
     assert parse_address(str(address)) == address
     create_link(str(address))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from aerokit import Signing, SigningKey
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.hub.border import Border
 from aerokit.hub.filters import Filters
 from aerokit.mavlink.dialect import STANDARD
@@ -47,7 +47,7 @@ def test_only_and_block_and_rates() -> None:
     ],
 )
 def test_what_fits_nothing_is_refused(fields: dict[str, object], text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         Filters(STANDARD, **fields)  # type: ignore[arg-type]
 
 

@@ -17,7 +17,7 @@ from wrong_types import misuses
 
 import aerokit
 from aerokit import Signing, SigningKey
-from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent, kinds
 from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
@@ -357,10 +357,10 @@ async def test_endpoints_come_and_go() -> None:
         assert [(each.endpoint, each.kind) for each in events] == [("late", "opened"), ("late", "removed")]
         detach()
         detach()
-        with pytest.raises(LocalProtocolError, match=r"name = 'late' is not allowed: a, b"):
+        with pytest.raises(InvalidArgument, match=r"name = 'late' is not allowed: a, b"):
             await hub.remove("late")
         other = Program(3, 1)
-        with pytest.raises(LocalProtocolError, match="two endpoints are called 'a'"):
+        with pytest.raises(InvalidArgument, match="two endpoints are called 'a'"):
             await hub.add(other.endpoint("a"))
         assert len(events) == 2
 
@@ -600,16 +600,16 @@ async def test_what_the_block_raises_comes_out_of_it() -> None:
     ],
 )
 def test_wrong_endpoints_are_refused(fields: dict[str, Any], text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         Endpoint(**fields)
 
 
 def test_wrong_arguments_of_a_hub_are_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="a list of addresses"):
+    with pytest.raises(InvalidArgument, match="a list of addresses"):
         Hub("udpin:0.0.0.0:14550")
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         Hub(["no address"])
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         Hub([5])  # type: ignore[list-item]
 
 
@@ -653,7 +653,7 @@ def test_the_names_of_the_package() -> None:
 async def test_arguments_of_wrong_types_are_refused() -> None:
     async with Hub() as hub:
         for wrong in (None, "pty", 5):
-            with pytest.raises(LocalProtocolError, match="connection = "):
+            with pytest.raises(InvalidArgument, match="connection = "):
                 await hub.share(wrong)  # type: ignore[arg-type]
         for misuse in misuses(hub, leave_out=frozenset({"share"})):
             error: BaseException | None = None
@@ -661,7 +661,7 @@ async def test_arguments_of_wrong_types_are_refused() -> None:
                 result = misuse.call()
                 if asyncio.iscoroutine(result):
                     await result
-            except LocalProtocolError as refusal:
+            except InvalidArgument as refusal:
                 error = refusal
             assert error is not None, misuse
             assert misuse.parameter in str(error) or "address" in str(error)

@@ -16,7 +16,7 @@ from served_copter import served_copter
 import aerokit
 import aerokit.sync
 from aerokit import Signing, SigningKey, Vehicle
-from aerokit.errors import ConnectionClosed, LinkOpenError, LocalProtocolError
+from aerokit.errors import ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.hub import Endpoint, Hub, HubEvent, shared
 from aerokit.links import FaultModel, FaultyLink, Link, memory_link_pair
 from aerokit.mavlink.messages import Attitude, CommandLong, ParamRequestList, ParamSet, SetupSigning
@@ -237,7 +237,7 @@ def test_it_ends_with_the_connection_and_the_connection_not_with_it() -> None:
             async with shared(connection, [station.endpoint("station")]) as hub:
                 events: list[HubEvent] = []
                 hub.on_event(events.append)
-                with pytest.raises(LocalProtocolError, match="two endpoints"):
+                with pytest.raises(InvalidArgument, match="two endpoints"):
                     await hub.share(connection)
             assert connection.is_open
             assert station.is_lost
@@ -290,7 +290,7 @@ def test_what_is_sent_is_told_to_taps_and_a_mistake_there_harms_nobody(
 def test_what_cannot_be_shared_is_said_at_once() -> None:
     async def run() -> None:
         async with simulated_link(SimulatedCopter()) as link:
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 async with aerokit.connect(link, share=["nonsense"]):
                     pass
         async with simulated_link(SimulatedCopter()) as link:
@@ -298,7 +298,7 @@ def test_what_cannot_be_shared_is_said_at_once() -> None:
                 async with aerokit.connect(link, share=["tcpin:203.0.113.9:5760"]):
                     pass
         async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
-            with pytest.raises(LocalProtocolError, match=r"aerokit\.hub\.shared"):
+            with pytest.raises(InvalidArgument, match=r"aerokit\.hub\.shared"):
                 async with aerokit.connect(connection, share=["tcpin:127.0.0.1:0"]):
                     pass
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links.address import LinkAddress, LinkKind, parse_address
 
 
@@ -158,7 +158,7 @@ def test_accepted(text: str, address: LinkAddress) -> None:
     ],
 )
 def test_refused_with_the_reason_and_the_accepted_forms(text: str, reason: str) -> None:
-    with pytest.raises(LocalProtocolError, match=reason) as caught:
+    with pytest.raises(InvalidArgument, match=reason) as caught:
         parse_address(text)
     assert "udpin:0.0.0.0:14550" in str(caught.value)
     assert "/dev/ttyUSB0,57600" in str(caught.value)
@@ -236,6 +236,6 @@ pieces = st.sampled_from([*PIECES.split(), " "])
 @given(st.lists(pieces, max_size=7).map("".join) | st.text(max_size=30))
 def test_any_string_gives_an_address_or_the_one_error(text: str) -> None:
     address = None
-    with contextlib.suppress(LocalProtocolError):
+    with contextlib.suppress(InvalidArgument):
         address = parse_address(text)
     assert address is None or parse_address(str(address)) == address

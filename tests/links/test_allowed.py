@@ -11,7 +11,7 @@ from link_harness import Recorder, each_loop, eventually
 
 import aerokit
 import aerokit.sync
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links import (
     FaultyLink,
     Link,
@@ -49,7 +49,7 @@ def test_addresses_and_networks(peers: Any, inside: list[str], outside: list[str
 
 @pytest.mark.parametrize("peers", ["", "10.0.0", "10.0.0.1/24", "copter", [], 7, [7], b"abcd", [None], 1.5])
 def test_what_is_no_address_is_an_error(peers: Any) -> None:
-    with pytest.raises(LocalProtocolError, match="peers"):
+    with pytest.raises(InvalidArgument, match="peers"):
         AllowedPeers(peers)
 
 
@@ -64,19 +64,19 @@ def test_links_to_which_anybody_can_send_take_peers(address: str) -> None:
     "address", ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1", "/dev/ttyACM0", "a.tlog", "pty"]
 )
 def test_others_do_not(address: str) -> None:
-    with pytest.raises(LocalProtocolError, match=r"peers = … is not allowed with .*udpin, udpbcast, tcpin"):
+    with pytest.raises(InvalidArgument, match=r"peers = … is not allowed with .*udpin, udpbcast, tcpin"):
         create_link(address, peers="10.0.0.7")
 
 
 @pytest.mark.anyio
 async def test_a_link_that_is_given_has_its_own() -> None:
-    with pytest.raises(LocalProtocolError, match="give them to the link"):
+    with pytest.raises(InvalidArgument, match="give them to the link"):
         async with aerokit.open_connection(UdpListen("127.0.0.1", 0), peers="10.0.0.7"):
             pytest.fail("not allowed")
-    with pytest.raises(LocalProtocolError, match=r"peers: 'copter' is no IP address"):
+    with pytest.raises(InvalidArgument, match=r"peers: 'copter' is no IP address"):
         async with aerokit.connect("udpin:127.0.0.1:0", peers="copter"):
             pytest.fail("no address")
-    with pytest.raises(LocalProtocolError, match=r"peers: 'copter' is no IP address"):
+    with pytest.raises(InvalidArgument, match=r"peers: 'copter' is no IP address"):
         aerokit.sync.connect("udpin:127.0.0.1:0", peers="copter")
 
 
@@ -85,7 +85,7 @@ async def test_an_open_connection_has_its_own() -> None:
     async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
         wrong: list[dict[str, Any]] = [{"peers": "10.0.0.7"}, {"may_move": True}]
         for options in wrong:
-            with pytest.raises(LocalProtocolError, match="say it to open_connection"):
+            with pytest.raises(InvalidArgument, match="say it to open_connection"):
                 async with aerokit.connect(connection, **options):
                     pytest.fail("not allowed")
 

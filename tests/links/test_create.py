@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links import (
     Link,
     Replay,
@@ -45,5 +45,5 @@ def test_each_address_makes_its_link(address: str, kind: type[Link], named: str)
 
 
 def test_a_wrong_address_shows_the_accepted_forms() -> None:
-    with pytest.raises(LocalProtocolError, match="Accepted:"):
+    with pytest.raises(InvalidArgument, match="Accepted:"):
         create_link("udpin:0.0.0.0")

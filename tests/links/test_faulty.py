@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from link_harness import Recorder, each_loop, each_traffic
 
 import aerokit
-from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.links import FaultModel, FaultyLink, UdpConnect, UdpListen, memory_link_pair
 from aerokit.links.fault_model import Air, FaultyPath, split_frames
 from aerokit.mavlink import FrameEncoder, messages
@@ -179,7 +179,7 @@ def test_a_model_can_be_replaced_at_any_time() -> None:
 )
 def test_a_model_that_makes_no_sense_is_refused(wrong: dict[str, Any]) -> None:
     (field,) = wrong
-    with pytest.raises(LocalProtocolError, match=field):
+    with pytest.raises(InvalidArgument, match=field):
         FaultModel(**wrong)
 
 

@@ -17,9 +17,9 @@ from link_harness import Recorder
 from aerokit.errors import (
     BusyError,
     ConnectionClosed,
+    InvalidArgument,
     LinkLost,
     LinkOpenError,
-    LocalProtocolError,
     RecordingEnded,
 )
 from aerokit.links import Peer, ReconnectingLink, Replay, create_link
@@ -137,7 +137,7 @@ async def test_the_first_opening_is_that_of_the_link_itself() -> None:
 
 
 async def test_a_wrong_address_is_told_before_anything_is_opened() -> None:
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         ReconnectingLink(lambda: create_link("nonsense"))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from link_harness import Recorder, each_loop
 
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.links import Replay, replay
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.testing import run_virtual
@@ -145,7 +145,7 @@ def test_a_file_that_fails_later_is_a_lost_link(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
 def test_speed_must_be_above_zero(speed: float) -> None:
-    with pytest.raises(LocalProtocolError, match="must be above 0"):
+    with pytest.raises(InvalidArgument, match="must be above 0"):
         Replay("flight.tlog", speed)
 
 

@@ -12,7 +12,7 @@ from link_harness import Recorder, each_loop
 from zenoh_harness import Told, client, reconnecting, serving
 from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
-from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.links import create_link, needed
 from aerokit.links.handover import Handover
 from aerokit.links.zenoh_keys import Stamp
@@ -134,7 +134,7 @@ async def test_a_link_is_opened_once(tmp_path: Path) -> None:
         each.write(b"nothing happens")
     wrong = tmp_path / "zenoh.json5"
     wrong.write_text("{ mode: 7 }")
-    with pytest.raises(LocalProtocolError, match="zenoh://north/alpha: config="):
+    with pytest.raises(InvalidArgument, match="zenoh://north/alpha: config="):
         await create_link(f"zenoh://north/alpha?config={wrong}").open(Recorder())
 
 

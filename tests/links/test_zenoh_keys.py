@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links.zenoh_keys import Beacon, Place, Stamp, Told, check_name, read_sent_at, sent_at
 
 u32 = st.integers(0, 2**32 - 1)
@@ -25,7 +25,7 @@ def test_keys() -> None:
     "name", ["", "*", "**", "a/b", "$x", "a b", "ä", "-a", ".a", "#", "a?", "x" * 64, "a\n"]
 )
 def test_names_that_zenoh_would_understand_otherwise(name: str) -> None:
-    with pytest.raises(LocalProtocolError, match="is not allowed"):
+    with pytest.raises(InvalidArgument, match="is not allowed"):
         check_name("fleet", name)
 
 
@@ -91,6 +91,6 @@ def test_a_beacon_whose_clock_is_no_time_is_none(clock: str) -> None:
 
 
 def test_no_client_is_called_as_everybody_is() -> None:
-    with pytest.raises(LocalProtocolError, match="client = 'all' is not allowed"):
+    with pytest.raises(InvalidArgument, match="client = 'all' is not allowed"):
         check_name("client", "all")
     assert check_name("name", "all") == "all"

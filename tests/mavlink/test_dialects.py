@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from wire_samples import for_peer, samples
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import STANDARD, Dialect, FrameEncoder, Framer, Message, enums, messages
 from aerokit.mavlink.generator import xml_folder
 
@@ -164,7 +164,7 @@ def test_a_private_message_goes_over_the_wire(private: Dialect) -> None:
     ],
 )
 def test_private_messages_complain_too(private: Dialect, changes: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(LocalProtocolError, match=complaint.replace(".", r"\.")):
+    with pytest.raises(InvalidArgument, match=complaint.replace(".", r"\.")):
         winch(private, **changes).encode()
 
 
@@ -211,19 +211,19 @@ def one_message(id: object, name: str, type: str) -> str:  # noqa: A002
 def test_wrong_files_are_told(tmp_path: Path, text: str, complaint: str) -> None:
     path = tmp_path / "wrong.xml"
     path.write_text(text)
-    with pytest.raises(LocalProtocolError) as caught:
+    with pytest.raises(InvalidArgument) as caught:
         Dialect.from_xml(path)
     assert complaint in str(caught.value)
     assert "wrong.xml" in str(caught.value)
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(LocalProtocolError, match=r"no dialect file .*nowhere\.xml"):
+    with pytest.raises(InvalidArgument, match=r"no dialect file .*nowhere\.xml"):
         Dialect.from_xml(tmp_path / "nowhere.xml")
 
 
 def test_an_id_that_means_two_messages_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(LocalProtocolError) as caught:
+    with pytest.raises(InvalidArgument) as caught:
         Dialect.from_xml(write(tmp_path, id=30))
     text = str(caught.value)
     assert text == "message id 30 is defined twice in private: ATTITUDE in common, WINCH_REPORT in private"
@@ -291,13 +291,13 @@ def test_a_private_module_by_its_own_name(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("name", ["nowhere", "nowhere.at.all", "pymavlink.dialects.v20.nowhere"])
 def test_a_missing_module_is_told(name: str) -> None:
-    with pytest.raises(LocalProtocolError, match=f"no pymavlink dialect '{name}'"):
+    with pytest.raises(InvalidArgument, match=f"no pymavlink dialect '{name}'"):
         Dialect.from_pymavlink(name)
 
 
 def test_a_module_that_is_no_dialect_is_told() -> None:
     with pytest.raises(
-        LocalProtocolError, match=r"pymavlink\.mavutil is no pymavlink dialect: it has no mavlink_map"
+        InvalidArgument, match=r"pymavlink\.mavutil is no pymavlink dialect: it has no mavlink_map"
     ):
         Dialect.from_pymavlink("pymavlink.mavutil")
 
@@ -355,7 +355,7 @@ def test_pymavlinks_dialects_with_fewer_extension_fields_are_the_standards_class
 def test_a_clash_is_told(tmp_path: Path) -> None:
     (tmp_path / "empty.xml").write_text("<mavlink/>")
     private = Dialect.from_xml(write(tmp_path, include="empty.xml", id=30))
-    with pytest.raises(LocalProtocolError) as caught:
+    with pytest.raises(InvalidArgument) as caught:
         STANDARD.extended_by(private)
     assert "message id 30 is ATTITUDE (CRC_EXTRA 39) in 'standard', but WINCH_REPORT" in str(caught.value)
 
@@ -374,9 +374,9 @@ def test_the_standard() -> None:
     assert STANDARD.enum("MAV_CMD") is enums.MavCmd
     with pytest.raises(KeyError):
         STANDARD[16_000_000]
-    with pytest.raises(LocalProtocolError, match="dialect 'standard' has no message 'NOPE'"):
+    with pytest.raises(InvalidArgument, match="dialect 'standard' has no message 'NOPE'"):
         STANDARD.by_name("NOPE")
-    with pytest.raises(LocalProtocolError, match="dialect 'standard' has no enum 'NOPE'"):
+    with pytest.raises(InvalidArgument, match="dialect 'standard' has no enum 'NOPE'"):
         STANDARD.enum("NOPE")
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, enums, messages
 from aerokit.mavlink.checksum import x25, x25_in_python
 
@@ -86,7 +86,7 @@ WRONG: list[tuple[Callable[[], Message], str]] = [
 @pytest.mark.parametrize(("make", "complaint"), WRONG, ids=[complaint for _, complaint in WRONG])
 def test_what_does_not_fit_is_named(make: Callable[[], Message], complaint: str) -> None:
     encoder = FrameEncoder(1, 1)
-    with pytest.raises(LocalProtocolError) as caught:
+    with pytest.raises(InvalidArgument) as caught:
         encoder.encode(make())
     assert complaint in str(caught.value)
     assert encoder.sequence == 0, "no number is used up"
@@ -123,7 +123,7 @@ def test_what_fits_in_spite_of_its_type(message: Message) -> None:
     ],
 )
 def test_wrong_ids(arguments: tuple[int, int], complaint: str) -> None:
-    with pytest.raises(LocalProtocolError, match=complaint):
+    with pytest.raises(InvalidArgument, match=complaint):
         FrameEncoder(*arguments)
 
 
@@ -133,10 +133,10 @@ def test_component_0_is_nobody_and_may_send() -> None:
 
 
 def test_wrong_version() -> None:
-    with pytest.raises(LocalProtocolError, match="version = 3 must be 1 or 2"):
+    with pytest.raises(InvalidArgument, match="version = 3 must be 1 or 2"):
         FrameEncoder(1, 1, version=3)
     encoder = FrameEncoder(1, 1)
-    with pytest.raises(LocalProtocolError, match="version = 0 must be 1 or 2"):
+    with pytest.raises(InvalidArgument, match="version = 0 must be 1 or 2"):
         encoder.version = 0
     assert encoder.version == 2
 
@@ -152,7 +152,7 @@ def test_the_version_may_change_between_two_frames() -> None:
 
 def test_version_1_has_no_ids_above_255() -> None:
     encoder = FrameEncoder(1, 1, version=1)
-    with pytest.raises(LocalProtocolError, match="PLAY_TUNE has id 258, MAVLink 1 has none above 255"):
+    with pytest.raises(InvalidArgument, match="PLAY_TUNE has id 258, MAVLink 1 has none above 255"):
         encoder.encode(messages.PlayTune(1, 1, "A"))
     assert encoder.sequence == 0
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import enums, generator, messages
 from aerokit.mavlink.definitions import DialectDefinition, merged_enums, read_xml
 from aerokit.mavlink.union import read_additions, with_added_enums, with_added_messages
@@ -45,7 +45,7 @@ def test_one_name_for_two_messages_is_refused(tmp_path: Path) -> None:
     text, count = re.subn('(<message id="[0-9]+" name=")[A-Z_]+"', r'\1AHRS"', path.read_text(), count=1)
     assert count == 1
     path.write_text(text)
-    with pytest.raises(LocalProtocolError, match="two definitions would both be called Ahrs"):
+    with pytest.raises(InvalidArgument, match="two definitions would both be called Ahrs"):
         generator.generate(tmp_path)
 
 

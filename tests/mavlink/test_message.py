@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire_samples import samples
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import STANDARD, Field, FrameEncoder, Framer, Message, messages
 from aerokit.mavlink.message import INTEGER_RANGES
 
@@ -136,7 +136,7 @@ def test_keys_are_not_shown() -> None:
     assert repr(message) == (
         "SetupSigning(target_system=1, target_component=1, secret_key=<not shown>, initial_timestamp=5)"
     )
-    with pytest.raises(LocalProtocolError) as raised:
+    with pytest.raises(InvalidArgument) as raised:
         messages.SetupSigning(1, 1, key * 2, 5).encode()
     assert "secret_key = <not shown>" in str(raised.value)
 
@@ -192,7 +192,7 @@ def test_field_is_public() -> None:
 
 def test_the_wrong_field_is_named_and_none_that_holds_its_greatest_or_least_value() -> None:
     for value in (0, 255):
-        with pytest.raises(LocalProtocolError, match=r"target_component = 300"):
+        with pytest.raises(InvalidArgument, match=r"target_component = 300"):
             messages.CommandLong(value, 300, 400, 0, 0, 0, 0, 0, 0, 0, 0).encode()
 
 
@@ -219,5 +219,5 @@ def test_char_arrays_that_carry_bytes_keep_their_zeros(kind: type[Message]) -> N
     assert told.to_dict()["param_value"] == number.ljust(128, b"\0")
     assert told.to_dict()["param_id"] == "A"
     for wrong in ("text", bytes(129), 5):
-        with pytest.raises(LocalProtocolError, match=r"\.param_value = .* cannot be sent"):
+        with pytest.raises(InvalidArgument, match=r"\.param_value = .* cannot be sent"):
             kind(**values | {"param_value": wrong}).encode()

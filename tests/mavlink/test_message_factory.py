@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Message, messages
 from aerokit.mavlink.from_pymavlink import from_pymavlink
 from aerokit.mavlink.message_factory import MessageFactory
@@ -25,8 +25,8 @@ def test_what_it_sends_goes_to_the_program_as_any_message_of_pymavlink() -> None
 
 def test_what_cannot_be_sent_is_told_to_the_caller_and_not_counted() -> None:
     factory: Any = MessageFactory(from_pymavlink, 255, 0)
-    with pytest.raises(LocalProtocolError, match="param_type"):
+    with pytest.raises(InvalidArgument, match="param_type"):
         factory.param_set_send(1, 1, b"RTL_ALT", 30, 900)
-    with pytest.raises(LocalProtocolError, match="a text must be str or bytes"):
+    with pytest.raises(InvalidArgument, match="a text must be str or bytes"):
         factory.param_set_send(1, 1, 5, 30, 9)
     assert (factory.seq, factory.total_packets_sent) == (0, 0)

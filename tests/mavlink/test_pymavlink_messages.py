@@ -16,7 +16,7 @@ from pymavlink.dialects.v10 import ardupilotmega as version_1
 from pymavlink.dialects.v20 import ardupilotmega, common, matrixpilot
 from wire_samples import random_message
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Message, messages
 from aerokit.mavlink.from_pymavlink import from_pymavlink
 from aerokit.mavlink.signing import Signing, SigningKey
@@ -40,7 +40,7 @@ def test_its_time_and_dialect_are_the_programs() -> None:
 
 
 def test_what_is_wrong_is_named() -> None:
-    with pytest.raises(LocalProtocolError, match=r"COMMAND_LONG.command = 70000 .*0\.\.65535"):
+    with pytest.raises(InvalidArgument, match=r"COMMAND_LONG.command = 70000 .*0\.\.65535"):
         from_pymavlink(ardupilotmega.MAVLink_command_long_message(1, 1, 70000, 0, 0, 0, 0, 0, 0, 0, 0))
 
 
@@ -184,7 +184,7 @@ def test_texts_are_bytes_or_text_and_the_later_one_counts() -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_cannot_be_sent_is_named(given: Any, complaint: str) -> None:
-    with pytest.raises(LocalProtocolError, match=complaint):
+    with pytest.raises(InvalidArgument, match=complaint):
         from_pymavlink(given)
 
 

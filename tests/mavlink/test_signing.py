@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as peer
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Framer
 from aerokit.mavlink.messages import Heartbeat, ParamValue, RadioStatus
 from aerokit.mavlink.signing import Refusal, Signing, SigningKey, timestamp_at
@@ -60,7 +60,7 @@ def test_a_passphrase_is_hashed_as_ground_stations_do() -> None:
 
 @pytest.mark.parametrize("secret", [b"", bytes(31), bytes(32), bytes(33), "a" * 32])
 def test_what_is_no_key_is_refused(secret: Any) -> None:
-    with pytest.raises(LocalProtocolError, match="key"):
+    with pytest.raises(InvalidArgument, match="key"):
         SigningKey(secret)
 
 
@@ -77,7 +77,7 @@ def test_no_text_shows_the_key() -> None:
     "options", [{"link_id": -1}, {"link_id": 256}, {"timestamp": -1}, {"timestamp": 1 << 48}]
 )
 def test_options_out_of_range(options: Any) -> None:
-    with pytest.raises(LocalProtocolError, match=next(iter(options))):
+    with pytest.raises(InvalidArgument, match=next(iter(options))):
         Signing(KEY, **options)
 
 
@@ -157,7 +157,7 @@ def test_what_was_heard_moves_our_time_stamps_on() -> None:
 def test_an_end_of_all_time_stamps() -> None:
     signing = Signing(KEY, timestamp=(1 << 48) - 1)
     signed(signing)
-    with pytest.raises(LocalProtocolError, match="used up"):
+    with pytest.raises(InvalidArgument, match="used up"):
         signed(signing)
 
 

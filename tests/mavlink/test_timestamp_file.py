@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Framer, timestamp_file
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.mavlink.signing import ONE_MINUTE, Refusal, Signing, SigningKey
@@ -89,7 +89,7 @@ def test_a_time_stamp_has_48_bits_all_of_which_may_be_set(path: Path) -> None:
     last = (1 << 48) - 1
     assert Signing(KEY, timestamp=last).timestamp == last
     for wrong in (-1, 1 << 48):
-        with pytest.raises(LocalProtocolError, match=rf"timestamp = {wrong} must be in 0\.\.{last}"):
+        with pytest.raises(InvalidArgument, match=rf"timestamp = {wrong} must be in 0\.\.{last}"):
             Signing(KEY, timestamp=wrong)
     path.write_text(str(last))
     assert Signing(KEY, keep=path).timestamp == last

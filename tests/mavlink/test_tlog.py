@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pymavlink import mavutil
 from recorded import recording
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import FrameEncoder, Framer, TlogWriter, read_tlog
 from aerokit.mavlink.messages import V2Extension
 
@@ -143,7 +143,7 @@ def test_a_reader_that_stops_early_closes_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("when", [-1.0, 1.9e13, 1e14])
 def test_time_stamps_must_fit(when: float) -> None:
-    with pytest.raises(LocalProtocolError, match=r"timestamp_s = .* must be seconds since 1970"):
+    with pytest.raises(InvalidArgument, match=r"timestamp_s = .* must be seconds since 1970"):
         TlogWriter(io.BytesIO()).write(b"", when)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from aerokit import missions
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import MissionItem, RallyPoints
 from aerokit.missions.check import check_item
@@ -159,7 +159,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
 
 @pytest.mark.parametrize(("build", "message"), WRONG)
 def test_builders_refuse(build: Callable[[], object], message: str) -> None:
-    with pytest.raises(LocalProtocolError, match=message):
+    with pytest.raises(InvalidArgument, match=message):
         build()
 
 
@@ -167,6 +167,6 @@ def test_places_without_a_place_are_ardupilots_alone() -> None:
     mission = missions.Mission([missions.take_off(altitude_relative_m=10), missions.land()])
     mission.check()
     mission.check(home_is_item_0=True)
-    with pytest.raises(LocalProtocolError, match=r"item 0 \(NAV_TAKEOFF\): x, y = 0, 0 .* only ArduPilot"):
+    with pytest.raises(InvalidArgument, match=r"item 0 \(NAV_TAKEOFF\): x, y = 0, 0 .* only ArduPilot"):
         mission.check(home_is_item_0=False)
     RallyPoints([missions.rally_point(0, 0, altitude_relative_m=1)]).check(home_is_item_0=False)

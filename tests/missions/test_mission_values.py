@@ -7,7 +7,7 @@ import pickle
 
 import pytest
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, MissionItem, RallyPoints
 from aerokit.position import Position
@@ -80,7 +80,7 @@ def test_positions_of_items() -> None:
     ],
 )
 def test_wrong_items_are_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(LocalProtocolError, match=message):
+    with pytest.raises(InvalidArgument, match=message):
         Mission([RTL, WAYPOINT.replace(**changes)]).check()
 
 
@@ -95,23 +95,23 @@ def test_what_the_standard_allows_passes() -> None:
 
 
 def test_no_item_at_all() -> None:
-    with pytest.raises(LocalProtocolError, match="item 1 = 'land' is no MissionItem"):
+    with pytest.raises(InvalidArgument, match="item 1 = 'land' is no MissionItem"):
         Mission([WAYPOINT, "land"])  # type: ignore[list-item]
-    with pytest.raises(LocalProtocolError, match="item 0 = None"):
+    with pytest.raises(InvalidArgument, match="item 0 = None"):
         RallyPoints([None])  # type: ignore[list-item]
 
 
 def test_too_many_items() -> None:
     Mission([RTL] * 65_535).check()
-    with pytest.raises(LocalProtocolError, match="65536 items are too many: at most 65535"):
+    with pytest.raises(InvalidArgument, match="65536 items are too many: at most 65535"):
         Mission([RTL] * 65_536).check()
-    with pytest.raises(LocalProtocolError, match="65535 items are too many: at most 65534"):
+    with pytest.raises(InvalidArgument, match="65535 items are too many: at most 65534"):
         Mission([RTL] * 65_535).check(home_is_item_0=True)
 
 
 @pytest.mark.parametrize("target", [-1, 2, 0.5, 70000])
 def test_jumps_must_lead_into_the_mission(target: float) -> None:
-    with pytest.raises(LocalProtocolError, match=r"item 1 \(DO_JUMP\): param1 = .* 0 to 1"):
+    with pytest.raises(InvalidArgument, match=r"item 1 \(DO_JUMP\): param1 = .* 0 to 1"):
         Mission([WAYPOINT, jump(target)]).check()
 
 
@@ -119,7 +119,7 @@ def test_jump_tags() -> None:
     tag = MissionItem(MavCmd.JUMP_TAG, MavFrame.MISSION, 7.0)
     leap = MissionItem(MavCmd.DO_JUMP_TAG, MavFrame.MISSION, 7.0, 1.0)
     Mission([tag, WAYPOINT, leap]).check()
-    with pytest.raises(LocalProtocolError, match=r"DO_JUMP_TAG.*param1 = 8"):
+    with pytest.raises(InvalidArgument, match=r"DO_JUMP_TAG.*param1 = 8"):
         Mission([tag, leap.replace(param1=8.0)]).check()
 
 
@@ -186,7 +186,7 @@ def test_fence_items_and_back() -> None:
 )
 def test_wrong_fences_cannot_be_made(make: object, message: str) -> None:
     assert callable(make)
-    with pytest.raises(LocalProtocolError, match=message):
+    with pytest.raises(InvalidArgument, match=message):
         make()
 
 
@@ -197,7 +197,7 @@ def test_rally_points() -> None:
     assert points.positions == (Position(47.3977419, 8.545594, altitude_relative_m=40.0),)
     assert RallyPoints.from_items(points.to_items()) == points
     assert (len(points), points[0], list(points)) == (1, item, [item])
-    with pytest.raises(LocalProtocolError, match="in rally points"):
+    with pytest.raises(InvalidArgument, match="in rally points"):
         RallyPoints([WAYPOINT]).check()
-    with pytest.raises(LocalProtocolError, match=r"frame = .* a global frame"):
+    with pytest.raises(InvalidArgument, match=r"frame = .* a global frame"):
         RallyPoints([item.replace(frame=2)]).check()

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions import Fence, Mission, MissionItem
@@ -75,7 +75,7 @@ def test_the_float_form_off_the_air_never_raises(x: float, y: float) -> None:
 
 
 def test_a_fraction_does_not_fit_into_the_integer_form() -> None:
-    with pytest.raises(LocalProtocolError, match=r"MISSION_ITEM_INT.x = 0.5"):
+    with pytest.raises(InvalidArgument, match=r"MISSION_ITEM_INT.x = 0.5"):
         to_wire(
             MissionItem(MavCmd.DO_SET_ACTUATOR, 2, x=0.5), 0, target_system=1, target_component=1
         ).encode()
@@ -131,7 +131,7 @@ def test_any_bytes_are_a_plan_or_an_error(data: bytes) -> None:
 
 
 def test_too_many_items_are_not_packed() -> None:
-    with pytest.raises(LocalProtocolError, match="65536 items are too many"):
+    with pytest.raises(InvalidArgument, match="65536 items are too many"):
         pack_items([MissionItem(20, 2)] * 65_535, first=1)
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -134,7 +134,7 @@ def test_altitude_modes_where_the_item_has_no_altitude(changes: dict[str, Any], 
     item = read(samples.document(entry)).mission[0]
     assert item == MissionItem(16, frame, 0, 0, 0, NAN, 470000000, 80000000, z)
     if z != z:
-        with pytest.raises(LocalProtocolError, match="z = nan"):
+        with pytest.raises(InvalidArgument, match="z = nan"):
             Mission([item]).check()
 
 
@@ -273,7 +273,7 @@ def test_plans_are_compared_without_their_source() -> None:
     ],
 )
 def test_what_a_plan_file_cannot_keep(plan: Plan, message: str) -> None:
-    with pytest.raises(LocalProtocolError, match=message):
+    with pytest.raises(InvalidArgument, match=message):
         format_plan(plan)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink import mavwp
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import (
     Mission,
@@ -165,9 +165,9 @@ def test_damaged_files(old: str, new: str, message: str) -> None:
 
 
 def test_what_cannot_be_written() -> None:
-    with pytest.raises(LocalProtocolError, match="infinite"):
+    with pytest.raises(InvalidArgument, match="infinite"):
         format_waypoints(Mission([MissionItem(16, 3, math.inf)]))
-    with pytest.raises(LocalProtocolError, match="version = 100 is not allowed"):
+    with pytest.raises(InvalidArgument, match="version = 100 is not allowed"):
         format_waypoints(Mission(), version=100)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import aerokit
-from aerokit.errors import ConnectionClosed, LocalProtocolError
+from aerokit.errors import ConnectionClosed, InvalidArgument
 from aerokit.network import Publisher, publishing
 from aerokit.network.publishing import REPEAT_S
 from aerokit.network.schema import ENUMS, document, rendered
@@ -162,10 +162,10 @@ def test_arguments() -> None:
         async with simulated_link(SimulatedCopter()) as link, aerokit.connect(link) as vehicle:
             wrongs: list[dict[str, Any]] = [{"rate_hz": 0.0}, {"rate_hz": 51.0}, {"states": ["nonsense"]}]
             for wrong in wrongs:
-                with pytest.raises(LocalProtocolError, match=r"not allowed|is no state"):
+                with pytest.raises(InvalidArgument, match=r"not allowed|is no state"):
                     async with publishing(vehicle, Kept(), **wrong):
                         pass
-            with pytest.raises(LocalProtocolError, match="it is not on a network"):
+            with pytest.raises(InvalidArgument, match="it is not on a network"):
                 async with publishing(vehicle, "udpin:0.0.0.0:14550"):
                     pass
         with pytest.raises(ConnectionClosed):

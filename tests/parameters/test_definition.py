@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters import CameraDefinition, SettingValue, load_definition, parse_definition
 from aerokit.parameters.setting import checked_setting, setting_bytes, setting_value, settings_equal
@@ -32,7 +32,7 @@ def of(parameters: str, more: str = "") -> CameraDefinition:
 
 
 def refusal(camera: CameraDefinition, name: str, value: object, **values: SettingValue) -> str:
-    with pytest.raises(LocalProtocolError) as caught:
+    with pytest.raises(InvalidArgument) as caught:
         camera.checked(name, value, values)
     return str(caught.value)
 
@@ -212,7 +212,7 @@ def test_what_is_taken(name: str, value: object, sent: object) -> None:
     ],
 )
 def test_what_is_refused(name: str, value: object, complaint: str) -> None:
-    with pytest.raises(LocalProtocolError, match=complaint) as caught:
+    with pytest.raises(InvalidArgument, match=complaint) as caught:
         CAMERA.checked(name, value, {})
     assert str(caught.value).startswith(f"{name} = ")
 
@@ -247,7 +247,7 @@ def test_values_there_and_back(given_value: tuple[SettingValue, MavParamExtType]
     value, kind = given_value
     try:
         wanted = checked_setting("A", value, kind)
-    except LocalProtocolError:
+    except InvalidArgument:
         assert isinstance(value, str)  # half of a surrogate pair
         return
     told = setting_value(setting_bytes(wanted, kind).ljust(128, b"\0"), kind)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters import parse_definition
 from aerokit.parameters.definition import LARGEST_DEFINITION, MOST_ELEMENTS
 
@@ -76,5 +76,5 @@ def test_options_that_are_alike_as_the_camera_stores_them_stay() -> None:
     )
     definition = parse_definition(file_of('<parameter name="A" type="float"/>' + rulers))
     assert [each.name for each in definition.options("A", {"B": 1, "C": 1})] == ["a"]
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         definition.checked("A", 0.2, {"B": 1, "C": 1})

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import ParamSet, ParamValue
@@ -88,6 +88,6 @@ def test_nonsense_off_the_air_is_returned_as_it_is() -> None:
 
 def test_eight_bytes_do_not_fit() -> None:
     value = checked_value("X", 5, ParameterType.INT64)
-    with pytest.raises(LocalProtocolError, match="INT64"):
+    with pytest.raises(InvalidArgument, match="INT64"):
         to_wire(value, ParameterType.INT64, bytewise=True)
     assert to_wire(value, ParameterType.INT64, bytewise=False) == 5.0

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.mavparm import MAVParmDict
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters import (
     Parameter,
     ParameterTable,
@@ -219,14 +219,14 @@ def test_noise(text: str) -> None:
 def test_nothing_is_written_when_something_cannot(values: dict[str, Any], text: str, tmp_path: Path) -> None:
     path = tmp_path / "a.param"
     write_parameter_file(path, {"OLD": 1})
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         write_parameter_file(path, {"GOOD": 1, **values} if values else values)
     assert path.read_text() == "OLD,1\n"
     assert [each.name for each in tmp_path.iterdir()] == ["a.param"]
 
 
 def test_unknown_format(tmp_path: Path) -> None:
-    with pytest.raises(LocalProtocolError, match="missionplanner, mavproxy or qgroundcontrol"):
+    with pytest.raises(InvalidArgument, match="missionplanner, mavproxy or qgroundcontrol"):
         write_parameter_file(tmp_path / "a", {"A": 1}, format="xml")  # type: ignore[arg-type]
 
 

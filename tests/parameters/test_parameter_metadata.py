@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters import (
     Metadata,
     Parameter,
@@ -212,13 +212,13 @@ def test_ranges() -> None:
     }.items():
         metadata.check(name, value)
     metadata.check("MPC_XY_CRUISE", -1)  # it has a name
-    with pytest.raises(LocalProtocolError, match=r"MPC_XY_CRUISE = 25 is not in 3\.\.20 m/s"):
+    with pytest.raises(InvalidArgument, match=r"MPC_XY_CRUISE = 25 is not in 3\.\.20 m/s"):
         metadata.check("MPC_XY_CRUISE", 25)
-    with pytest.raises(LocalProtocolError, match=r"COM_FLIGHT_UUID = -1 is not in 0\.\."):
+    with pytest.raises(InvalidArgument, match=r"COM_FLIGHT_UUID = -1 is not in 0\.\."):
         metadata.check("COM_FLIGHT_UUID", -1)
-    with pytest.raises(LocalProtocolError, match="not a number"):
+    with pytest.raises(InvalidArgument, match="not a number"):
         metadata.check("MPC_XY_CRUISE", float("nan"))
-    with pytest.raises(LocalProtocolError, match="can only be read"):
+    with pytest.raises(InvalidArgument, match="can only be read"):
         parse_metadata(ARDUPILOT_XML.encode()).check("BARO1_GND_PRESS", 1)
 
 

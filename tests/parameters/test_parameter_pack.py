@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.mavftp import MAVFTP
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.pack import pack_parameters, pack_served, unpack_parameters
 
@@ -189,14 +189,14 @@ def test_wider_types_carry_unsigned_ones() -> None:
     ],
 )
 def test_what_cannot_be_packed(parameter: Parameter, text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         pack_parameters([parameter])
 
 
 def test_limits() -> None:
     rows = [Parameter(f"{i * 7919 % 10000:04}{i:012}", 1, ParameterType.INT32) for i in range(8000)]
-    with pytest.raises(LocalProtocolError, match="at most 65535"):
+    with pytest.raises(InvalidArgument, match="at most 65535"):
         pack_parameters(rows)
     assert len(pack_parameters(rows[:2000])) < 65536
-    with pytest.raises(LocalProtocolError, match=r"start = 8000 must be in 0\.\.7999"):
+    with pytest.raises(InvalidArgument, match=r"start = 8000 must be in 0\.\.7999"):
         pack_served(rows, start=8000)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.errors import LocalProtocolError, ValueUnknownError
+from aerokit.errors import InvalidArgument, ValueUnknownError
 from aerokit.mavlink.enums import MavParamType
 from aerokit.parameters import Parameter, ParameterTable, ParameterType, check_name, checked_value
 from aerokit.parameters.parameter import same_value
@@ -39,7 +39,7 @@ def test_ranges_are_those_of_the_bytes(type_: ParameterType, format_: str) -> No
     "name", ["", "SEVENTEEN_LETTERS", "WP SPD", "WP_SPD\n", "GESCHWINDIGKEIT\N{DEGREE SIGN}", 5]
 )
 def test_names_that_cannot_be_sent(name: Any) -> None:
-    with pytest.raises(LocalProtocolError, match="parameter name = "):
+    with pytest.raises(InvalidArgument, match="parameter name = "):
         check_name(name)
 
 
@@ -64,7 +64,7 @@ def test_names_that_can() -> None:
     ],
 )
 def test_values_that_cannot_be_sent(value: Any, type_: ParameterType, text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=rf"^X = .*{text}"):
+    with pytest.raises(InvalidArgument, match=rf"^X = .*{text}"):
         checked_value("X", value, type_)
 
 

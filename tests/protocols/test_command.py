@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed, LocalProtocolError
+from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat
 from aerokit.protocols.command import CommandExchange, command_int, command_long
@@ -207,19 +207,19 @@ def test_the_int_form_is_resent_unchanged() -> None:
     ],
 )
 def test_nonsense_is_refused(params: tuple[float, ...], text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         command_long(1, 1, ARM, params)
 
 
 def test_a_broadcast_by_accident_is_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="target_system = 0"):
+    with pytest.raises(InvalidArgument, match="target_system = 0"):
         command_long(0, 0, ARM, (1.0,))
 
 
 def test_integers_of_the_int_form_must_fit() -> None:
-    with pytest.raises(LocalProtocolError, match="x = 2147483648"):
+    with pytest.raises(InvalidArgument, match="x = 2147483648"):
         command_int(1, 1, MavCmd.DO_REPOSITION, frame=6, x=2**31, y=0, z=0.0)
-    with pytest.raises(LocalProtocolError, match="at most 4"):
+    with pytest.raises(InvalidArgument, match="at most 4"):
         command_int(1, 1, MavCmd.DO_REPOSITION, (0,) * 5, frame=6, x=0, y=0, z=0.0)
 
 
@@ -227,7 +227,7 @@ def test_integers_of_the_int_form_must_fit() -> None:
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan")])
 def test_a_timeout_that_is_no_time_is_refused(field: str, seconds: float) -> None:
     arguments: dict[str, float] = {field: seconds}
-    with pytest.raises(LocalProtocolError, match=field):
+    with pytest.raises(InvalidArgument, match=field):
         CommandExchange(
             command_long(1, 1, ARM),
             own_system=255,

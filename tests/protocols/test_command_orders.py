@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from parameter_channel import framed
 
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandLong
@@ -242,7 +242,7 @@ def test_the_last_allowed_values_are_allowed() -> None:
     ],
 )
 def test_places_beyond_their_type_are_refused(place: dict[str, Any], text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         command_int(1, 1, 192, frame=6, **({"x": 0, "y": 0, "z": 0.0} | place))
 
 
@@ -252,11 +252,11 @@ def test_a_target_is_a_single_system(system: int) -> None:
         lambda: command_long(system, 0, ARM),
         lambda: command_int(system, 0, 192, frame=6, x=0, y=0, z=0),
     ):
-        with pytest.raises(LocalProtocolError, match=f"target_system = {system}"):
+        with pytest.raises(InvalidArgument, match=f"target_system = {system}"):
             make()
 
 
 def test_a_command_is_sent_at_least_once() -> None:
-    with pytest.raises(LocalProtocolError, match="attempts = 0"):
+    with pytest.raises(InvalidArgument, match="attempts = 0"):
         order(attempts=0)
     assert order(attempts=1).deadline == 1.0

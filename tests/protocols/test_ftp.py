@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.mavftp import FTP_OP
 
-from aerokit.errors import FileError, FileTimeout, LocalProtocolError
+from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp import FtpMessage, FtpRequest, path_bytes
@@ -72,7 +72,7 @@ def test_any_bytes_are_some_message(payload: bytes) -> None:
 
 @pytest.mark.parametrize("path", ["", "a\0b", "x" * 239, "ä" * 120, "\ud800"])
 def test_paths_that_cannot_be_sent(path: str) -> None:
-    with pytest.raises(LocalProtocolError, match="path"):
+    with pytest.raises(InvalidArgument, match="path"):
         path_bytes(path)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from parameter_channel import Channel, FakeVehicle, table_of
 
-from aerokit.errors import LocalProtocolError, ParameterTimeout
+from aerokit.errors import InvalidArgument, ParameterTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
@@ -88,7 +88,7 @@ def test_progress_is_told() -> None:
 
 
 def test_patience_is_above_zero() -> None:
-    with pytest.raises(LocalProtocolError, match="patience_s"):
+    with pytest.raises(InvalidArgument, match="patience_s"):
         listing(patience_s=0.0)
 
 

@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import minimal as pymavlink
 
 from aerokit import connect, open_connection
-from aerokit.errors import ConnectFailed, LinkLost, LocalProtocolError
+from aerokit.errors import ConnectFailed, InvalidArgument, LinkLost
 from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.dialect import Dialect
 from aerokit.mavlink.encoder import FrameEncoder
@@ -185,7 +185,7 @@ async def test_wrong_arguments_are_refused_before_anything_is_opened(
     near, _ = memory_link_pair()
     record = tmp_path / "flight.tlog"
     record.write_bytes(b"precious")
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         async with connect(near, record=record, **arguments):
             pytest.fail("nothing is opened")
     assert record.read_bytes() == b"precious"
@@ -194,6 +194,6 @@ async def test_wrong_arguments_are_refused_before_anything_is_opened(
 
 
 async def test_a_wrong_address_shows_the_accepted_forms() -> None:
-    with pytest.raises(LocalProtocolError, match="udpin"):
+    with pytest.raises(InvalidArgument, match="udpin"):
         async with connect("carrier pigeon"):
             pytest.fail("there is no such link")

@@ -19,9 +19,9 @@ from aerokit.errors import (
     BusyError,
     ConnectFailed,
     ConnectionClosed,
+    InvalidArgument,
     LinkLost,
     LinkOpenError,
-    LocalProtocolError,
 )
 from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink import STANDARD, Dialect
@@ -114,7 +114,7 @@ async def test_our_ids_may_be_all_that_there_are(system_id: int, component_id: i
 )
 async def test_our_ids_are_bytes(wrong: dict[str, int], text: str) -> None:
     link, _ = memory_link_pair()
-    with pytest.raises(LocalProtocolError, match=f"^{text}$"):
+    with pytest.raises(InvalidArgument, match=f"^{text}$"):
         Connection(link, **wrong)  # type: ignore[arg-type]
 
 
@@ -127,7 +127,7 @@ async def test_what_the_dialect_does_not_know_cannot_be_subscribed_to() -> None:
             ((str,), "neither a message class nor an event class"),
             ((), "at least one"),
         ):
-            with pytest.raises(LocalProtocolError, match=text):
+            with pytest.raises(InvalidArgument, match=text):
                 connection.check_types(types)
 
 

@@ -10,7 +10,7 @@ import pytest
 from flight_harness import block_loop
 
 from aerokit import open_connection
-from aerokit.errors import CommandTimeout, ConnectionClosed, LinkLost, LocalProtocolError
+from aerokit.errors import CommandTimeout, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -195,12 +195,12 @@ async def test_the_loss_of_the_link_ends_it(pair: Pair) -> None:
 async def test_a_message_that_cannot_be_sent_is_told_at_once(pair: Pair) -> None:
     """Also when it is a later one: nobody else would tell."""
     nonsense = CommandLong(300, 1, 400, 0, *(0.0,) * 7)
-    with pytest.raises(LocalProtocolError, match="target_system"):
+    with pytest.raises(InvalidArgument, match="target_system"):
         await pair.run(Counting(question=nonsense))
     exchange = Counting()
     later(0.5, lambda: setattr(exchange, "question", nonsense))
     started = anyio.current_time()
-    with pytest.raises(LocalProtocolError, match="target_system"):
+    with pytest.raises(InvalidArgument, match="target_system"):
         await pair.run(exchange)
     assert anyio.current_time() == pytest.approx(started + 1)
 

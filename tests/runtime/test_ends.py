@@ -16,8 +16,8 @@ from aerokit.errors import (
     AerokitError,
     BusyError,
     ConnectionClosed,
+    InvalidArgument,
     LinkLost,
-    LocalProtocolError,
     OperationTimeout,
 )
 from aerokit.links import MemoryLink, memory_link_pair
@@ -224,7 +224,7 @@ async def test_a_mistake_inside_ends_the_connection_and_says_so(
 async def test_an_error_of_our_own_kind_that_nobody_catches_ends_it_too(link: MemoryLink) -> None:
     """Only once it has ended is such an error what a task was told of that."""
     async with connect(link) as vehicle:
-        vehicle.connection.fail(LocalProtocolError("from a task"))
+        vehicle.connection.fail(InvalidArgument("from a task"))
         with pytest.raises(ConnectionClosed, match="from a task"):
             vehicle.send(COPTER)
 
@@ -402,7 +402,7 @@ async def test_a_subscription_is_entered_once(link: MemoryLink) -> None:
 async def test_a_subscription_that_is_refused_leaves_nothing_attached(vehicle: Vehicle) -> None:
     before = dict(vehicle.connection.bus.wanted)
     for rate_hz in (0, -1, 1001, float("nan")):
-        with pytest.raises(LocalProtocolError, match="rate_hz"):
+        with pytest.raises(InvalidArgument, match="rate_hz"):
             vehicle.subscribe(Attitude, rate_hz=rate_hz)
     assert vehicle.connection.bus.wanted == before
 

@@ -18,8 +18,8 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandTimeout,
     ConnectionClosed,
+    InvalidArgument,
     LinkLost,
-    LocalProtocolError,
     OperationRejected,
     RecordingEnded,
 )
@@ -273,11 +273,11 @@ class OneEnd(BaseLink):
 
 
 async def test_a_link_can_be_opened_once_only() -> None:
-    with pytest.raises(LocalProtocolError, match="ReconnectingLink"):
+    with pytest.raises(InvalidArgument, match="ReconnectingLink"):
         async with connect(OneEnd(), reconnect=True):
             pytest.fail("it could not be opened again")
     async with open_connection(OneEnd()) as connection:
-        with pytest.raises(LocalProtocolError, match="say it to open_connection"):
+        with pytest.raises(InvalidArgument, match="say it to open_connection"):
             async with connect(connection, reconnect=True):
                 pytest.fail("the connection is open already")
 

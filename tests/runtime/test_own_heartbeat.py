@@ -15,7 +15,7 @@ from served_copter import served, served_copter
 import aerokit.sync
 from aerokit import OwnHeartbeat, dronekit
 from aerokit import messages as m
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavType
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import HeartbeatPaused, HeartbeatResumed
@@ -74,14 +74,14 @@ async def test_no_heartbeat_is_sent_if_none_is_wanted() -> None:
     "values", [{"type": 256}, {"type": "GCS"}, {"fed_within_s": 0.5}, {"fed_within_s": "5"}]
 )
 def test_heartbeat_of_nonsense_is_refused(values: dict[str, Any]) -> None:
-    with pytest.raises(LocalProtocolError, match=f"{next(iter(values))} = "):
+    with pytest.raises(InvalidArgument, match=f"{next(iter(values))} = "):
         OwnHeartbeat(**values)
 
 
 @pytest.mark.anyio
 async def test_heartbeat_of_an_open_connection_is_not_changed_by_connect() -> None:
     async with open_flight() as flight:
-        with pytest.raises(LocalProtocolError, match="heartbeat = … is not allowed here"):
+        with pytest.raises(InvalidArgument, match="heartbeat = … is not allowed here"):
             async with aerokit.connect(flight.vehicle.connection, heartbeat=None):
                 raise AssertionError
 

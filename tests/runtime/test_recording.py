@@ -12,7 +12,7 @@ import pytest
 from pymavlink import mavutil
 
 from aerokit import Vehicle, connect, open_connection
-from aerokit.errors import BusyError, ConnectFailed, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectFailed, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.links import Peer, create_link, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
@@ -221,7 +221,7 @@ def test_a_full_disk_is_told_of_once_wherever_it_is_noticed(
 
 async def test_a_connection_that_is_open_has_its_own_recording(tmp_path: Path) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, open_connection(link) as connection:
-        with pytest.raises(LocalProtocolError, match="record"):
+        with pytest.raises(InvalidArgument, match="record"):
             async with connect(connection, record=tmp_path / "flight.tlog"):
                 pytest.fail("nothing would be recorded")
 

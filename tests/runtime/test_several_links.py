@@ -11,7 +11,7 @@ from several_harness import DEAD, GOOD, News, Radios, Told, over
 import aerokit
 from aerokit import events
 from aerokit import messages as m
-from aerokit.errors import AerokitError, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.errors import AerokitError, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.hub import shared
 from aerokit.links import FaultModel, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
@@ -304,13 +304,13 @@ async def test_links_that_cannot_be_opened() -> None:
     with pytest.raises(LinkOpenError, match=r"none of the links.*tcp:127.0.0.1:1.*tcp:127.0.0.1:2"):
         async with open_connection(["tcp:127.0.0.1:1", "tcp:127.0.0.1:2"]):
             pass
-    with pytest.raises(LocalProtocolError, match=r"\[\] is not allowed"):
+    with pytest.raises(InvalidArgument, match=r"\[\] is not allowed"):
         async with open_connection([]):
             pass
-    with pytest.raises(LocalProtocolError, match="a recording is no link"):
+    with pytest.raises(InvalidArgument, match="a recording is no link"):
         async with open_connection(["udpin:127.0.0.1:0", "flight.tlog"]):
             pass
-    with pytest.raises(LocalProtocolError, match="not a link address"):
+    with pytest.raises(InvalidArgument, match="not a link address"):
         async with open_connection(["udpin:127.0.0.1:0", "nonsense"]):
             pass
 

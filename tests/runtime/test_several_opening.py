@@ -10,7 +10,7 @@ import pytest
 from several_harness import News
 
 from aerokit import events
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.links import Link, MemoryLink, SeveralLinks, memory_link_pair
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
@@ -39,7 +39,7 @@ async def test_an_address_that_is_named_twice_is_refused_before_anything_is_open
     one: str, again: str
 ) -> None:
     near, far = memory_link_pair()
-    with pytest.raises(LocalProtocolError, match=r"address = .* is not allowed: .* is named twice") as caught:
+    with pytest.raises(InvalidArgument, match=r"address = .* is not allowed: .* is named twice") as caught:
         async with open_connection([near, one, again]):
             pass
     assert repr(again) in str(caught.value)
@@ -49,7 +49,7 @@ async def test_an_address_that_is_named_twice_is_refused_before_anything_is_open
 
 async def test_a_link_that_is_named_twice_is_refused() -> None:
     near, far = memory_link_pair()
-    with pytest.raises(LocalProtocolError, match="is named twice"):
+    with pytest.raises(InvalidArgument, match="is named twice"):
         async with open_connection([near, near]):
             pass
     async with open_connection(near):

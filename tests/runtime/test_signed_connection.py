@@ -16,7 +16,7 @@ from aerokit.errors import (
     BusyError,
     CommandTimeout,
     ConnectFailed,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -193,7 +193,7 @@ async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
         vehicle.connection.mavlink_version = 1
         with pytest.raises(NotSupported, match="our frames are MAVLink 1"):
             await vehicle.setup_signing(Signing(KEY))
-        with pytest.raises(LocalProtocolError, match="mavlink_version = 1"):
+        with pytest.raises(InvalidArgument, match="mavlink_version = 1"):
             vehicle.connection.signing = Signing(KEY)
         vehicle.connection.mavlink_version = 2
         beat = vehicle.connection.heard[1, 1]
@@ -206,7 +206,7 @@ async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
         with pytest.raises(OperationRejected, match="armed; nothing was sent"):
             await vehicle.setup_signing(Signing(KEY))
         await vehicle.disarm()
-        with pytest.raises(LocalProtocolError, match="timeout"):
+        with pytest.raises(InvalidArgument, match="timeout"):
             await vehicle.setup_signing(Signing(KEY), timeout=0)
         assert copter.signing.key is None
         copter.signing.may_change = lambda: False  # type: ignore[method-assign]
@@ -364,10 +364,10 @@ async def test_an_unknown_message_is_checked_too() -> None:
 
 async def test_an_open_connection_has_its_signing() -> None:
     async with with_far() as (connection, _):
-        with pytest.raises(LocalProtocolError, match="signing"):
+        with pytest.raises(InvalidArgument, match="signing"):
             async with connect_vehicle(connection, signing=Signing(KEY)):
                 pass
-    with pytest.raises(LocalProtocolError, match="mavlink_version = 1"):
+    with pytest.raises(InvalidArgument, match="mavlink_version = 1"):
         async with with_far(signing=Signing(KEY), mavlink_version=1):
             pass
 

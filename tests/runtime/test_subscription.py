@@ -5,7 +5,7 @@ from __future__ import annotations
 import anyio
 import pytest
 
-from aerokit.errors import ConnectionClosed, LocalProtocolError, OperationTimeout, SubscriptionOverflow
+from aerokit.errors import ConnectionClosed, InvalidArgument, OperationTimeout, SubscriptionOverflow
 from aerokit.runtime.bus import Detach, Sink
 from aerokit.runtime.subscription import Overflow, Subscription
 
@@ -65,7 +65,7 @@ async def test_it_is_registered_on_entry_and_gone_at_exit() -> None:
         source.give(2)
         assert await numbers.get() == 2
     assert source.sinks == []
-    with pytest.raises(LocalProtocolError, match="closed"):
+    with pytest.raises(InvalidArgument, match="closed"):
         await numbers.get()
 
 
@@ -120,12 +120,12 @@ async def test_a_second_reader_is_refused() -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(numbers.get)
             await anyio.sleep(1)
-            with pytest.raises(LocalProtocolError, match="one reader"):
+            with pytest.raises(InvalidArgument, match="one reader"):
                 await numbers.get()
             tasks.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize(("capacity", "overflow"), [(0, "drop_oldest"), (1, "block")])
 async def test_nonsense_is_refused(capacity: int, overflow: Overflow) -> None:
-    with pytest.raises(LocalProtocolError, match="is not allowed"):
+    with pytest.raises(InvalidArgument, match="is not allowed"):
         Source().subscribe(capacity, overflow)

@@ -9,7 +9,7 @@ import anyio
 import pytest
 
 from aerokit import connect, open_connection
-from aerokit.errors import ConnectionClosed, LinkLost, LocalProtocolError
+from aerokit.errors import ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -135,7 +135,7 @@ async def test_a_raw_frame_goes_where_its_target_is_as_it_is(link: TwoPeers, con
     ids=["nothing", "text", "a part", "two", "unknown flags", "a part of version 1"],
 )
 async def test_what_is_no_frame_is_refused(link: TwoPeers, connection: Connection, data: bytes) -> None:
-    with pytest.raises(LocalProtocolError, match=f"{len(data)} bytes"):
+    with pytest.raises(InvalidArgument, match=f"{len(data)} bytes"):
         connection.write_raw(data)
     assert link.sent == []
 
@@ -189,9 +189,9 @@ async def test_the_version_can_be_changed_while_it_is_open() -> None:
         connection.mavlink_version = 1
         await anyio.sleep(1)
         assert [(frame.version, frame.sequence) for frame in ear.frames] == [(2, 0), (1, 1)]
-        with pytest.raises(LocalProtocolError, match="PLAY_TUNE"):
+        with pytest.raises(InvalidArgument, match="PLAY_TUNE"):
             connection.send(PlayTune(1, 1, "A"))
-        with pytest.raises(LocalProtocolError, match="mavlink_version = 3 is not allowed: 1 or 2"):
+        with pytest.raises(InvalidArgument, match="mavlink_version = 3 is not allowed: 1 or 2"):
             connection.mavlink_version = 3
         assert connection.mavlink_version == 1
     far.close()

@@ -9,7 +9,7 @@ import pytest
 from flight_harness import open_flight
 from serve_stage import HOST, TOKEN, open_stage
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.serve import make_app
 from aerokit.serve.orders import ORDERS
@@ -279,5 +279,5 @@ async def test_a_parameter_is_set_and_told() -> None:
 )
 async def test_tokens_that_cannot_be(token: str) -> None:
     async with open_flight() as flight:
-        with pytest.raises(LocalProtocolError, match="token"):
+        with pytest.raises(InvalidArgument, match="token"):
             make_app(flight.vehicle, token=token)

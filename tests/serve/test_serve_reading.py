@@ -14,7 +14,7 @@ from starlette.applications import Starlette
 from starlette.routing import Mount, Route, WebSocketRoute
 
 import aerokit
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.missions import Mission, return_to_launch, take_off
 from aerokit.serve import make_app
 from aerokit.serve.app import STATIC
@@ -155,7 +155,7 @@ async def test_tiles_are_let_in_by_their_origin_alone() -> None:
             "https://t/{z}/{x}/{y};x",
             "javascript:{z}{x}{y}",
         ):
-            with pytest.raises(LocalProtocolError, match="tiles"):
+            with pytest.raises(InvalidArgument, match="tiles"):
                 make_app(stage.flight.vehicle, token=TOKEN, tiles=wrong)
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 from component_client import ComponentClient, copter_with, settled, source
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     CameraCapFlags,
@@ -311,10 +311,10 @@ def test_it_fits_on_any_vehicle(make: type[SimulatedVehicle]) -> None:
 
 def test_it_belongs_to_one_vehicle() -> None:
     camera = SimulatedCamera()
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         _ = camera.system_id
     SimulatedCopter(components=[camera])
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         SimulatedCopter(components=[camera])
 
 

@@ -11,7 +11,7 @@ from recorded import SHORT
 from simulated_client import Client
 
 import aerokit
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -111,9 +111,9 @@ def test_other_components_keep_their_ids_and_other_systems_are_left_out() -> Non
 
 
 def test_a_recording_without_a_vehicle_is_refused() -> None:
-    with pytest.raises(LocalProtocolError, match="no vehicle"):
+    with pytest.raises(InvalidArgument, match="no vehicle"):
         RecordedVehicle(tlog((0.0, m.Heartbeat(6, 8, 0, 0, 4, 3), GROUND)))
-    with pytest.raises(LocalProtocolError, match="system id 9"):
+    with pytest.raises(InvalidArgument, match="system id 9"):
         RecordedVehicle(COPTER, system_id=9)
 
 

@@ -10,7 +10,7 @@ import anyio
 import pytest
 from late_loop import since_the_beginning
 
-from aerokit.errors import BusyError, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.links import Link, Peer, TcpConnect, TcpListen, UdpConnect, UdpListen, memory_link_pair
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
@@ -161,7 +161,7 @@ async def test_leaving_closes_the_link_and_can_be_cancelled() -> None:
 
 async def test_misuse_is_explained() -> None:
     near, far = memory_link_pair()
-    with pytest.raises(LocalProtocolError, match="speedup"):
+    with pytest.raises(InvalidArgument, match="speedup"):
         SimulatorServer(SimulatedCopter(), far, speedup=0.0)
     server = SimulatorServer(SimulatedCopter(), far)
     async with server:

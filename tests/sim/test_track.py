@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 from simulated_client import flying_copter, ready_copter
 
-from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.sim import SimulatedPx4, SimulatedVehicle
 from aerokit.sim.picture import check_picture, draw_svg, save_picture
 from aerokit.sim.track import Track, TrackPoint, record_track
@@ -66,7 +66,7 @@ def test_every_autopilot_has_a_track() -> None:
 
 def test_what_is_nowhere_has_no_track() -> None:
     nowhere = SimulatedVehicle(system_id=1, component_id=1, seed=0, components=())
-    with pytest.raises(LocalProtocolError, match="no true place"):
+    with pytest.raises(InvalidArgument, match="no true place"):
         record_track(nowhere)
 
 
@@ -80,7 +80,7 @@ def test_speed_and_battery_are_in_the_track() -> None:
 
 
 def test_an_interval_must_be_above_0() -> None:
-    with pytest.raises(LocalProtocolError, match="interval_s"):
+    with pytest.raises(InvalidArgument, match="interval_s"):
         record_track(SimulatedPx4(), interval_s=0)
 
 
@@ -118,7 +118,7 @@ def test_a_picture_of_nothing(tmp_path: Path) -> None:
 
 
 def test_other_names_are_refused() -> None:
-    with pytest.raises(LocalProtocolError, match=r"\.svg or \.png"):
+    with pytest.raises(InvalidArgument, match=r"\.svg or \.png"):
         check_picture("track.jpeg")
 
 

@@ -9,7 +9,7 @@ import anyio
 import pytest
 
 from aerokit import messages
-from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
+from aerokit.errors import CommandRejected, InvalidArgument, OperationTimeout
 from aerokit.testing import Flight, open_fleet, open_flight, run_virtual, serve_flight
 
 pytestmark = pytest.mark.anyio
@@ -94,7 +94,7 @@ async def test_a_fleet_stands_side_by_side() -> None:
 
 
 async def test_an_unknown_parameter_is_said_with_its_like() -> None:
-    with pytest.raises(LocalProtocolError, match=r"no parameter 'RTL_ALT_MM'; similar: RTL_ALT\b"):
+    with pytest.raises(InvalidArgument, match=r"no parameter 'RTL_ALT_MM'; similar: RTL_ALT\b"):
         async with open_flight(parameters={"RTL_ALT_MM": 15}):
             pass
 
@@ -145,12 +145,12 @@ async def test_mistakes() -> None:
             lambda: flight.faults.go_silent(for_s=0),
         ]
         for wrong in wrongs:
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 wrong()
         assert not flight.faults.all.gps_lost
     with pytest.raises(RuntimeError, match="is not open"):
         _ = flight.vehicle
-    with pytest.raises(LocalProtocolError, match="one kind"):
+    with pytest.raises(InvalidArgument, match="one kind"):
         open_fleet("copter", "px4", count=2)
 
 

@@ -7,7 +7,7 @@ import pytest
 from flight_harness import in_the_air, open_flight, open_px4
 
 from aerokit import connect
-from aerokit.errors import LinkLost, LocalProtocolError, OperationRejected, OperationTimeout
+from aerokit.errors import InvalidArgument, LinkLost, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import CopterMode, MavCmd, PlaneMode
 from aerokit.sim import SimulatedPlane, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
@@ -42,10 +42,10 @@ async def test_a_mode_in_which_it_does_not_arm_is_refused_before_anything_is_sen
         await flight.vehicle.wait_ready()
         flight.wire.forget()
         with pytest.raises(
-            LocalProtocolError, match=r"mode = 'LAND' .*does not arm in LAND, but in ACRO, .*GUIDED"
+            InvalidArgument, match=r"mode = 'LAND' .*does not arm in LAND, but in ACRO, .*GUIDED"
         ):
             await flight.vehicle.arm(mode="LAND")
-        with pytest.raises(LocalProtocolError, match="NOWHERE"):
+        with pytest.raises(InvalidArgument, match="NOWHERE"):
             await flight.vehicle.arm(mode="NOWHERE")
         assert not flight.wire.commands(ARM)
         assert not flight.wire.mode_orders()

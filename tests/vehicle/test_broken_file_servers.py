@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from flight_harness import Flight, now
 
-from aerokit.errors import FileError, LocalProtocolError, RemoteProtocolError
+from aerokit.errors import FileError, InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
@@ -259,7 +259,7 @@ async def test_more_than_a_file_holds_is_refused_before_anything_is_sent(
         yield ack(request)
 
     serve(grounded, answer)
-    with pytest.raises(LocalProtocolError, match="data of 11 bytes is not allowed: at most 10"):
+    with pytest.raises(InvalidArgument, match="data of 11 bytes is not allowed: at most 10"):
         await grounded.vehicle.files.write("/a", bytes(11))
     assert asked == []
     await grounded.vehicle.files.write("/a", bytes(10), verify=False)

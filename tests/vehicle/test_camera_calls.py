@@ -14,7 +14,7 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     FileError,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationTimeout,
 )
@@ -132,7 +132,7 @@ async def test_what_cannot_record_is_told() -> None:
             await vehicle.camera_at(101).start_video()  # in the mode for pictures
         assert refused.value.result == MavResult.DENIED
         for hz in (-0.1, 10.1):
-            with pytest.raises(LocalProtocolError, match="status_hz"):
+            with pytest.raises(InvalidArgument, match="status_hz"):
                 vehicle.camera.video(status_hz=hz)
 
 
@@ -191,7 +191,7 @@ async def test_storage_is_told_and_formatted() -> None:
         assert vehicle.camera.captures() == []
         assert (await vehicle.camera.take_photo()).index == 0
         for wrong in (0, 256):
-            with pytest.raises(LocalProtocolError, match="number"):
+            with pytest.raises(InvalidArgument, match="number"):
                 await vehicle.camera.format_storage(wrong)
         with pytest.raises(CommandRejected):
             await vehicle.camera.format_storage(2)
@@ -268,13 +268,13 @@ async def test_zoom_by_steps_to_a_value_and_as_long_as_a_block_lasts() -> None:
         await anyio.sleep(2.0)
         assert camera.zoom == stopped_at
         for percent in (-0.1, 100.1):
-            with pytest.raises(LocalProtocolError, match="percent"):
+            with pytest.raises(InvalidArgument, match="percent"):
                 await vehicle.camera.zoom_to(percent)
-        with pytest.raises(LocalProtocolError, match="millimetres"):
+        with pytest.raises(InvalidArgument, match="millimetres"):
             await vehicle.camera.zoom_to_focal_length(0.0)
         with pytest.raises(CommandRejected):
             await vehicle.camera.zoom_to_focal_length(1000.0)
-        with pytest.raises(LocalProtocolError, match="speed"):
+        with pytest.raises(InvalidArgument, match="speed"):
             vehicle.camera.zooming(1.1)
 
 
@@ -295,7 +295,7 @@ async def test_focus_by_steps_to_a_value_by_itself_and_as_long_as_a_block_lasts(
             await vehicle.camera.focus_to(10.0)
             await vehicle.camera.auto_focus(kind)
             assert camera.focus == 50.0
-        with pytest.raises(LocalProtocolError, match="kind"):
+        with pytest.raises(InvalidArgument, match="kind"):
             await vehicle.camera.auto_focus("never")  # type: ignore[arg-type]
 
 
@@ -386,13 +386,13 @@ async def test_places_outside_of_the_picture_are_refused() -> None:
     async with on_board(SimulatedCamera(capabilities=ALL)) as vehicle:
         one = vehicle.camera
         for x, y, radius in ((-0.1, 0.5, 0), (0.5, 1.1, 0), (0.5, 0.5, 2)):
-            with pytest.raises(LocalProtocolError, match="is not allowed: 0 to 1"):
+            with pytest.raises(InvalidArgument, match="is not allowed: 0 to 1"):
                 await one.track_point(x, y, radius=radius)
-        with pytest.raises(LocalProtocolError, match="is no rectangle"):
+        with pytest.raises(InvalidArgument, match="is no rectangle"):
             await one.track_rectangle(0.5, 0.1, 0.4, 0.2)
-        with pytest.raises(LocalProtocolError, match="is no rectangle"):
+        with pytest.raises(InvalidArgument, match="is no rectangle"):
             await one.track_rectangle(0.1, 0.3, 0.4, 0.2)
-        with pytest.raises(LocalProtocolError, match="status_hz"):
+        with pytest.raises(InvalidArgument, match="status_hz"):
             await one.track_point(0.5, 0.5, status_hz=0)
 
 
@@ -422,9 +422,9 @@ async def test_streams_are_listed_and_chosen() -> None:
         assert camera.running_streams == {3}
         with pytest.raises(CommandRejected):
             await vehicle.camera.start_streaming(4)
-        with pytest.raises(LocalProtocolError, match="stream"):
+        with pytest.raises(InvalidArgument, match="stream"):
             await vehicle.camera.start_streaming(256)
-        with pytest.raises(LocalProtocolError, match="stream"):
+        with pytest.raises(InvalidArgument, match="stream"):
             await vehicle.camera.select_stream(0)
 
 
@@ -447,7 +447,7 @@ async def test_a_thermal_camera_tells_its_range_and_its_source_is_chosen() -> No
         assert camera.source == 2
         with pytest.raises(CommandRejected):
             await vehicle.camera_at(101).select_source("ir")
-        with pytest.raises(LocalProtocolError, match="primary"):
+        with pytest.raises(InvalidArgument, match="primary"):
             await one.select_source("x")  # type: ignore[arg-type]
 
 

@@ -12,7 +12,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -66,7 +66,7 @@ async def test_cameras_are_found_by_what_they_say() -> None:
         assert vehicle.camera_at(100).information.value == information
         assert "100 (aerokit Second)" in repr(vehicle.camera_at(100))
         for wrong in (0, 256):
-            with pytest.raises(LocalProtocolError, match=f"number = {wrong} is not allowed"):
+            with pytest.raises(InvalidArgument, match=f"number = {wrong} is not allowed"):
                 vehicle.camera_at(wrong)
 
 
@@ -92,7 +92,7 @@ async def test_what_it_cannot_do_is_refused_before_anything_is_sent() -> None:
                 pass
         assert heard == []
         for seconds, count in ((0.0, 1), (3601.0, 1), (1.0, -1), (1.0, 32768)):
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 vehicle.camera.photo_interval(seconds, count)
 
 

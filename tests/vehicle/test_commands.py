@@ -15,8 +15,8 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     ConnectionClosed,
+    InvalidArgument,
     LinkLost,
-    LocalProtocolError,
     OperationRejected,
     OperationTimeout,
 )
@@ -81,13 +81,13 @@ async def test_unsupported_on_this_firmware(grounded: Flight) -> None:
 
 async def test_nonsense_is_not_sent(grounded: Flight) -> None:
     vehicle = grounded.vehicle
-    with pytest.raises(LocalProtocolError, match="at most 7"):
+    with pytest.raises(InvalidArgument, match="at most 7"):
         await vehicle.command(BANNER, *range(8))
-    with pytest.raises(LocalProtocolError, match="param2"):
+    with pytest.raises(InvalidArgument, match="param2"):
         await vehicle.command(BANNER, 0, math.inf)
-    with pytest.raises(LocalProtocolError, match="x = "):
+    with pytest.raises(InvalidArgument, match="x = "):
         await vehicle.command_int(MavCmd.DO_REPOSITION, frame=6, x=2**31)
-    with pytest.raises(LocalProtocolError, match="retries"):
+    with pytest.raises(InvalidArgument, match="retries"):
         await vehicle.command(BANNER, retries=-1)
     assert not grounded.wire.commands(BANNER)
     assert not grounded.wire.commands(MavCmd.DO_REPOSITION)

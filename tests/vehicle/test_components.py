@@ -15,7 +15,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     FileFormatError,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationTimeout,
 )
@@ -148,7 +148,7 @@ async def test_only_what_is_meant_is_returned() -> None:
 async def test_an_id_that_cannot_be_is_refused() -> None:
     async with on_board() as vehicle:
         for wrong in (0, 256, -1):
-            with pytest.raises(LocalProtocolError, match=f"component_id = {wrong} is not allowed: 1 to 255"):
+            with pytest.raises(InvalidArgument, match=f"component_id = {wrong} is not allowed: 1 to 255"):
                 vehicle.component(wrong)
         assert vehicle.component(100) is vehicle.component(100)
 

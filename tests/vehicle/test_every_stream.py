@@ -9,7 +9,7 @@ import pytest
 from flight_harness import Flight, Px4Flight, open_flight, open_px4
 
 from aerokit import messages as m
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
 
@@ -80,7 +80,7 @@ async def test_a_vehicle_that_streams_by_itself_is_asked_for_what_is_missing() -
 async def test_rates_out_of_range(rate_hz: float) -> None:
     async with open_flight(rates={}) as flight:
         with (
-            pytest.raises(LocalProtocolError, match="rate_hz"),
+            pytest.raises(InvalidArgument, match="rate_hz"),
             flight.vehicle.streams(rate_hz),
         ):
             pass

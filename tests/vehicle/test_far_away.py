@@ -7,7 +7,7 @@ import pytest
 from flight_harness import Flight
 
 from aerokit import Position
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.missions import Mission, RallyPoints, rally_point, waypoint
 from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
 
@@ -22,7 +22,7 @@ def exchanged(flight: Flight) -> Position:
 
 async def test_go_to_a_place_too_far_away_sends_nothing(flying: Flight) -> None:
     target = exchanged(flying)
-    with pytest.raises(LocalProtocolError, match=r"target = .* km away, more than max_distance_m = 100,000"):
+    with pytest.raises(InvalidArgument, match=r"target = .* km away, more than max_distance_m = 100,000"):
         await flying.vehicle.go_to(target)
     assert flying.wire.sent == [] or all(m.NAME == "HEARTBEAT" for _, m in flying.wire.sent)
 
@@ -42,7 +42,7 @@ async def test_distance_is_compared_exactly(flying: Flight, metres: float, is_al
         if is_allowed:
             await flying.vehicle.go_to(target)
         else:
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 await flying.vehicle.go_to(target)
     assert bool(flying.wire.commands(192)) is is_allowed
 
@@ -53,10 +53,10 @@ async def test_plan_with_a_place_too_far_away_is_not_uploaded(grounded: Flight, 
     if kind == "mission":
         places = [here.offset(north_m=50.0), far]
         items = [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
-        with pytest.raises(LocalProtocolError, match="more than max_distance_m"):
+        with pytest.raises(InvalidArgument, match="more than max_distance_m"):
             await grounded.vehicle.mission.upload(Mission(items))
         await grounded.vehicle.mission.upload(Mission(items), max_distance_m=2.1e7)
     else:
         points = RallyPoints([rally_point(far.latitude_deg, far.longitude_deg, altitude_relative_m=20.0)])
-        with pytest.raises(LocalProtocolError, match="more than max_distance_m"):
+        with pytest.raises(InvalidArgument, match="more than max_distance_m"):
             await grounded.vehicle.rally.upload(points)

@@ -9,7 +9,7 @@ from flight_harness import open_flight, open_px4
 from plan_flights import near_home, sent_for_plans
 
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, LocalProtocolError, MissionRejected, NotSupported
+from aerokit.errors import CommandRejected, InvalidArgument, MissionRejected, NotSupported
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, waypoint
 from aerokit.missions.storage import Storage
@@ -96,6 +96,6 @@ async def test_on_and_off() -> None:
 async def test_a_mission_is_no_fence() -> None:
     async with open_flight() as flight:
         plan: Any = Mission()
-        with pytest.raises(LocalProtocolError, match="a Fence"):
+        with pytest.raises(InvalidArgument, match="a Fence"):
             await flight.vehicle.fence.upload(plan)
         assert sent_for_plans(flight.wire) == []

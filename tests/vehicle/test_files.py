@@ -20,7 +20,7 @@ from aerokit.errors import (
     ConnectionClosed,
     FileError,
     FileTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     VerificationFailed,
 )
 from aerokit.links import FaultModel, FaultyLink
@@ -186,22 +186,22 @@ async def test_paths_that_cannot_be_are_refused_before_anything_is_sent(ardupilo
         lambda: files.download(path, "/nowhere/at/all"),
     ]
     for call in calls:
-        with pytest.raises(LocalProtocolError, match="path"):
+        with pytest.raises(InvalidArgument, match="path"):
             await call()
     assert ardupilot.sent() == []
 
 
 async def test_other_arguments_that_cannot_be(ardupilot: Bench) -> None:
     files = ardupilot.files
-    with pytest.raises(LocalProtocolError, match="together"):
+    with pytest.raises(InvalidArgument, match="together"):
         await files.rename("/" + "a" * 150, "/" + "b" * 150)
     for size in (-1, 2**32):
-        with pytest.raises(LocalProtocolError, match="size"):
+        with pytest.raises(InvalidArgument, match="size"):
             await files.truncate("/a", size)
     for seconds in (0.0, -1.0, float("nan")):
-        with pytest.raises(LocalProtocolError, match="timeout"):
+        with pytest.raises(InvalidArgument, match="timeout"):
             await files.read("/a", timeout=seconds)
-        with pytest.raises(LocalProtocolError, match="patience_s"):
+        with pytest.raises(InvalidArgument, match="patience_s"):
             await files.read("/a", patience_s=seconds)
     assert ardupilot.sent() == []
 

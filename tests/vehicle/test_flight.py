@@ -13,7 +13,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     HeartbeatTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     OperationTimeout,
 )
@@ -121,7 +121,7 @@ async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:
 async def test_take_off_to_nonsense_sends_nothing(grounded: Flight, altitude_m: float) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
-    with pytest.raises(LocalProtocolError, match="altitude_m"):
+    with pytest.raises(InvalidArgument, match="altitude_m"):
         await grounded.vehicle.take_off(altitude_m)
     assert not grounded.wire.commands(MavCmd.NAV_TAKEOFF)
 
@@ -410,7 +410,7 @@ async def test_the_older_message_is_not_resent_after_cancellation() -> None:
 
 
 async def test_go_to_nowhere_sends_nothing(flying: Flight) -> None:
-    with pytest.raises(LocalProtocolError, match="latitude"):
+    with pytest.raises(InvalidArgument, match="latitude"):
         await flying.vehicle.go_to(Position(91.0, 8.0, altitude_relative_m=10.0))
     assert not flying.wire.commands(MavCmd.DO_REPOSITION)
 
@@ -425,7 +425,7 @@ async def test_go_to_nowhere_sends_nothing(flying: Flight) -> None:
     ],
 )
 async def test_go_to_with_nonsense_sends_nothing(flying: Flight, name: str, value: float) -> None:
-    with pytest.raises(LocalProtocolError, match=name):
+    with pytest.raises(InvalidArgument, match=name):
         await flying.vehicle.go_to(north_of_home(flying, 10.0), **{name: value})
     await anyio.sleep(1.0)
     assert not flying.wire.commands(MavCmd.DO_REPOSITION)
@@ -436,7 +436,7 @@ async def test_go_to_without_an_altitude_from_a_place_without_one_sends_nothing(
     here = flying.vehicle.position.value
     low = Position(here.latitude_deg, here.longitude_deg, altitude_amsl_m=594.0)
     flying.vehicle.telemetry.position.set(low, Source(1, 1, "GLOBAL_POSITION_INT"))
-    with pytest.raises(LocalProtocolError, match="has no altitude, and the vehicle's own is not known"):
+    with pytest.raises(InvalidArgument, match="has no altitude, and the vehicle's own is not known"):
         await flying.vehicle.go_to(Position(here.latitude_deg, here.longitude_deg))
     assert not flying.wire.commands(MavCmd.DO_REPOSITION)
 
@@ -578,7 +578,7 @@ async def test_set_speed(flying: Flight) -> None:
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1001.0, math.nan])
 async def test_set_speed_out_of_range_sends_nothing(flying: Flight, speed: float) -> None:
-    with pytest.raises(LocalProtocolError, match="speed_m_s"):
+    with pytest.raises(InvalidArgument, match="speed_m_s"):
         await flying.vehicle.set_speed(speed)
     assert not flying.wire.commands(MavCmd.DO_CHANGE_SPEED)
 
@@ -608,7 +608,7 @@ async def test_set_heading_that_does_not_come_off_times_out(flying: Flight) -> N
 
 @pytest.mark.parametrize("heading", [-361.0, 400.0, math.nan])
 async def test_set_heading_out_of_range_sends_nothing(flying: Flight, heading: float) -> None:
-    with pytest.raises(LocalProtocolError, match="heading_deg"):
+    with pytest.raises(InvalidArgument, match="heading_deg"):
         await flying.vehicle.set_heading(heading)
     assert not flying.wire.commands(MavCmd.CONDITION_YAW)
 

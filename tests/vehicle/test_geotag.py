@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from aerokit import Position
-from aerokit.errors import AerokitError, FileFormatError, LocalProtocolError
+from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
 from aerokit.sim.components.storage import GREY_JPEG
 from aerokit.vehicle.camera import geotag
 from aerokit.vehicle.camera.capture import Capture
@@ -91,7 +91,7 @@ def test_what_is_not_known_is_left_out() -> None:
         assert set(exif.get_ifd(0x8825)) == {0, 1, 2, 3, 4, 18}
         assert exif.get_ifd(0x8825)[3] == "W"
         assert 0x9003 not in exif.get_ifd(0x8769)
-    with pytest.raises(LocalProtocolError, match="capture 7 of camera 100 has no place"):
+    with pytest.raises(InvalidArgument, match="capture 7 of camera 100 has no place"):
         geotagged(GREY_JPEG, CAPTURE.replace(place=None))
 
 

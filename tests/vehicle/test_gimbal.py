@@ -17,7 +17,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     OperationTimeout,
 )
@@ -171,7 +171,7 @@ async def test_a_reboot_forgets_it() -> None:
 async def test_angles_out_of_range_send_nothing(wrong: float, grounded: Flight) -> None:
     gimbal = grounded.vehicle.gimbal
     for pitch, yaw, roll in ((wrong, 0.0, 0.0), (0.0, wrong, 0.0), (0.0, 0.0, wrong)):
-        with pytest.raises(LocalProtocolError, match=r"_deg = .* is not allowed"):
+        with pytest.raises(InvalidArgument, match=r"_deg = .* is not allowed"):
             await gimbal.point(pitch, yaw, roll_deg=roll)
     assert not [each for kind in (PITCHYAW, MOUNT) for each in grounded.wire.commands(kind)]
 

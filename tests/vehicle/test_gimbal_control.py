@@ -30,7 +30,7 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     GimbalTaken,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -545,14 +545,14 @@ async def test_rates_are_checked_and_entered_once() -> None:
             {"rate_hz": 1.0},
             {"valid_for_s": 99.0},
         ):
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 gimbal.rates(**wrong)  # type: ignore[arg-type]
         assert not flight.wire.commands(PITCHYAW)
         stream = gimbal.rates()
         with pytest.raises(SetpointStreamStopped, match="inside their `async with`"):
             stream.set(1.0, 1.0)
         async with stream:
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 stream.set(999.0, 0.0)
             with pytest.raises(BusyError, match="once"):
                 await stream.__aenter__()

@@ -17,7 +17,7 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     HeartbeatTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -321,7 +321,7 @@ async def test_information_of_a_gimbal_beside_the_autopilot() -> None:
         assert told.axes == ("roll", "pitch", "yaw")
         assert (told.retracts, told.has_neutral, told.looks_at_places) == (True, True, True)
         for pitch, roll in ((-85.0, 0.0), (20.0, 0.0), (0.0, 40.0)):
-            with pytest.raises(LocalProtocolError, match="is not allowed: gimbal 154 turns from"):
+            with pytest.raises(InvalidArgument, match="is not allowed: gimbal 154 turns from"):
                 await flight.vehicle.gimbal.point(pitch, 0.0, roll_deg=roll)
         assert not flight.wire.commands(PITCHYAW)
         await flight.vehicle.gimbal.point(-10, 0)
@@ -346,9 +346,9 @@ async def test_without_a_gimbal_there_is_no_information() -> None:
 
 @pytest.mark.parametrize("tolerance", [0.0, 46.0, math.nan])
 async def test_tolerances_have_limits(tolerance: float, grounded: Flight) -> None:
-    with pytest.raises(LocalProtocolError, match="tolerance_deg"):
+    with pytest.raises(InvalidArgument, match="tolerance_deg"):
         await grounded.vehicle.gimbal.point(0, 0, tolerance_deg=tolerance)
-    with pytest.raises(LocalProtocolError, match="frame"):
+    with pytest.raises(InvalidArgument, match="frame"):
         await grounded.vehicle.gimbal.point(0, 0, frame="sideways")  # type: ignore[arg-type]
     assert not grounded.wire.commands(PITCHYAW)
 
@@ -413,7 +413,7 @@ async def test_gimbals_from_the_air_fill_no_table() -> None:
             gimbals.get(250)
         assert len({id(each) for each in gimbals}) == MOST
         assert gimbals.get(1) is gimbals.get(1)
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(InvalidArgument):
         gimbals.get(0)
 
 
@@ -559,6 +559,6 @@ async def test_angles_that_are_no_numbers_are_not_known(wrong: float) -> None:
 
 async def test_true_is_no_system_id() -> None:
     async with mounted() as flight:
-        with pytest.raises(LocalProtocolError, match="system_id = True is not allowed: 1 to 255"):
+        with pytest.raises(InvalidArgument, match="system_id = True is not allowed: 1 to 255"):
             await flight.vehicle.gimbal.look_at_system(True)
         assert not flight.wire.commands(MavCmd.DO_SET_ROI_SYSID)

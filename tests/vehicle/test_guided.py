@@ -18,7 +18,7 @@ from aerokit.errors import (
     BusyError,
     CommandRejected,
     CommandTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     SetpointStreamStopped,
 )
@@ -412,7 +412,7 @@ BAD: list[Callable[[Any], object]] = [
 
 @pytest.mark.parametrize("make", BAD)
 async def test_wrong_arguments(grounded: Flight, make: Callable[[Any], object]) -> None:
-    with pytest.raises(LocalProtocolError, match="is not allowed"):
+    with pytest.raises(InvalidArgument, match="is not allowed"):
         make(grounded.vehicle.guided)
 
 
@@ -446,7 +446,7 @@ async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Fligh
         guided.attitude(AttitudeSetpoint(0.0, 0.0, 0.0, 1.1)),
         guided.attitude(AttitudeSetpoint(math.nan, 0.0, 0.0, 0.5)),
     ):
-        with pytest.raises(LocalProtocolError):
+        with pytest.raises(InvalidArgument):
             async with stream:
                 raise AssertionError("entered")
     await anyio.sleep(1.0)
@@ -458,7 +458,7 @@ async def test_a_wrong_setpoint_leaves_the_one_before_in_force(flying: Flight) -
     async with flying.vehicle.guided.velocity(valid_for_s=5.0) as stream:
         stream.set(NORTH)
         for wrong in (math.nan, 1e39):
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 stream.set(VelocitySetpoint(wrong))
         flying.wire.forget()
         await anyio.sleep(1.0)

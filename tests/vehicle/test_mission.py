@@ -16,7 +16,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     HeartbeatTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     OperationTimeout,
 )
@@ -266,9 +266,9 @@ async def test_what_cannot_be_started(opened: Any) -> None:
         with pytest.raises(OperationRejected, match="not armed"):
             await mission.resume()
         for item in (3, -1, True):
-            with pytest.raises(LocalProtocolError, match="0 to 2"):
+            with pytest.raises(InvalidArgument, match="0 to 2"):
                 await mission.start(item)
-            with pytest.raises(LocalProtocolError, match="0 to 2"):
+            with pytest.raises(InvalidArgument, match="0 to 2"):
                 await mission.set_current(item)
         assert not flight.wire.commands(MavCmd.MISSION_START)
         assert not flight.wire.commands(MavCmd.DO_SET_MODE)
@@ -277,7 +277,7 @@ async def test_what_cannot_be_started(opened: Any) -> None:
 async def test_the_vehicles_reason_for_not_starting() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.clear()
-        with pytest.raises(LocalProtocolError, match="the vehicle's mission is empty: upload") as caught:
+        with pytest.raises(InvalidArgument, match="the vehicle's mission is empty: upload") as caught:
             await flight.vehicle.mission.start()
         assert "item" not in str(caught.value)
         assert isinstance(flight, Flight)
@@ -299,7 +299,7 @@ async def test_while_nobody_knows_how_many_items_there_are_every_number_of_one_i
     async with open_flight(rates={}) as flight:
         mission = flight.vehicle.mission
         assert not mission.count.is_known
-        with pytest.raises(LocalProtocolError, match="item = 65535 is not allowed: 0 to 65534"):
+        with pytest.raises(InvalidArgument, match="item = 65535 is not allowed: 0 to 65534"):
             await mission.set_current(65535)
         with pytest.raises(CommandRejected):
             await mission.set_current(65534)

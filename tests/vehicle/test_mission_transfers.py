@@ -14,7 +14,7 @@ from plan_flights import changed, long_mission, near_home, sent_for_plans
 from aerokit import messages as m
 from aerokit.errors import (
     ConnectionClosed,
-    LocalProtocolError,
+    InvalidArgument,
     MissionRejected,
     MissionTimeout,
     NotSupported,
@@ -266,7 +266,7 @@ async def test_no_files() -> None:
 async def test_nonsense_is_not_sent(plan: Any, options: dict[str, Any], text: str) -> None:
     async with open_flight() as flight:
         flight.wire.forget()
-        with pytest.raises(LocalProtocolError, match=text):
+        with pytest.raises(InvalidArgument, match=text):
             await flight.vehicle.mission.upload(plan, **options)
         assert sent_for_plans(flight.wire) == []
 
@@ -276,7 +276,7 @@ async def test_nonsense_is_refused_before_it_waits_for_its_turn() -> None:
         tasks.start_soon(flight.vehicle.mission.upload, long_mission(40))
         await anyio.sleep(1.0)
         begin = now()
-        with pytest.raises(LocalProtocolError, match="patience_s = -1 is not allowed"):
+        with pytest.raises(InvalidArgument, match="patience_s = -1 is not allowed"):
             await flight.vehicle.mission.upload(long_mission(2), patience_s=-1)
         assert now() == begin
 

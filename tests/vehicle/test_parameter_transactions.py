@@ -10,8 +10,8 @@ from flight_harness import Flight, open_flight, open_px4
 
 from aerokit import messages
 from aerokit.errors import (
+    InvalidArgument,
     LinkLost,
-    LocalProtocolError,
     ParameterRejected,
     RollbackFailed,
     VerificationFailed,
@@ -136,7 +136,7 @@ async def test_when_one_cannot_be_set_none_is() -> None:
 
 async def test_impossible_values_are_refused_before_anything_is_set() -> None:
     async with open_flight(copter()) as flight:
-        with pytest.raises(LocalProtocolError):
+        with pytest.raises(InvalidArgument):
             async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 1e9}):
                 pytest.fail("the block was entered")
         assert {each.param_value for each in flight.wire.all(messages.ParamSet)} <= {1500.0, 50.0}
@@ -185,7 +185,7 @@ async def test_a_block_is_entered_once() -> None:
         block = flight.vehicle.parameters.temporarily({"RTL_ALT": 2000})
         async with block:
             pass
-        with pytest.raises(LocalProtocolError, match="already"):
+        with pytest.raises(InvalidArgument, match="already"):
             async with block:
                 pass
 
@@ -204,7 +204,7 @@ async def test_a_transaction_that_succeeds_stays() -> None:
             ]
             assert transaction.needs_reboot == ()
         assert values(flight) == (2500, 60)
-        with pytest.raises(LocalProtocolError, match="not open"):
+        with pytest.raises(InvalidArgument, match="not open"):
             await transaction.set("RTL_ALT", 1)
 
 
@@ -290,7 +290,7 @@ async def test_a_transaction_is_entered_once() -> None:
     async with open_flight(copter()) as flight:
         transaction = flight.vehicle.parameters.transaction()
         async with transaction:
-            with pytest.raises(LocalProtocolError, match="already"):
+            with pytest.raises(InvalidArgument, match="already"):
                 await transaction.__aenter__()
 
 

@@ -17,7 +17,7 @@ from aerokit import events, messages
 from aerokit.errors import (
     FileError,
     FileTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationTimeout,
     ParameterRejected,
@@ -209,9 +209,9 @@ async def test_a_limit_for_all_of_it() -> None:
 
 async def test_wrong_methods() -> None:
     async with open_flight(copter()) as flight:
-        with pytest.raises(LocalProtocolError, match="auto, ftp, list"):
+        with pytest.raises(InvalidArgument, match="auto, ftp, list"):
             await flight.vehicle.parameters.download(method="fast")  # type: ignore[arg-type]
-        with pytest.raises(LocalProtocolError, match="auto, ftp, set"):
+        with pytest.raises(InvalidArgument, match="auto, ftp, set"):
             await flight.vehicle.parameters.upload({"RTL_ALT": 1}, method="fast")  # type: ignore[arg-type]
 
 
@@ -345,7 +345,7 @@ async def test_impossible_names_are_refused_before_anything_is_sent(name: str) -
             parameters.set(name, 1),
             parameters.set_many({"RTL_ALT": 1, name: 1}),
         ):
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 await attempt
         assert not reads_and_lists(flight)
         assert not sent_writes(flight)
@@ -400,7 +400,7 @@ async def test_impossible_numbers_are_refused_before_anything_is_set(value: Any)
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         await parameters.download()
-        with pytest.raises(LocalProtocolError, match="WPNAV_SPEED"):
+        with pytest.raises(InvalidArgument, match="WPNAV_SPEED"):
             await parameters.set_many({"RTL_ALT": 2000, "WPNAV_SPEED": value})
         assert not sent_writes(flight)
 
@@ -412,7 +412,7 @@ async def test_what_a_type_cannot_hold_is_refused_before_anything_is_set(name: s
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         for _ in range(2):  # without and with what the vehicle has being known
-            with pytest.raises(LocalProtocolError, match=name):
+            with pytest.raises(InvalidArgument, match=name):
                 await parameters.set_many({"LAND_SPEED": 60, name: value})
             assert not sent_writes(flight)
             await parameters.download()
@@ -600,7 +600,7 @@ async def test_renamed_names_in_files_and_blocks() -> None:
             assert simulated.parameters["WPNAV_SPEED"] == 600
             results = await parameters.upload({"WP_SPD": 9.0, "WPNAV_SPEED": 700})
             assert list(results) == ["WPNAV_SPEED"]
-            with pytest.raises(LocalProtocolError, match="contradict"):
+            with pytest.raises(InvalidArgument, match="contradict"):
                 await parameters.set_many({"WP_SPD": 9.0, "WPNAV_SPEED": 800})
             assert simulated.parameters["WPNAV_SPEED"] == 700
 

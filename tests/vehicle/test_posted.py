@@ -16,7 +16,7 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     ConnectionClosed,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     OperationTimeout,
 )
@@ -369,12 +369,12 @@ async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
         )
         with pytest.raises(CommandRejected, match="DENIED"):  # taken back
             await order.until_told(2)
-    with pytest.raises(LocalProtocolError, match="no subject is named"), vehicle.posted():
+    with pytest.raises(InvalidArgument, match="no subject is named"), vehicle.posted():
         pass
     grounded.wire.forget()
-    with pytest.raises(LocalProtocolError, match="needs armed=True or armed=False"), vehicle.posted("arm"):
+    with pytest.raises(InvalidArgument, match="needs armed=True or armed=False"), vehicle.posted("arm"):
         pass
-    with pytest.raises(LocalProtocolError, match="the block of this order was left"):
+    with pytest.raises(InvalidArgument, match="the block of this order was left"):
         await order.command(ARM, 1)
     assert not grounded.wire.commands(ARM)
 
@@ -389,7 +389,7 @@ async def test_a_command_int_may_fall_back_to_command_long(flying: Flight) -> No
     assert isinstance(first, m.CommandInt)
     assert isinstance(second, m.CommandLong)
     assert (second.param5, second.param6, second.param7) == (1.0, 2.0, 30.0)
-    with pytest.raises(LocalProtocolError, match="frame = 6 is not allowed with or_long"):
+    with pytest.raises(InvalidArgument, match="frame = 6 is not allowed with or_long"):
         await flying.vehicle.command_int(MavCmd.DO_SET_HOME, 0, frame=6, **place, or_long=True)
 
 
@@ -413,7 +413,7 @@ async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(groun
     guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
     faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
     with vehicle.posted("mode", modes=(guided,)) as order:
-        with pytest.raises(LocalProtocolError, match="mode = LOITER is not allowed"):
+        with pytest.raises(InvalidArgument, match="mode = LOITER is not allowed"):
             await order.set_mode(loiter)
         await order.set_mode(guided)
     assert (vehicle.mode_name, len(wire.all(m.SetMode)), len(wire.commands(SET_MODE))) == ("GUIDED", 1, 1)

@@ -12,7 +12,7 @@ from flight_harness import Flight
 
 from aerokit import Position
 from aerokit import messages as m
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.vehicle.checks import check_range
 
 pytestmark = pytest.mark.anyio
@@ -60,13 +60,13 @@ def test_the_ends_of_a_range_belong_to_it(value: float, above: bool) -> None:
 
 @pytest.mark.parametrize(("value", "above"), NOT_ALLOWED)
 def test_what_is_beyond_the_ends_of_a_range_does_not(value: float, above: bool) -> None:
-    with pytest.raises(LocalProtocolError, match=r"^it = .* is not allowed: .*0 to 1000$"):
+    with pytest.raises(InvalidArgument, match=r"^it = .* is not allowed: .*0 to 1000$"):
         check_range("it", value, 0, 1000, above=above)
 
 
 async def test_out_of_range(flying: Flight) -> None:
     for text, call in REFUSED.items():
-        with pytest.raises(LocalProtocolError, match=f"^{re.escape(text)}$"):
+        with pytest.raises(InvalidArgument, match=f"^{re.escape(text)}$"):
             await call(flying.vehicle)
     kinds = (m.CommandLong, m.CommandInt, m.SetPositionTargetGlobalInt)
     assert not [message for kind in kinds for message in flying.wire.all(kind)]

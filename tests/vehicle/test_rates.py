@@ -10,7 +10,7 @@ import pytest
 from flight_harness import Flight, open_flight, open_px4
 
 from aerokit import messages as m
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.runtime.events import StreamSlow, StreamUnavailable
@@ -105,10 +105,10 @@ async def test_a_slower_wish_asks_for_nothing(grounded: Flight) -> None:
 
 @pytest.mark.parametrize("hz", [0.0, -1.0, 1001.0, float("nan")])
 async def test_rates_out_of_range(grounded: Flight, hz: float) -> None:
-    with pytest.raises(LocalProtocolError, match="rate_hz"), grounded.vehicle.rate(m.Attitude, hz):
+    with pytest.raises(InvalidArgument, match="rate_hz"), grounded.vehicle.rate(m.Attitude, hz):
         raise AssertionError
     with (
-        pytest.raises(LocalProtocolError, match="rate_hz"),
+        pytest.raises(InvalidArgument, match="rate_hz"),
         grounded.vehicle.subscribe(m.Attitude, rate_hz=hz),
     ):
         raise AssertionError

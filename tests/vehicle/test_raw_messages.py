@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from aerokit import Vehicle, connect
-from aerokit.errors import ConnectionClosed, LocalProtocolError, ValueUnknownError
+from aerokit.errors import ConnectionClosed, InvalidArgument, ValueUnknownError
 from aerokit.mavlink.messages import Attitude, Heartbeat, ScaledImu2
 from aerokit.sim import SimulatedCopter, simulated_link
 
@@ -40,5 +40,5 @@ async def test_it_ends_with_the_connection() -> None:
 
 async def test_a_rate_out_of_range_is_refused() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
-        with pytest.raises(LocalProtocolError, match="rate_hz"):
+        with pytest.raises(InvalidArgument, match="rate_hz"):
             vehicle.message(ScaledImu2, rate_hz=0)

@@ -10,7 +10,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     OperationTimeout,
 )
@@ -33,7 +33,7 @@ async def test_by_name_and_by_number(grounded: Flight, mode: str | int) -> None:
 
 
 async def test_an_unknown_name_lists_the_modes_and_sends_nothing(grounded: Flight) -> None:
-    with pytest.raises(LocalProtocolError) as caught:
+    with pytest.raises(InvalidArgument) as caught:
         await grounded.vehicle.set_mode("GIUDED")
     text = str(caught.value)
     assert "'GIUDED' is not known (did you mean 'GUIDED'?)" in text
@@ -108,7 +108,7 @@ async def test_a_mode_that_the_vehicle_tells_is_known_by_its_name() -> None:
         )
         with pytest.raises(CommandRejected, match="No such mode 118"):
             await flight.vehicle.set_mode("FOLLOW_BOAT")
-        with pytest.raises(LocalProtocolError, match="Follow Boat"):
+        with pytest.raises(InvalidArgument, match="Follow Boat"):
             await flight.vehicle.set_mode("FOLLOW_TRAIN")
 
 

@@ -16,7 +16,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     FileError,
     FileFormatError,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationTimeout,
     ParameterRejected,
@@ -126,7 +126,7 @@ async def test_names_and_values_that_cannot_be_are_refused_before_anything_is_se
             ("CAM_WBMODE", "Sunny", "a number"),
             ("CAM_OWNER", 7, "a text or bytes"),
         ):
-            with pytest.raises(LocalProtocolError, match=complaint):
+            with pytest.raises(InvalidArgument, match=complaint):
                 await settings.set(name, value)
         assert shelf.sent == []
 
@@ -269,10 +269,10 @@ async def test_a_definition_from_a_file_or_made_before(tmp_path: Path) -> None:
     ("uri", "error"),
     [
         ("mftp:///nowhere.xml", FileError),
-        ("ftp://example.org/camera.xml", LocalProtocolError),
-        ("file:///etc/passwd", LocalProtocolError),
-        ("mftp://[;comp=0]/camera.xml", LocalProtocolError),
-        ("mftp://", LocalProtocolError),
+        ("ftp://example.org/camera.xml", InvalidArgument),
+        ("file:///etc/passwd", InvalidArgument),
+        ("mftp://[;comp=0]/camera.xml", InvalidArgument),
+        ("mftp://", InvalidArgument),
         ("mftp:///picture.jpg", FileFormatError),
     ],
 )
@@ -315,7 +315,7 @@ async def test_what_is_not_allowed_is_refused_before_it_is_sent() -> None:
             ("CAM_ISO", 100, "CAM_ISO = 100 is not allowed now: excluded by CAM_EXPMODE = Auto"),
             ("CAM_QUALITY", 91, "10, 15, 20"),
         ):
-            with pytest.raises(LocalProtocolError, match=complaint):
+            with pytest.raises(InvalidArgument, match=complaint):
                 await settings.set(name, value)
         assert shelf.sent == []
         assert settings.excluded_by("CAM_ISO") == ("CAM_EXPMODE = Auto",)
@@ -325,7 +325,7 @@ async def test_what_is_not_allowed_is_refused_before_it_is_sent() -> None:
 async def test_what_decides_is_read_before_if_it_is_not_known() -> None:
     async with on_board() as shelf:
         await shelf.settings.fetch_definition()
-        with pytest.raises(LocalProtocolError, match="excluded by CAM_EXPMODE = Auto"):
+        with pytest.raises(InvalidArgument, match="excluded by CAM_EXPMODE = Auto"):
             await shelf.settings.set("CAM_ISO", "400")
         assert {each.param_id for each in shelf.all(m.ParamExtRequestRead)} == {
             "CAM_MODE",
@@ -364,7 +364,7 @@ async def test_ranges_follow_the_other_settings() -> None:
         await shelf.component.command(MavCmd.SET_CAMERA_MODE, 0, CameraMode.VIDEO)
         assert list(settings.options("CAM_ISO")) == ["100", "200", "400"]
         with pytest.raises(
-            LocalProtocolError, match=r"CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100'"
+            InvalidArgument, match=r"CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100'"
         ):
             await settings.set("CAM_ISO", 800)
         await settings.set("CAM_MODE", "Photo")

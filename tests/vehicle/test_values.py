@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import enums, messages
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.position import Position
 from aerokit.vehicle.state import gimbal
 from aerokit.vehicle.state.condition import EstimatorHealth, SensorHealth
@@ -41,13 +41,13 @@ def test_a_position_as_users_write_it() -> None:
     ],
 )
 def test_nonsense_is_refused_by_name(fields: dict[str, Any], text: str) -> None:
-    with pytest.raises(LocalProtocolError, match=text):
+    with pytest.raises(InvalidArgument, match=text):
         Position(**fields)
 
 
 def test_an_offset_of_a_wrong_type_is_refused_by_name() -> None:
     north: Any = "30"
-    with pytest.raises(LocalProtocolError, match="north_m = '30' is not allowed: a number"):
+    with pytest.raises(InvalidArgument, match="north_m = '30' is not allowed: a number"):
         Position(47.3977, 8.5456).offset(north_m=north)
 
 

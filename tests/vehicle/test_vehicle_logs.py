@@ -15,7 +15,7 @@ from flight_harness import open_flight, open_px4
 
 import aerokit
 from aerokit import messages as m
-from aerokit.errors import FileError, FileTimeout, LocalProtocolError
+from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.links import FaultModel, FaultyLink
 from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
@@ -236,11 +236,11 @@ async def test_arguments_that_cannot_be(bench: Bench) -> None:
     bench.wire.forget()
     logs: Any = bench.logs
     for log in (-1, 65536, "1"):
-        with pytest.raises(LocalProtocolError, match="log"):
+        with pytest.raises(InvalidArgument, match="log"):
             await logs.read(log)
-    with pytest.raises(LocalProtocolError, match="method"):
+    with pytest.raises(InvalidArgument, match="method"):
         await logs.download(1, "to", method="carrier pigeon")
-    with pytest.raises(LocalProtocolError, match="timeout"):
+    with pytest.raises(InvalidArgument, match="timeout"):
         await logs.list(timeout=-1.0)
     assert bench.sent() == 0
 

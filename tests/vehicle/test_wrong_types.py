@@ -13,7 +13,7 @@ from flight_harness import Flight, in_the_air
 from wrong_types import Misuse, misuses, misuses_of, refusal_of
 
 import aerokit
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.runtime.connection import Connection
 
@@ -112,13 +112,13 @@ async def test_values_of_parameters(values: Any) -> None:
     async with quiet_flight() as flight:
         parameters = flight.vehicle.parameters
         for call in (parameters.upload, parameters.diff, parameters.set_many):
-            with pytest.raises(LocalProtocolError):
+            with pytest.raises(InvalidArgument):
                 await call(values)
         assert [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)] == []
 
 
 async def test_a_time_that_no_clock_has() -> None:
     async with quiet_flight() as flight:
-        with pytest.raises(LocalProtocolError, match=r"timeout = .* is not allowed: seconds above 0"):
+        with pytest.raises(InvalidArgument, match=r"timeout = .* is not allowed: seconds above 0"):
             await flight.vehicle.set_mode("LOITER", timeout=10**400)
         assert not flight.wire.mode_orders()

@@ -17,7 +17,7 @@ import anyio
 import pytest
 
 from aerokit import messages as m
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.foxglove import FoxgloveBridge, foxglove_bridge
 from aerokit.foxglove import bridge as bridge_module
 from aerokit.links.sockets import is_free
@@ -237,7 +237,7 @@ async def test_wrong_arguments_and_taken_ports_are_said() -> None:
             ({"port": 70_000}, "port"),
             ({"messages": ["GPSS*"]}, "GPSS"),
         ]:
-            with pytest.raises(LocalProtocolError, match=text):
+            with pytest.raises(InvalidArgument, match=text):
                 async with foxglove_bridge(connection, **wrong):  # type: ignore[arg-type]
                     raise AssertionError
         with socket.socket() as taken:

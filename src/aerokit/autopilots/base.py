@@ -251,7 +251,7 @@ class Autopilot:
     def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """The mode of this name (any case, with or without spaces and underscores) or number.
 
-        Raises :class:`LocalProtocolError`, which lists the known names.
+        Raises :class:`InvalidArgument`, which lists the known names.
         """
         return self.modes.find(mode, extra)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavModeFlag
 from aerokit.snapshot import Snapshot
 from aerokit.wording import did_you_mean, shown
@@ -71,7 +71,7 @@ class ModeTable:
     def find(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """The mode of this name or number.
 
-        Raises :class:`LocalProtocolError` with the names that are known when there is none of this name.
+        Raises :class:`InvalidArgument` with the names that are known when there is none of this name.
         """
         if isinstance(mode, Mode):
             mode = mode.custom_mode
@@ -88,13 +88,11 @@ class ModeTable:
         digits = key[len(_UNKNOWN) :] if key.startswith(_UNKNOWN) else key
         if digits.isdecimal():
             return self._check(int(digits))
-        raise LocalProtocolError(self._unknown(name, extra))
+        raise InvalidArgument(self._unknown(name, extra))
 
     def _check(self, number: int) -> int:
         if not 0 <= number <= _MAX_CUSTOM_MODE:
-            raise LocalProtocolError(
-                f"mode = {number}: a custom_mode is a number from 0 to {_MAX_CUSTOM_MODE}"
-            )
+            raise InvalidArgument(f"mode = {number}: a custom_mode is a number from 0 to {_MAX_CUSTOM_MODE}")
         return int(number)
 
     def _unknown(self, name: str, extra: Mapping[int, str]) -> str:

@@ -18,7 +18,7 @@ from aerokit.autopilots.base import (
 )
 from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 
 __all__ = ["Px4", "px4_custom_mode"]
@@ -173,12 +173,12 @@ class Px4(Autopilot):
     ) -> TakeOff | None:
         """NAV_TAKEOFF with the altitude above the sea, here, with the present heading; then LOITER.
 
-        Raises :class:`LocalProtocolError` when the altitude of home is not given.
+        Raises :class:`InvalidArgument` when the altitude of home is not given.
         """
         if self._stays_down:
             return None
         if home_altitude_amsl_m is None:
-            raise LocalProtocolError("take-off on PX4 needs the altitude of home: it counts from the sea")
+            raise InvalidArgument("take-off on PX4 needs the altitude of home: it counts from the sea")
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
         return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
 

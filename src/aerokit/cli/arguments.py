@@ -11,7 +11,7 @@ from aerokit import geo
 from aerokit.cli.completers import kinds as kind_names
 from aerokit.cli.completers import offer
 from aerokit.cli.places import place_of
-from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.links import parse_address
 from aerokit.parameters import ParameterType, check_name, checked_value
 from aerokit.parameters.number_text import parse_number
@@ -43,7 +43,7 @@ def address(text: str) -> str:
     """A connection string."""
     try:
         parse_address(text)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise ArgumentTypeError(str(error)) from None
     return text
 
@@ -64,7 +64,7 @@ def vehicle_kind(text: str) -> str:
         return text
     try:
         kind_class(text)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise ArgumentTypeError(str(error)) from None
     return text
 
@@ -123,7 +123,7 @@ def assignment(text: str) -> tuple[str, int | float]:
         raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number") from None
     try:
         checked_value(check_name(name), number, ParameterType.REAL32)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise ArgumentTypeError(str(error)) from None
     return name, number
 
@@ -146,7 +146,7 @@ def home(text: str) -> tuple[float, float, float]:
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(","))
         geo.check_place(latitude, longitude)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise ArgumentTypeError(str(error)) from None
     except ValueError:
         raise ArgumentTypeError(f"{text!r} is not LAT,LON,ALT in degrees and metres") from None

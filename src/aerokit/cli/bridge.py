@@ -14,7 +14,7 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.cli.vehicle_command import add_place
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links.address import parse_address
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def _broker(text: str) -> str:
     """As :func:`_network`; an error does not show the password."""
     try:
         _without_password(text)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text
 

@@ -6,8 +6,8 @@ from aerokit.errors import (
     AerokitError,
     FileFormatError,
     HeartbeatTimeout,
+    InvalidArgument,
     LinkError,
-    LocalProtocolError,
     OperationRejected,
     OperationTimeout,
 )
@@ -51,7 +51,7 @@ _CODES: tuple[tuple[type[BaseException], int], ...] = (
     (KeyboardInterrupt, INTERRUPTED),
     (NotInstalled, NOT_INSTALLED),
     (FileFormatError, UNREADABLE),
-    (LocalProtocolError, WRONG_ARGUMENTS),
+    (InvalidArgument, WRONG_ARGUMENTS),
     (LinkError, NOTHING_HEARD),
     (HeartbeatTimeout, NOTHING_HEARD),
     (OperationTimeout, TIMED_OUT),

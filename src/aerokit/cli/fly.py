@@ -17,7 +17,7 @@ from aerokit.cli.own_flight import ON_INTERRUPT
 from aerokit.cli.plans import PARTS, read_plan, tell_items
 from aerokit.cli.signing import signing_of
 from aerokit.cli.vehicle_command import add_vehicle, default_address, reached
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     import argparse
@@ -88,13 +88,13 @@ async def run_fly(options: argparse.Namespace) -> int:
 
 def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
     if not plan.mission.items:
-        raise LocalProtocolError(f"{options.file} has no mission items: there is nothing to fly")
+        raise InvalidArgument(f"{options.file} has no mission items: there is nothing to fly")
     if options.sim and options.connect is not None:
-        raise LocalProtocolError("--sim and --connect are not allowed together: which vehicle is meant?")
+        raise InvalidArgument("--sim and --connect are not allowed together: which vehicle is meant?")
     if options.vehicle is not None and not options.sim:
-        raise LocalProtocolError("--vehicle is for --sim")
+        raise InvalidArgument("--vehicle is for --sim")
     if not (options.sim or options.yes or is_somebody_there()):
-        raise LocalProtocolError("nobody is at a terminal to agree, and --yes is not given: nothing was sent")
+        raise InvalidArgument("nobody is at a terminal to agree, and --yes is not given: nothing was sent")
 
 
 async def _connect_and_fly(

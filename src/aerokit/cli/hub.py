@@ -16,7 +16,7 @@ from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.new_file import make_new_recording, remove_if_empty
 from aerokit.cli.output import add_json, tell
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.wording import did_you_mean
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
         if name:
             _check_known(name, names)
     if options.signed and signing_of(options) is None:
-        raise LocalProtocolError(f"--signed needs a key: --signing-key FILE or ${ENVIRONMENT}")
+        raise InvalidArgument(f"--signed needs a key: --signing-key FILE or ${ENVIRONMENT}")
     return [
         Endpoint(
             place,
@@ -188,7 +188,7 @@ def _for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str
 
 def _check_known(name: str, names: list[str]) -> None:
     if name not in names:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"there is no endpoint {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}"
         )
 

@@ -11,7 +11,7 @@ from aerokit.cli.exits import DONE, FAILED
 from aerokit.cli.output import tell, tell_done
 from aerokit.cli.progress import file_size, progress_bar
 from aerokit.cli.vehicle_command import add_action, agreed, connected
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -66,7 +66,7 @@ def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequenc
     known = {entry.id: entry for entry in entries}
     for log_id in options.ids:
         if log_id not in known:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"there is no log {log_id}: {', '.join(map(str, known)) or 'there are none'}"
             )
     return [known[log_id] for log_id in options.ids]

@@ -14,7 +14,7 @@ from aerokit.cli.extras import need
 from aerokit.cli.interrupt import on_interrupt
 from aerokit.cli.signing import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.cli.vehicle_command import add_place
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     import argparse
@@ -38,7 +38,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
     from aerokit.monitor.app import run_monitor as run
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise LocalProtocolError("aerokit monitor needs a terminal")
+        raise InvalidArgument("aerokit monitor needs a terminal")
     with ExitStack() as stack:
 
         def end_soon(number: int) -> None:

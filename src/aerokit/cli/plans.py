@@ -25,7 +25,7 @@ def read_plan(path: str) -> Plan:
     Raises:
         OSError: the file cannot be read.
         FileFormatError: it is neither of the two; the text says where.
-        LocalProtocolError: an item cannot be sent.
+        InvalidArgument: an item cannot be sent.
     """
     from aerokit.missions import Plan, read_plan_file, read_waypoint_file
 

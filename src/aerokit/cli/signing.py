@@ -29,7 +29,7 @@ def add_signing_key(command: argparse._ActionsContainer, text: str) -> None:
 
 def key_file(path: str) -> SigningKey:
     """The key that a file holds."""
-    from aerokit.errors import LocalProtocolError
+    from aerokit.errors import InvalidArgument
     from aerokit.mavlink.signing import SigningKey
 
     try:
@@ -38,7 +38,7 @@ def key_file(path: str) -> SigningKey:
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is no text"
         raise ArgumentTypeError(f"cannot read a signing key from {path!r}: {why}") from None
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise ArgumentTypeError(f"{path!r} has no signing key: {error}") from None
 
 

@@ -14,9 +14,9 @@ __all__ = ["simulated_fleet", "simulated_vehicle"]
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """A vehicle of a kind of `aerokit.sim.kinds`, just switched on; ``options`` are its class's.
 
-    LocalProtocolError when it has no such option or parameter. ``boot_text`` is for those that have one.
+    InvalidArgument when it has no such option or parameter. ``boot_text`` is for those that have one.
     """
-    from aerokit.errors import LocalProtocolError
+    from aerokit.errors import InvalidArgument
     from aerokit.sim.kinds import kind_class, simulated
 
     taken = _options_of(kind_class(name))
@@ -24,7 +24,7 @@ def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
         options.pop("boot_text", None)
     for option in options:
         if option not in taken:
-            raise LocalProtocolError(f"the simulated {name} has no {option}")
+            raise InvalidArgument(f"the simulated {name} has no {option}")
     return simulated(name, **options)
 
 
@@ -42,16 +42,14 @@ def simulated_fleet(
 
     The name of a .tlog file gives the one vehicle of that recording, to which nothing else applies.
     """
-    from aerokit.errors import LocalProtocolError
+    from aerokit.errors import InvalidArgument
     from aerokit.sim.local_frame import GlobalPoint, LocalFrame
     from aerokit.sim.place import HOME
 
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
     if system_id + count - 1 > 255:
-        raise LocalProtocolError(
-            f"{count} vehicles from system id {system_id} on: the last would be above 255"
-        )
+        raise InvalidArgument(f"{count} vehicles from system id {system_id} on: the last would be above 255")
     home = home or HOME
     frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
     places = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
@@ -68,11 +66,11 @@ def simulated_fleet(
 
 
 def _recorded(path: str, count: int) -> SimulatedVehicle:
-    from aerokit.errors import LocalProtocolError
+    from aerokit.errors import InvalidArgument
     from aerokit.sim.recorded import RecordedVehicle
 
     if count != 1:
-        raise LocalProtocolError(f"{path} is one vehicle; count = {count}")
+        raise InvalidArgument(f"{path} is one vehicle; count = {count}")
     return RecordedVehicle(path)
 
 

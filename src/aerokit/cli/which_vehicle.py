@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     import argparse
@@ -23,7 +23,7 @@ async def check_alone(vehicle: Vehicle, options: argparse.Namespace) -> None:
     """Unless ``--system-id`` says which vehicle is meant, listen whether there are others.
 
     Raises:
-        LocalProtocolError: there are.
+        InvalidArgument: there are.
     """
     if options.system_id is not None:
         return
@@ -33,6 +33,6 @@ async def check_alone(vehicle: Vehicle, options: argparse.Namespace) -> None:
             heard.add(found.system_id)
             if len(heard) > 1:
                 numbers = ", ".join(map(str, sorted(heard)))
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"several vehicles were heard ({numbers}): say which by --system-id; nothing was sent"
                 )

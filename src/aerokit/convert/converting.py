@@ -14,7 +14,7 @@ from aerokit.arguments import checked
 from aerokit.convert.mcap import McapFile
 from aerokit.convert.tables import CsvTable, FlightTable, MessageTables, ParquetTable
 from aerokit.convert.tracks import GpxFile, KmlFile
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.flights.entries import TlogFile
 from aerokit.flights.flight_controllers import BinFile, UlogFile
 from aerokit.protocols.transfer import Progress
@@ -97,7 +97,7 @@ def convert(
         on_progress: called now and then with the bytes that were read.
 
     Raises:
-        LocalProtocolError: there is no such format, or the target is there already.
+        InvalidArgument: there is no such format, or the target is there already.
         FileFormatError: the log is none, or has nothing that can be read.
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``convert`` is not installed.
@@ -108,9 +108,9 @@ def convert(
     if reader is None:
         raise FileFormatError(f"{source} is no flight log by its name: {', '.join(LOGS)}")
     if not force and to.exists() and not (to.is_dir() and not to.suffix and not any(to.iterdir())):
-        raise LocalProtocolError(f"{to} is there already: it is replaced with force (--force) only")
+        raise InvalidArgument(f"{to} is there already: it is replaced with force (--force) only")
     if to.exists() and to.is_dir() != (not to.suffix):
-        raise LocalProtocolError(f"{to} is a {'folder' if to.is_dir() else 'file'}: it is not replaced")
+        raise InvalidArgument(f"{to} is a {'folder' if to.is_dir() else 'file'}: it is not replaced")
     show = _shower(source, on_progress)
     # Beside the target, so that it can be renamed; nobody takes it for the target meanwhile.
     with tempfile.TemporaryDirectory(dir=to.parent, prefix=f".{to.name}.") as folder:
@@ -127,7 +127,7 @@ def _maker(to: Path, tables: str) -> Callable[[Path, Log], _Writer]:
     table: dict[str, Any] = FORMATS if to.suffix else FOLDERS
     key = to.suffix.lower() if to.suffix else tables
     if key not in table:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"no format is called {key!r}: a file is {', '.join(FORMATS)}, a folder has {' or '.join(FOLDERS)}"
         )
     made: Callable[[Path, Log], _Writer] = table[key]

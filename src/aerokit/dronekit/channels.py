@@ -12,7 +12,7 @@ from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.override_release import RELEASE_UPPER
 from aerokit.dronekit.privates import Python2Mapping
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Channels(_ChannelDict):
     @count.setter
     def count(self, count: int) -> None:
         if not FEWEST <= count <= MOST:
-            raise LocalProtocolError(f"count = {count!r} is not allowed: {FEWEST} to {MOST}")
+            raise InvalidArgument(f"count = {count!r} is not allowed: {FEWEST} to {MOST}")
         with self._changing:
             self._grow(count)
             for number in NUMBERS[count:]:
@@ -247,13 +247,13 @@ class ChannelsOverride(_ChannelDict):
 
 
 def _checked_value(number: int, value: Any) -> int:
-    """Microseconds, 0 to give the channel back; LocalProtocolError, a ValueError, names the channel."""
+    """Microseconds, 0 to give the channel back; InvalidArgument, a ValueError, names the channel."""
     if value is None:
         return 0
     with contextlib.suppress(TypeError, ValueError, OverflowError):
         microseconds = round(value)  # numpy's numbers too, and what a controller works out
         if 0 <= microseconds <= UNUSED:
             return int(microseconds)
-    raise LocalProtocolError(
+    raise InvalidArgument(
         f"channel {number} = {value!r} is not allowed: microseconds, 1000 to 2000 as a rule; None gives it back"
     )

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20.ardupilotmega import MAVLink_mission_item_message
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
-from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
+from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission
 from aerokit.missions.ardupilot_habits import written_out
@@ -175,7 +175,7 @@ class CommandSequence:
         Raises:
             TimeoutError: the vehicle does not answer, or not in time.
             APIException: it refused: the text names command and reason, commands counted as their indices here.
-            LocalProtocolError: a ValueError; a command cannot be right. Nothing was sent.
+            InvalidArgument: a ValueError; a command cannot be right. Nothing was sent.
         """
         self._settle()
         with self._lock:
@@ -389,7 +389,7 @@ def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
 
 
 def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
-    """The mission of these commands for this vehicle; LocalProtocolError names a field that is no number."""
+    """The mission of these commands for this vehicle; InvalidArgument names a field that is no number."""
     items: Iterable[MissionItem] = [_item(each, index) for index, each in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
         here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
@@ -411,7 +411,7 @@ def _item(cmd: Command, index: int) -> MissionItem:
         z, autocontinue = float(cmd.z), bool(cmd.autocontinue)
         return MissionItem(command, frame, one, two, three, four, x, y, z, autocontinue)
     except (TypeError, ValueError, OverflowError) as error:
-        raise LocalProtocolError(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
+        raise InvalidArgument(f"commands[{index}] is not allowed: {error}, in {cmd}") from None
 
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:

@@ -6,7 +6,7 @@ import builtins
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from aerokit.errors import AerokitError, LocalProtocolError, OperationTimeout
+from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 
 __all__ = ["APIException", "TimeoutError", "classic_errors"]
 
@@ -24,7 +24,7 @@ def classic_errors() -> Iterator[None]:
     """What aerokit raises in the block becomes one of these; what is wrong with an argument stays a ValueError."""
     try:
         yield
-    except LocalProtocolError:
+    except InvalidArgument:
         raise
     except OperationTimeout as error:
         raise TimeoutError(str(error)) from error

@@ -14,7 +14,7 @@ import anyio
 from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
 from aerokit.dronekit.exceptions import APIException
-from aerokit.errors import CommandRejected, LocalProtocolError, OperationTimeout
+from aerokit.errors import CommandRejected, InvalidArgument, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     MavAutopilot,
@@ -67,8 +67,8 @@ def mode_named(vehicle: AsyncVehicle, mode: str | int) -> Mode:
         return Mode(mode_name(vehicle, mode), mode)
     try:
         found = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
-    except (LocalProtocolError, AttributeError, TypeError) as error:  # the first lists the modes there are
-        raise KeyError(mode) from (error if isinstance(error, LocalProtocolError) else None)
+    except (InvalidArgument, AttributeError, TypeError) as error:  # the first lists the modes there are
+        raise KeyError(mode) from (error if isinstance(error, InvalidArgument) else None)
     if not isinstance(mode, str) or not (mode.isupper() or mode == found.name):
         raise KeyError(mode)
     return found if autopilot.modes_are_numbered else found.replace(base_mode=_px4_flags(found.name))
@@ -158,7 +158,7 @@ async def refuse(reason: str) -> None:
 
 
 def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Latitude and longitude in 1e-7 degrees, altitude in metres; LocalProtocolError names what is missing or wrong."""
+    """Latitude and longitude in 1e-7 degrees, altitude in metres; InvalidArgument names what is missing or wrong."""
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
         value = getattr(location, name)
         try:
@@ -167,14 +167,14 @@ def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[in
             is_good = False
         if not is_good:
             allowed = "a number of metres" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
-            raise LocalProtocolError(f"location.{name} = {value!r} is not allowed: {allowed}")
+            raise InvalidArgument(f"location.{name} = {value!r} is not allowed: {allowed}")
     return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
 
 
 def check_speed(name: str, speed: float | None) -> None:
-    """LocalProtocolError, a ValueError, unless it is a number of m/s or None."""
+    """InvalidArgument, a ValueError, unless it is a number of m/s or None."""
     if speed is not None and not math.isfinite(speed):
-        raise LocalProtocolError(f"{name} = {speed!r} is not allowed: a number of m/s")
+        raise InvalidArgument(f"{name} = {speed!r} is not allowed: a number of m/s")
 
 
 class CurrentCommand:
@@ -203,9 +203,9 @@ class CurrentCommand:
         return int(message.seq) + 1
 
     def choose(self, seq: int) -> None:
-        """Have the vehicle fly this one next; does not wait. LocalProtocolError: it is not from 0 to 65,535."""
+        """Have the vehicle fly this one next; does not wait. InvalidArgument: it is not from 0 to 65,535."""
         if not 0 <= operator.index(seq) <= MOST:
-            raise LocalProtocolError(f"next = {seq!r} is not allowed, but 0 to {MOST}")
+            raise InvalidArgument(f"next = {seq!r} is not allowed, but 0 to {MOST}")
         self._core.order("commands.next", self._choose, operator.index(seq))
 
     def _on_current(self, message: m.MissionCurrent) -> None:

@@ -10,7 +10,7 @@ from aerokit.dronekit.flight_orders import checked_place
 from aerokit.dronekit.line import weakly
 from aerokit.dronekit.privates import GimbalPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.position import Position
 from aerokit.vehicle.state.gimbal import GimbalAttitude
 
@@ -85,7 +85,7 @@ class Gimbal(GimbalPrivates):
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
         """Keep the camera on a place; a copter without a gimbal that turns does so itself. All zeros give it up."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
-            raise LocalProtocolError("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
+            raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
         is_a_place = any(checked_place(roi))
         aio = self._core.check_link()
         if not is_a_place:
@@ -126,5 +126,5 @@ def _checked(name: str, value: float) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise LocalProtocolError(f"{name} = {value!r} is not allowed: a finite number of degrees")
+        raise InvalidArgument(f"{name} = {value!r} is not allowed: a finite number of degrees")
     return number if abs(number) <= MOST_DEG else math.remainder(number, 360.0)

@@ -81,7 +81,7 @@ class Line:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message, in the order of the calls; from any thread, never blocks.
 
-        LocalProtocolError: a field is out of range; APIException: the connection is closed.
+        InvalidArgument: a field is out of range; APIException: the connection is closed.
         """
         message.encode()  # so that what is wrong with it is told to who made it
         with classic_errors():

@@ -6,7 +6,7 @@ from typing import Any
 
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import PlayTune
 from aerokit.protocols.command import command_long
@@ -93,9 +93,9 @@ def _tune_text(tune: str | bytes) -> str:
         text = tune.encode() if isinstance(tune, str) else tune
         notes = text.rstrip(b"\0").decode("ascii")
     except (UnicodeError, AttributeError):
-        raise LocalProtocolError(f"tune = {tune!r} is not allowed: a text of ASCII characters") from None
+        raise InvalidArgument(f"tune = {tune!r} is not allowed: a text of ASCII characters") from None
     if "\0" in notes or len(notes) > sum(TUNE_SIZES):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"tune of {len(notes)} characters is not allowed: at most {sum(TUNE_SIZES)}, none of them NUL"
         )
     return notes

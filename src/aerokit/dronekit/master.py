@@ -14,7 +14,7 @@ from aerokit.autopilots.modes import is_armed
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import message_of
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
 from aerokit.mavlink.from_pymavlink import from_pymavlink
@@ -359,5 +359,5 @@ class Inbox(Mapping[str, Any]):
 def _id_of(name: str) -> int:
     try:
         return STANDARD.by_name(name).ID
-    except LocalProtocolError:
+    except InvalidArgument:
         raise KeyError(name) from None

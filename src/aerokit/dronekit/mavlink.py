@@ -17,7 +17,7 @@ from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.line import Line
 from aerokit.dronekit.observers import message_of
 from aerokit.dronekit.override_release import OverrideRelease
-from aerokit.errors import AerokitError, ConnectionClosed, LinkOpenError, LocalProtocolError
+from aerokit.errors import AerokitError, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.links.address import ACCEPTED_FORMS, parse_address
 from aerokit.links.reconnecting import ReconnectingLink
 from aerokit.runtime.opening import open_connection
@@ -241,10 +241,10 @@ async def _releasing(
 
 def _check_address(ip: object) -> None:
     if not isinstance(ip, str):
-        raise LocalProtocolError(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
+        raise InvalidArgument(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
     try:
         parse_address(ip)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         from aerokit.links.address_error import AddressError
 
         raise AddressError(str(error)) from None

@@ -12,7 +12,7 @@ from aerokit.dronekit.line import weakly
 from aerokit.errors import (
     AerokitError,
     ConnectionClosed,
-    LocalProtocolError,
+    InvalidArgument,
     ParameterRejected,
     ParameterTimeout,
 )
@@ -193,7 +193,7 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
         known = aio.parameters.known(name) or await aio.parameters.read(name, patience_s=patience_s)
         wanted = as_held(name, value, known.type)
         done = await aio.parameters.set(name, wanted, patience_s=patience_s)
-    except (LocalProtocolError, ParameterRejected, ParameterTimeout) as error:
+    except (InvalidArgument, ParameterRejected, ParameterTimeout) as error:
         return error
     if done.outcome == "clamped":
         return ParameterRejected(f"the vehicle made it {done.value:g}", name=name)
@@ -201,7 +201,7 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
 
 
 def as_held(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
-    """The value as a parameter of that type holds it; LocalProtocolError when it cannot."""
+    """The value as a parameter of that type holds it; InvalidArgument when it cannot."""
     if type.is_integer and isinstance(value, float) and abs(value) < float("inf"):
         value = int(value - ALMOST if value < 0 else value + ALMOST)
     return checked_value(name, value, type)

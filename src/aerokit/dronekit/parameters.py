@@ -13,7 +13,7 @@ from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import HasObservers, ListenerT
 from aerokit.dronekit.parameter_transfers import ParameterReading, ParameterValues, set_parameter
 from aerokit.dronekit.privates import Python2Mapping
-from aerokit.errors import LocalProtocolError, ParameterTimeout
+from aerokit.errors import InvalidArgument, ParameterTimeout
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import check_name
 from aerokit.parameters.parameter import number_of
@@ -119,7 +119,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
             Whether the vehicle holds the value now. If not, the reason is logged as an error: no answer, no such
             parameter, a value that the vehicle or the parameter's type does not take.
 
-        LocalProtocolError, a ValueError: the name is no text, or the value no number.
+        InvalidArgument, a ValueError: the name is no text, or the value no number.
         """
         name, number = _upper(name), number_of(name, value)
         if wait_ready:
@@ -205,7 +205,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
 def _upper(name: str) -> str:
     if not isinstance(name, str):
-        raise LocalProtocolError(f"parameter name = {name!r} is no text")
+        raise InvalidArgument(f"parameter name = {name!r} is no text")
     return name.upper()
 
 
@@ -219,6 +219,6 @@ def _described(name: str) -> str:
 def _is_possible(name: str) -> bool:
     try:
         check_name(name)
-    except LocalProtocolError:
+    except InvalidArgument:
         return False
     return True

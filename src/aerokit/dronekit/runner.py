@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from aerokit.dronekit.alias import install
 from aerokit.dronekit.util import errprinter
-from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.wording import did_you_mean
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
     from aerokit.sim.place import HOME
 
     if not 0.1 <= options.speedup <= 100:
-        raise LocalProtocolError(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")
+        raise InvalidArgument(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")
     home = HOME if options.home is None else parse_home(options.home)
     served = serve_for_program(options.vehicle, home, options.speedup)
     tcp, udp = (place.replace("tcpin:", "tcp:").replace("udpout:", "udp:") for place in served.addresses)

@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.util import errprinter
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.sim.kinds import simulated
 from aerokit.sim.patience import wait_longer
 from aerokit.sim.place import HOME
@@ -105,7 +105,7 @@ def serve_for_program(kind: str, home: tuple[float, float, float], speedup: floa
     """Serve a vehicle where DroneKit programs look for one; a program that starts one itself puts it in its place.
 
     Raises:
-        LocalProtocolError: there is no such kind.
+        InvalidArgument: there is no such kind.
         LinkOpenError: no address could be opened.
     """
     global _given
@@ -133,7 +133,7 @@ class SITL:
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:
         """Note which vehicle it is; there is nothing to be fetched, and ``version`` is the simulator's own."""
         if system not in KINDS:
-            raise LocalProtocolError(f"dronekit_sitl: system = {system!r} is not one of: {', '.join(KINDS)}")
+            raise InvalidArgument(f"dronekit_sitl: system = {system!r} is not one of: {', '.join(KINDS)}")
         self._kind = KINDS[system]
 
     def launch(
@@ -199,9 +199,9 @@ class SITL:
 
 
 def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
-    """Start a copter, at home near Canberra or at this place; LocalProtocolError for one of the two alone."""
+    """Start a copter, at home near Canberra or at this place; InvalidArgument for one of the two alone."""
     if (lat is None) != (lon is None):
-        raise LocalProtocolError("dronekit_sitl.start_default: give both lat and lon, or neither")
+        raise InvalidArgument("dronekit_sitl.start_default: give both lat and lon, or neither")
     sitl = SITL()
     sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},353"])
     return sitl
@@ -213,11 +213,11 @@ def version_list() -> dict[str, dict[str, str]]:
 
 
 def parse_home(text: str) -> tuple[float, float, float]:
-    """``LAT,LON,ALT`` or SITL's ``LAT,LON,ALT,HEADING``; LocalProtocolError for anything else."""
+    """``LAT,LON,ALT`` or SITL's ``LAT,LON,ALT,HEADING``; InvalidArgument for anything else."""
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(",")[:3])
     except ValueError:
-        raise LocalProtocolError(f"home = {text!r} is not LAT,LON,ALT in degrees and metres") from None
+        raise InvalidArgument(f"home = {text!r} is not LAT,LON,ALT in degrees and metres") from None
     return latitude, longitude, altitude
 
 

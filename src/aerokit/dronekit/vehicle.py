@@ -188,7 +188,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         """Send a message made by :attr:`message_factory`, by pymavlink or of ``aerokit.messages``, once.
 
         ``target_system`` becomes this vehicle's, in the message itself; ``target_component`` stays. Never blocks.
-        LocalProtocolError, a ValueError: a field is wrong; APIException: the link is down. Nothing was sent.
+        InvalidArgument, a ValueError: a field is wrong; APIException: the link is down. Nothing was sent.
         """
         from aerokit.mavlink.from_pymavlink import from_pymavlink
 

@@ -7,7 +7,7 @@ from operator import attrgetter
 from typing import Any
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError, OperationTimeout
+from aerokit.errors import InvalidArgument, OperationTimeout
 from aerokit.fleets.members import Member
 from aerokit.fleets.part import FleetPart
 from aerokit.fleets.results import FleetResult
@@ -43,7 +43,7 @@ class Actions(FleetPart):
             **options: of the method.
 
         Raises:
-            LocalProtocolError: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
         """
         if isinstance(action, str):
             for member in self:
@@ -56,7 +56,7 @@ class Actions(FleetPart):
             what = action
         else:
             if arguments or options:
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     "arguments and options go with an action by name; a function has its own"
                 )
             act, what = action, getattr(action, "__name__", "action")  # type: ignore[assignment]
@@ -98,7 +98,7 @@ class Actions(FleetPart):
             stagger_s: each begins so many seconds after the one before; None: all at once.
 
         Raises:
-            LocalProtocolError: the altitude is out of range. Nothing was sent.
+            InvalidArgument: the altitude is out of range. Nothing was sent.
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         return await self._run(
@@ -145,7 +145,7 @@ class Actions(FleetPart):
             timeout: seconds that each of them has.
 
         Raises:
-            LocalProtocolError: one of them has no such mode. Nothing was sent.
+            InvalidArgument: one of them has no such mode. Nothing was sent.
         """
         for member in self:  # before anybody has changed it
             if member.takes_orders:
@@ -216,7 +216,5 @@ def _method(member: Member, name: str) -> Callable[..., Awaitable[Any]]:
         except AttributeError:
             found = None
     if not callable(found):
-        raise LocalProtocolError(
-            f"action = {shown(name)} is not allowed: a method of Vehicle, such as 'land'"
-        )
+        raise InvalidArgument(f"action = {shown(name)} is not allowed: a method of Vehicle, such as 'land'")
     return found  # type: ignore[no-any-return]

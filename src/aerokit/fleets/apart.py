@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Literal
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.fleets.paths import Path, PathPoint, Place, horizontal_distance, least_distance
 from aerokit.snapshot import Snapshot
 
@@ -237,4 +237,4 @@ def _pairs(conflicts: Sequence[Conflict]) -> str:
 
 def _check_distance(min_distance_m: float) -> None:
     if not 0 < min_distance_m < math.inf:
-        raise LocalProtocolError(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 metres")
+        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 metres")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,12 +38,12 @@ def fragments(data: bytes, sequence: int) -> list[GpsRtcmData]:
     follows where the last is full.
 
     Raises:
-        LocalProtocolError: it is empty, or longer than the 720 bytes that fit into four.
+        InvalidArgument: it is empty, or longer than the 720 bytes that fit into four.
     """
     from aerokit.mavlink.messages import GpsRtcmData
 
     if not 0 < len(data) <= PIECE * PIECES:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"rtcm: {len(data)} bytes are not allowed: 1 to {PIECE * PIECES} in one message"
         )
     flags = (sequence & 0x1F) << 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.runtime.background import Background
 from aerokit.runtime.bus import Bus
 from aerokit.wording import shown
@@ -67,13 +67,13 @@ class Crew:
         """The names of members that one of these names or patterns (``"north/*"``) means, each once.
 
         Raises:
-            LocalProtocolError: one of them means nobody.
+            InvalidArgument: one of them means nobody.
         """
         found: dict[str, None] = {}
         for pattern in patterns:
             names = [name for name in self.members if name == pattern or fnmatchcase(name, pattern)]
             if not names:
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"{shown(pattern)} is no member of this fleet: {', '.join(self.members) or 'it is empty'}"
                 )
             found.update(dict.fromkeys(names))

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.fleets.corrections import fragments, rtcm_messages
 from aerokit.fleets.events import FleetEvent, StateTold, Told
 from aerokit.fleets.selection import Selection
@@ -39,7 +39,7 @@ class Fleet(Selection):
         Nothing is sent: the next action goes to it, too. **Ask the pilot first.**
 
         Raises:
-            LocalProtocolError: there is no such member.
+            InvalidArgument: there is no such member.
         """
         for each in self._crew.matching(name):
             self._crew.members[each].take_back()
@@ -48,7 +48,7 @@ class Fleet(Selection):
         """Order a member nothing any more, until :meth:`take_back`. Nothing is sent: it goes on with what it does.
 
         Raises:
-            LocalProtocolError: there is no such member.
+            InvalidArgument: there is no such member.
         """
         for each in self._crew.matching(name):
             self._crew.members[each].leave(why)
@@ -63,7 +63,7 @@ class Fleet(Selection):
             How many messages were sent on each link.
 
         Raises:
-            LocalProtocolError: one is longer, or there is none. Nothing was sent.
+            InvalidArgument: one is longer, or there is none. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the others before it have got them.
         """
         pieces = [
@@ -95,7 +95,7 @@ class Fleet(Selection):
             overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
 
         Raises:
-            LocalProtocolError: a type is no event.
+            InvalidArgument: a type is no event.
         """
         wanted: tuple[type[Event], ...] = types or (FleetEvent, Event)
 
@@ -126,12 +126,12 @@ class Fleet(Selection):
             overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
 
         Raises:
-            LocalProtocolError: there is no such state, or none is named.
+            InvalidArgument: there is no such state, or none is named.
         """
         for member in self:
             for name in names or ("",):
                 if name not in member.vehicle.telemetry.cells:
-                    raise LocalProtocolError(f"names: {shown(name)} is no state; docs/states.md has them")
+                    raise InvalidArgument(f"names: {shown(name)} is no state; docs/states.md has them")
 
         def attach(sink: Sink) -> list[Detach]:
             detach: list[Detach] = []

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class Offset(Snapshot):
     def _check(self) -> None:
         for name in self.__match_args__:
             if not math.isfinite(getattr(self, name)):
-                raise LocalProtocolError(f"{name} = {getattr(self, name)!r} is not a finite number")
+                raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not a finite number")
 
 
 class Formation(Snapshot):
@@ -69,13 +69,13 @@ class Formation(Snapshot):
         """Its place as metres north, east and up of the leader.
 
         Raises:
-            LocalProtocolError: the leader's heading is needed and not known.
+            InvalidArgument: the leader's heading is needed and not known.
         """
         offset = self.offsets[name]
         if self.frame == "north":
             return offset
         if heading_deg is None:
-            raise LocalProtocolError("frame = 'heading' needs the leader's heading, and it is not known")
+            raise InvalidArgument("frame = 'heading' needs the leader's heading, and it is not known")
         return offset.turned(heading_deg)
 
     def least_distance_m(self) -> float:
@@ -87,10 +87,10 @@ class Formation(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "offsets", dict(self.offsets))
         if self.frame not in ("north", "heading"):
-            raise LocalProtocolError(f"frame = {self.frame!r} is not allowed: 'north' or 'heading'")
+            raise InvalidArgument(f"frame = {self.frame!r} is not allowed: 'north' or 'heading'")
         for name, offset in self.offsets.items():
             if not isinstance(offset, Offset):
-                raise LocalProtocolError(f"offsets: {name} has {offset!r}: an Offset is needed")
+                raise InvalidArgument(f"offsets: {name} has {offset!r}: an Offset is needed")
 
 
 def follow_velocity(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError, OperationRejected
+from aerokit.errors import InvalidArgument, OperationRejected
 from aerokit.fleets.following import Following
 from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member
@@ -38,7 +38,7 @@ class Formations(Travel):
             timeout: seconds that each of them has for a leg; None: as long as it takes.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
+            InvalidArgument: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
             ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
@@ -73,7 +73,7 @@ class Formations(Travel):
             max_speed_m_s: nobody is told to fly faster, in m/s.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is out of range.
+            InvalidArgument: a name is nobody's, or an argument is out of range.
             OperationRejected: the leader does not take part.
         """
         check_range("rate_hz", rate_hz, 2, 50)
@@ -84,13 +84,13 @@ class Formations(Travel):
     def _roles(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
         for name in (leader, *formation.offsets):
             if name not in self.members:
-                raise LocalProtocolError(f"formation: {shown(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(f"formation: {shown(name)} is not one of {', '.join(self.members)}")
         if leader in formation.offsets:
-            raise LocalProtocolError(f"formation: {leader!r} is the leader, and has no place of its own")
+            raise InvalidArgument(f"formation: {leader!r} is the leader, and has no place of its own")
         least_m = self._crew.min_distance_m
         if least_m is not None and formation.least_distance_m() < least_m:
             nearest = formation.least_distance_m()
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"formation: two places are {nearest:.1f} m apart, and this fleet keeps {least_m:g} m"
             )
         member = self.members[leader]

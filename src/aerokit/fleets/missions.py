@@ -9,7 +9,7 @@ from typing import Any
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError, OperationRejected
+from aerokit.errors import InvalidArgument, OperationRejected
 from aerokit.fleets.apart import Deconfliction, conflicts_of
 from aerokit.fleets.events import PathsDecided
 from aerokit.fleets.members import Member
@@ -48,12 +48,12 @@ class Missions(FleetPart):
             timeout: seconds that each of them has; None: as long as something comes.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or a mission cannot be right. Nothing was sent.
+            InvalidArgument: a name is nobody's, or a mission cannot be right. Nothing was sent.
             OperationRejected: one of them does not take part now, or the ways come too near. Nothing was sent.
             FleetError: one of them did not take its mission: none of them will be started.
         """
         if at_once < 1:
-            raise LocalProtocolError(f"at_once = {at_once!r} is not allowed: at least 1")
+            raise InvalidArgument(f"at_once = {at_once!r} is not allowed: at least 1")
         members = self._named(missions)
         for name, mission in missions.items():
             mission.check(home_is_item_0=members[name].vehicle.autopilot.home_is_item_0)
@@ -128,12 +128,12 @@ class Missions(FleetPart):
             min_distance_m: metres that have to be between any two; None: the fleet's own.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is missing.
+            InvalidArgument: a name is nobody's, or an argument is missing.
             ValueUnknownError: it is not known where one of them is.
         """
         least_m = self._crew.min_distance_m if min_distance_m is None else min_distance_m
         if least_m is None:
-            raise LocalProtocolError("min_distance_m is needed: this fleet has none")
+            raise InvalidArgument("min_distance_m is needed: this fleet has none")
         members = self._named(missions)
         first = next(iter(members.values()), None)
         around = None if first is None else Around(position_of(first, math.inf))
@@ -151,7 +151,7 @@ class Missions(FleetPart):
         found: dict[str, Member] = {}
         for name in missions:
             if name not in self.members:
-                raise LocalProtocolError(f"missions: {shown(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(f"missions: {shown(name)} is not one of {', '.join(self.members)}")
             member = found[name] = self.members[name]
             member.look()
             if not member.takes_orders:

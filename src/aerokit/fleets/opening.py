@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.fleets.crew import Crew
 from aerokit.fleets.distances import DistanceWatch
 from aerokit.fleets.finding import find_systems
@@ -73,7 +73,7 @@ async def fleet(
         rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
 
     Raises:
-        LocalProtocolError: an argument is wrong, or two vehicles have the same name.
+        InvalidArgument: an argument is wrong, or two vehicles have the same name.
         BusyError: this program has a vehicle object of one of ``system_ids`` on that connection already.
         LinkOpenError: a link could not be opened.
         LinkLost, ConnectionClosed: a link went down while waiting.
@@ -81,17 +81,15 @@ async def fleet(
     """
     rules = Rules(on_error, on_error_of or {})
     if min_distance_m is not None and not 0 < min_distance_m < 10_000:
-        raise LocalProtocolError(
-            f"min_distance_m = {min_distance_m!r} is not allowed: above 0 to 10,000 metres"
-        )
+        raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 to 10,000 metres")
     if too_close not in ("hold", "tell"):
-        raise LocalProtocolError(f"too_close = {too_close!r} is not allowed: 'hold' or 'tell'")
+        raise InvalidArgument(f"too_close = {too_close!r} is not allowed: 'hold' or 'tell'")
     strange = [group for group in on_error_of or {} if group and group not in (groups or {})]
     if strange:
         there = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
-        raise LocalProtocolError(f"on_error_of = {shown(strange[0])} is not allowed: {there}")
+        raise InvalidArgument(f"on_error_of = {shown(strange[0])} is not allowed: {there}")
     if count is not None and count < 1:
-        raise LocalProtocolError(f"count = {count} is not allowed: 1 or more, or None")
+        raise InvalidArgument(f"count = {count} is not allowed: 1 or more, or None")
     named = _named(sources)
     async with AsyncExitStack() as stack:
         networks: dict[str, Connection] = {}
@@ -128,12 +126,12 @@ def _named(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Sour
         more = source if isinstance(source, Mapping) else {str(number): source}
         for name, each in more.items():
             if not isinstance(name, str) or not name:
-                raise LocalProtocolError(f"sources: {shown(name)} is no name")
+                raise InvalidArgument(f"sources: {shown(name)} is no name")
             if name in named:
-                raise LocalProtocolError(f"sources: two are called {name!r}")
+                raise InvalidArgument(f"sources: two are called {name!r}")
             named[name] = each
     if not named:
-        raise LocalProtocolError("sources: a fleet needs an address, a connection or a vehicle")
+        raise InvalidArgument("sources: a fleet needs an address, a connection or a vehicle")
     return named
 
 
@@ -164,11 +162,11 @@ def _ids(
         ids = {name: list(system_ids) for name in networks}
     for name, those in by_network.items():
         if name not in ids:
-            raise LocalProtocolError(f"system_ids: {shown(name)} is no network: {', '.join(networks)}")
+            raise InvalidArgument(f"system_ids: {shown(name)} is no network: {', '.join(networks)}")
         ids[name] = list(those)
     for each in (number for those in ids.values() for number in those or ()):
         if not isinstance(each, int) or not 1 <= each <= 255:
-            raise LocalProtocolError(f"system_ids: {shown(each)} is not allowed: 1 to 255")
+            raise InvalidArgument(f"system_ids: {shown(each)} is not allowed: 1 to 255")
     return ids
 
 
@@ -177,10 +175,10 @@ def _check_names(members: list[Member]) -> None:
     for each in members:
         other = seen.setdefault(each.name, each)
         if other is not each:
-            raise LocalProtocolError(f"two vehicles are called {each.name!r}: give them names of their own")
+            raise InvalidArgument(f"two vehicles are called {each.name!r}: give them names of their own")
         twice = next((one.name for one in members if one is not each and one.vehicle is each.vehicle), None)
         if twice is not None:
-            raise LocalProtocolError(f"{each.name!r} and {twice!r} are the same vehicle")
+            raise InvalidArgument(f"{each.name!r} and {twice!r} are the same vehicle")
 
 
 def _sort(crew: Crew, sorts: Mapping[str, Iterable[str]], what: str) -> None:
@@ -189,7 +187,7 @@ def _sort(crew: Crew, sorts: Mapping[str, Iterable[str]], what: str) -> None:
         for each in crew.matching(*those):
             before = getattr(crew.members[each], what)
             if before:
-                raise LocalProtocolError(f"{each} is in two {what}s: {before!r} and {name!r}")
+                raise InvalidArgument(f"{each} is in two {what}s: {before!r} and {name!r}")
             setattr(crew.members[each], what, name)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class PathPoint(Snapshot):
 
     def _check(self) -> None:
         if not all(math.isfinite(each) for each in (self.t_s, *self.place)):
-            raise LocalProtocolError(f"{self!r} is not allowed: finite numbers")
+            raise InvalidArgument(f"{self!r} is not allowed: finite numbers")
 
 
 class Path(Snapshot):
@@ -52,10 +52,10 @@ class Path(Snapshot):
         """A straight leg at one speed that begins at ``at_s``.
 
         Raises:
-            LocalProtocolError: the speed is not above 0.
+            InvalidArgument: the speed is not above 0.
         """
         if not speed_m_s > 0:
-            raise LocalProtocolError(f"speed_m_s = {speed_m_s!r} is not allowed: above 0")
+            raise InvalidArgument(f"speed_m_s = {speed_m_s!r} is not allowed: above 0")
         duration_s = math.dist(start, end) / speed_m_s
         return cls(name, (PathPoint(at_s, *start), PathPoint(at_s + duration_s, *end)))
 
@@ -82,12 +82,10 @@ class Path(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
         if not self.points:
-            raise LocalProtocolError(f"points: the path of {self.name} has no points")
+            raise InvalidArgument(f"points: the path of {self.name} has no points")
         for one, other in pairwise(self.points):
             if other.t_s < one.t_s:
-                raise LocalProtocolError(
-                    f"points: the path of {self.name} goes back in time at {other.t_s:g} s"
-                )
+                raise InvalidArgument(f"points: the path of {self.name} goes back in time at {other.t_s:g} s")
 
 
 class Approach(Snapshot):

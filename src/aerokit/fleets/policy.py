@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Literal, get_args
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 from aerokit.wording import shown
 
@@ -49,7 +49,7 @@ class Rules:
             *((f"on_error of {group}", of_groups[group]) for group in of_groups),
         ):
             if not callable(each) and each not in get_args(PolicyName):
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"{name} = {shown(each)} is not allowed: one of {', '.join(get_args(PolicyName))}, or a function"
                 )
         self._policy, self._of_groups = policy, dict(of_groups)
@@ -58,7 +58,7 @@ class Rules:
         """What each of the others is told; who is not in it goes on.
 
         Raises:
-            LocalProtocolError: the program's function gave something else, or a member that is not one of the others.
+            InvalidArgument: the program's function gave something else, or a member that is not one of the others.
         """
         policy = self._of_groups.get(failure.group, self._policy)
         decided = policy(failure) if callable(policy) else policy
@@ -76,8 +76,8 @@ class Rules:
         raise self._nonsense(decided)
 
     @staticmethod
-    def _nonsense(decided: object) -> LocalProtocolError:
-        return LocalProtocolError(
+    def _nonsense(decided: object) -> InvalidArgument:
+        return InvalidArgument(
             f"the policy decided {shown(decided)}: allowed are {', '.join(get_args(PolicyName))}, or for some of the"
             f" others one of {', '.join(get_args(PolicyOrder))} each"
         )

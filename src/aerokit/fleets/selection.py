@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.fleets.actions import Actions
 from aerokit.fleets.formations import Formations
 from aerokit.fleets.missions import Missions
@@ -30,7 +30,7 @@ class Selection(Actions, Missions, Formations, Shows):
         """Those of one group.
 
         Raises:
-            LocalProtocolError: there is no such group.
+            InvalidArgument: there is no such group.
         """
         return self._those("group", name)
 
@@ -38,7 +38,7 @@ class Selection(Actions, Missions, Formations, Shows):
         """Those with one role.
 
         Raises:
-            LocalProtocolError: nobody has it.
+            InvalidArgument: nobody has it.
         """
         return self._those("role", name)
 
@@ -47,7 +47,7 @@ class Selection(Actions, Missions, Formations, Shows):
         if not found:
             there = dict.fromkeys(getattr(each, what) for each in self if getattr(each, what))
             those = f"the {what}s are {', '.join(there)}" if there else f"there are no {what}s"
-            raise LocalProtocolError(f"{what} = {shown(name)} is not allowed: {those}")
+            raise InvalidArgument(f"{what} = {shown(name)} is not allowed: {those}")
         return Selection(self._crew, found)
 
     def __repr__(self) -> str:

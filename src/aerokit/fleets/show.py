@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.fleets.apart import Conflict, conflicts_of
 from aerokit.fleets.paths import Path, PathPoint, Place
 from aerokit.snapshot import Snapshot
@@ -62,13 +62,11 @@ class Show(Snapshot):
         """The same show by other members: name in the show → member's name.
 
         Raises:
-            LocalProtocolError: a name is missing, or two become one.
+            InvalidArgument: a name is missing, or two become one.
         """
         missing = [name for name in self.tracks if name not in names]
         if missing or len(set(names.values())) < len(self.tracks):
-            raise LocalProtocolError(
-                f"names: {missing or 'two names for one member'}: each track needs its own"
-            )
+            raise InvalidArgument(f"names: {missing or 'two names for one member'}: each track needs its own")
         return type(self)(
             {names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()}
         )
@@ -78,14 +76,14 @@ class Show(Snapshot):
         """Of ``(t_s, north_m, east_m, up_m)`` for each name.
 
         Raises:
-            LocalProtocolError: a point is no four numbers, or times go back.
+            InvalidArgument: a point is no four numbers, or times go back.
         """
         made: dict[str, Path] = {}
         for name, points in tracks.items():
             try:
                 made[name] = Path(name, [PathPoint(*map(float, each)) for each in points])
             except (TypeError, ValueError) as error:
-                raise LocalProtocolError(f"track {name!r}: {error}") from None
+                raise InvalidArgument(f"track {name!r}: {error}") from None
         return cls(made)
 
     @classmethod
@@ -99,7 +97,7 @@ class Show(Snapshot):
         text = read_bounded(path).decode("utf-8-sig", errors="replace")
         try:
             return cls.from_json(text) if text.lstrip().startswith("{") else cls.from_csv(text)
-        except LocalProtocolError as error:
+        except InvalidArgument as error:
             raise FileFormatError(f"{path}: {error}") from None
 
     @classmethod
@@ -107,11 +105,11 @@ class Show(Snapshot):
         """See the module.
 
         Raises:
-            LocalProtocolError: it is not like that; the text names the line.
+            InvalidArgument: it is not like that; the text names the line.
         """
         rows = csv.reader(io.StringIO(text))
         if [each.strip() for each in next(rows, [])] != COLUMNS:
-            raise LocalProtocolError(f"line 1 is not {','.join(COLUMNS)}")
+            raise InvalidArgument(f"line 1 is not {','.join(COLUMNS)}")
         points: dict[str, list[PathPoint]] = {}
         for row in rows:
             if not row:
@@ -121,7 +119,7 @@ class Show(Snapshot):
                 t_s, north_m, east_m, up_m = map(float, numbers)
                 points.setdefault(name, []).append(PathPoint(t_s, north_m, east_m, up_m))
             except ValueError as error:
-                raise LocalProtocolError(f"line {rows.line_num}: {error}") from None
+                raise InvalidArgument(f"line {rows.line_num}: {error}") from None
         return cls({name: Path(name, each) for name, each in points.items()})
 
     @classmethod
@@ -129,15 +127,15 @@ class Show(Snapshot):
         """See the module.
 
         Raises:
-            LocalProtocolError: it is not like that; the text names the track.
+            InvalidArgument: it is not like that; the text names the track.
         """
         try:
             found = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise LocalProtocolError(f"not JSON: {error}") from None
+            raise InvalidArgument(f"not JSON: {error}") from None
         tracks = found.get("tracks") if isinstance(found, dict) else None
         if not isinstance(tracks, dict) or (found.get("format"), found.get("version")) != (FORMAT, VERSION):
-            raise LocalProtocolError(f"not {FORMAT!r} of version {VERSION}")
+            raise InvalidArgument(f"not {FORMAT!r} of version {VERSION}")
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:
@@ -163,13 +161,13 @@ class Show(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "tracks", dict(self.tracks))
         if not self.tracks:
-            raise LocalProtocolError("tracks: a show needs one")
+            raise InvalidArgument("tracks: a show needs one")
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
-                raise LocalProtocolError(f"tracks: {name!r} needs a Path that begins at 0 s or later")
+                raise InvalidArgument(f"tracks: {name!r} needs a Path that begins at 0 s or later")
             for one, other in pairwise(track.points):
                 if not _speed(one, other) < math.inf:
-                    raise LocalProtocolError(f"tracks: {name!r} is at two places at {other.t_s:g} s")
+                    raise InvalidArgument(f"tracks: {name!r} is at two places at {other.t_s:g} s")
 
 
 def state_at(path: Path, at_s: float) -> tuple[Place, Place]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError, OperationRejected
+from aerokit.errors import InvalidArgument, OperationRejected
 from aerokit.fleets.clocks import ClockOffset, measure_clock
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.members import Member
@@ -48,7 +48,7 @@ class Shows(Travel):
             origin: where its metres count from; without an altitude above the sea it is at the home of the first.
 
         Raises:
-            LocalProtocolError: a track is nobody's.
+            InvalidArgument: a track is nobody's.
             ValueUnknownError: it is not known where the first of them is.
         """
         around, base_m = self._stage(show, origin)
@@ -82,7 +82,7 @@ class Shows(Travel):
             speed_m_s: ground speed on the way to the first points; None leaves it.
 
         Raises:
-            LocalProtocolError: a track is nobody's, or an argument is out of range. Nothing was sent.
+            InvalidArgument: a track is nobody's, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come nearer to each other than this fleet allows, or one of its members does not
                 take part. Nothing was sent.
             FleetError: one of them did not answer TIMESYNC or did not get to its first point. The show was not begun.
@@ -124,7 +124,7 @@ class Shows(Travel):
         """Metres around the origin, and its height above the sea."""
         for name in show.tracks:
             if name not in self.members:
-                raise LocalProtocolError(f"show: {shown(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(f"show: {shown(name)} is not one of {', '.join(self.members)}")
         first = self.members[next(iter(show.tracks))]
         if origin.altitude_amsl_m is not None:
             return Around(origin), origin.altitude_amsl_m

@@ -9,7 +9,7 @@ from typing import Literal
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError, OperationRejected, ValueUnknownError
+from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
 from aerokit.fleets.apart import Deconfliction, Route, in_corridors, in_layers
 from aerokit.fleets.events import PathsDecided
 from aerokit.fleets.members import Member
@@ -54,7 +54,7 @@ class Travel(FleetPart):
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or a place is too far away. Nothing was sent.
+            InvalidArgument: a name is nobody's, or a place is too far away. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
@@ -93,16 +93,16 @@ class Travel(FleetPart):
             slack_s: for corridors: by how many seconds one may be early or late compared with another.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is missing.
+            InvalidArgument: a name is nobody's, or an argument is missing.
             ValueUnknownError: it is not known where one of them is.
         """
         least_m = self._crew.min_distance_m if min_distance_m is None else min_distance_m
         if least_m is None:
-            raise LocalProtocolError("min_distance_m is needed: this fleet has none")
+            raise InvalidArgument("min_distance_m is needed: this fleet has none")
         routes, standing = self._routes(self._places(targets))
         if by == "corridors":
             if speed_m_s is None:
-                raise LocalProtocolError("by = 'corridors' needs speed_m_s: times come of ways and speeds")
+                raise InvalidArgument("by = 'corridors' needs speed_m_s: times come of ways and speeds")
             decided = in_corridors(routes, standing, least_m, speed_m_s, slack_s=slack_s)
         else:
             decided = in_layers(
@@ -150,7 +150,7 @@ class Travel(FleetPart):
             return {each.name: _target_of(targets, each) for each in self if each.takes_orders}
         for name in targets:
             if name not in self.members:
-                raise LocalProtocolError(f"targets: {shown(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(f"targets: {shown(name)} is not one of {', '.join(self.members)}")
         return dict(targets)
 
     def _routes(

@@ -12,7 +12,7 @@ import anyio
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.foxglove import topics
 from aerokit.foxglove.topics import Topic
 from aerokit.links.sockets import is_free
@@ -82,15 +82,15 @@ async def foxglove_bridge(
         on_found: called with each new vehicle, in the loop.
 
     Raises:
-        LocalProtocolError: an argument is wrong, or no message has such a name.
+        InvalidArgument: an argument is wrong, or no message has such a name.
         LinkOpenError: the port cannot be listened on.
         ConnectionClosed, LinkLost: the connection has ended.
         ModuleNotFoundError: foxglove-sdk is not installed.
     """
     if not 0 < rate_hz <= HIGHEST_RATE_HZ:
-        raise LocalProtocolError(f"rate_hz = {rate_hz} is not allowed: above 0, at most {HIGHEST_RATE_HZ:g}")
+        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {HIGHEST_RATE_HZ:g}")
     if not 0 <= port <= 65535:
-        raise LocalProtocolError(f"port = {port} is not allowed: 0 to 65535")
+        raise InvalidArgument(f"port = {port} is not allowed: 0 to 65535")
     kinds = _message_types(connection, messages)
     shown = _Shown(connection)
     server = _serve(shown, host, port)
@@ -114,7 +114,7 @@ def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type
     for pattern in patterns:
         matching = [each for each in connection.bus.dialect if fnmatchcase(each.NAME, pattern.upper())]
         if not matching:
-            raise LocalProtocolError(f"no message of this connection's dialect is called {pattern!r}")
+            raise InvalidArgument(f"no message of this connection's dialect is called {pattern!r}")
         found.update({each.ID: each for each in matching})
     return list(found.values())
 

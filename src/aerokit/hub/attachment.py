@@ -276,7 +276,7 @@ def _named(peer: Peer) -> str:
 
 
 def check_filters(endpoint: Endpoint, dialect: Dialect) -> Filters:
-    """What may go out there; LocalProtocolError when a name fits no message of the dialect."""
+    """What may go out there; InvalidArgument when a name fits no message of the dialect."""
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.wording import did_you_mean
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class Filters:
     `ANSWERS` only their own names do.
 
     Raises:
-        LocalProtocolError: a pattern fits no message of the dialect, or a rate is not in 0…1000.
+        InvalidArgument: a pattern fits no message of the dialect, or a rate is not in 0…1000.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Filters:
                 self._check(field, pattern)
         for pattern, hz in self._rates.items():
             if not 0 < hz <= MOST_HZ:
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"rates: {pattern} = {hz:g} Hz is not allowed: above 0, at most {MOST_HZ:g}"
                 )
 
@@ -79,7 +79,7 @@ class Filters:
     def _check(self, field: str, pattern: str) -> None:
         names = [each.NAME for each in self._dialect]
         if not any(fnmatchcase(name, pattern) for name in names):
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{field} = {pattern!r} fits no message of the dialect {self._dialect.name!r}"
                 f"{did_you_mean(pattern, names)}"
             )

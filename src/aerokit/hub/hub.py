@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import BusyError, ConnectionClosed, LinkError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkError
 from aerokit.hub.attachment import Attachment, check_filters
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.switch import Switch
@@ -67,17 +67,17 @@ class Hub:
             dialect: the messages that are understood; others are passed on to everybody, unchecked.
 
         Raises:
-            LocalProtocolError: an address or a name of a message is wrong, or two endpoints have one name.
+            InvalidArgument: an address or a name of a message is wrong, or two endpoints have one name.
         """
         if isinstance(endpoints, str):
-            raise LocalProtocolError(f"endpoints = {endpoints!r} is not allowed: a list of addresses")
+            raise InvalidArgument(f"endpoints = {endpoints!r} is not allowed: a list of addresses")
         self._given = [_endpoint(each) for each in endpoints]
         for each in self._given:
             check_filters(each, dialect)
         names = [each.name for each in self._given if each.name]
         for name in names:
             if names.count(name) > 1:
-                raise LocalProtocolError(f"two endpoints are called {name!r}")
+                raise InvalidArgument(f"two endpoints are called {name!r}")
         self._dialect = dialect
         self._attachments: dict[str, Attachment] = {}
         self._listeners: list[Callable[[HubEvent], object]] = []
@@ -90,7 +90,7 @@ class Hub:
 
         Raises:
             LinkOpenError: one of them, which is not ``patient``, could not be opened; none is open then.
-            LocalProtocolError: two endpoints have one address and no names.
+            InvalidArgument: two endpoints have one address and no names.
             BusyError: the hub was entered before.
         """
         if self._switch is not None:
@@ -123,7 +123,7 @@ class Hub:
 
         Raises:
             LinkOpenError: it could not be opened, and is not ``patient``.
-            LocalProtocolError: the address, the name or a name of a message is wrong; nothing was opened.
+            InvalidArgument: the address, the name or a name of a message is wrong; nothing was opened.
             BusyError: the link given is in use.
             ConnectionClosed: the hub, or the link given, is closed.
         """
@@ -134,15 +134,13 @@ class Hub:
         """Close an endpoint and forget who was behind it.
 
         Raises:
-            LocalProtocolError: there is none of this name.
+            InvalidArgument: there is none of this name.
             ConnectionClosed: the hub is closed.
         """
         self._raise_unless_open()
         attachment = self._attachments.pop(name, None)
         if attachment is None:
-            raise LocalProtocolError(
-                f"name = {name!r} is not allowed: {', '.join(self._attachments) or 'none'}"
-            )
+            raise InvalidArgument(f"name = {name!r} is not allowed: {', '.join(self._attachments) or 'none'}")
         attachment.close()
         self._tell(attachment, "removed", f"{name} was removed")
         await _closed([attachment])
@@ -155,7 +153,7 @@ class Hub:
         other ids than the program (``source_system``, ``source_component``): what is for these ids is the program's.
 
         Raises:
-            LocalProtocolError: there is an endpoint of this name.
+            InvalidArgument: there is an endpoint of this name.
             ConnectionClosed, LinkLost: the hub is closed, or the connection has ended.
         """
         self._raise_unless_open()
@@ -199,7 +197,7 @@ class Hub:
         clock = asyncio.get_running_loop().time
         attachment = Attachment(endpoint, self._switch, self._dialect, clock, self._tell)
         if attachment.name in self._attachments:
-            raise LocalProtocolError(f"two endpoints are called {attachment.name!r}: give them names")
+            raise InvalidArgument(f"two endpoints are called {attachment.name!r}: give them names")
         self._attachments[attachment.name] = attachment
         try:
             await attachment.open()

@@ -30,7 +30,7 @@ async def shared(connection: Connection, endpoints: Iterable[str | Endpoint | Li
         endpoints: where the others are, or come: ``["tcpin:127.0.0.1:5760"]``.
 
     Raises:
-        LocalProtocolError: an address is wrong, or two endpoints have one name.
+        InvalidArgument: an address is wrong, or two endpoints have one name.
         LinkOpenError: an endpoint could not be opened.
         ConnectionClosed, LinkLost: the connection has ended.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Literal
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links.address import parse_address
 from aerokit.links.link import Link
 from aerokit.snapshot import Snapshot
@@ -22,7 +22,7 @@ class Endpoint(Snapshot):
     """One link of a hub, and what may pass.
 
     Raises:
-        LocalProtocolError: a field is wrong. Names of messages are checked when the hub takes it.
+        InvalidArgument: a field is wrong. Names of messages are checked when the hub takes it.
     """
 
     address: str | Link
@@ -53,11 +53,9 @@ class Endpoint(Snapshot):
         if isinstance(self.address, str):
             parse_address(self.address)
         elif self.peers is not None:
-            raise LocalProtocolError("peers = … is not allowed with a link: give them to the link")
+            raise InvalidArgument("peers = … is not allowed with a link: give them to the link")
         elif self.patient:
-            raise LocalProtocolError(
-                "patient = True is not allowed with a link, which can be opened once only"
-            )
+            raise InvalidArgument("patient = True is not allowed with a link, which can be opened once only")
         for field in ("only", "block"):
             patterns = getattr(self, field)
             if isinstance(patterns, str) or not _are_texts(patterns):
@@ -77,8 +75,8 @@ def _are_texts(values: object) -> bool:
     return isinstance(values, Iterable) and all(isinstance(each, str) for each in values)
 
 
-def _not_allowed(field: str, value: object, allowed: str) -> LocalProtocolError:
-    return LocalProtocolError(f"{field} = {shown(value)} is not allowed: {allowed}")
+def _not_allowed(field: str, value: object, allowed: str) -> InvalidArgument:
+    return InvalidArgument(f"{field} = {shown(value)} is not allowed: {allowed}")
 
 
 class EndpointStatistics(Snapshot):

@@ -6,7 +6,7 @@ import math
 import re
 from typing import Literal, NoReturn
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 from aerokit.wording import did_you_mean
 
@@ -82,7 +82,7 @@ def parse_address(text: str) -> LinkAddress:
     """Reads a connection string.
 
     A bare ``host:port`` and ``udp:`` listen, as with DroneKit and pymavlink. In the forms with a scheme,
-    ``%20`` and its like in devices and paths are decoded, as in any URL. Raises LocalProtocolError that says
+    ``%20`` and its like in devices and paths are decoded, as in any URL. Raises InvalidArgument that says
     what is wrong and lists the accepted forms.
     """
     return _Parser(text).parse()
@@ -242,7 +242,7 @@ class _Parser:
             check_name("the fleet", fleet)
             check_name("the name", name)
             check_name("client", options.get("client", "c"))
-        except LocalProtocolError as error:
+        except InvalidArgument as error:
             self.fail(str(error))
         return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
 
@@ -335,7 +335,7 @@ class _Parser:
 
     def fail(self, reason: str) -> NoReturn:
         shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # a broker's, with a password
-        raise LocalProtocolError(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
+        raise InvalidArgument(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
 
 
 def _is_ipv6(text: str) -> bool:

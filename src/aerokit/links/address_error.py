@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from serial import SerialException
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 __all__ = ["AddressError"]
 
 
-class AddressError(SerialException, LocalProtocolError):  # type: ignore[misc]  # pyserial has no types
+class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
     """It names no link. pymavlink takes it for a serial port, so it is an OSError; and it is a ValueError."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterable
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.wording import shown
 
 __all__ = ["AllowedPeers", "Network", "Peers"]
@@ -24,14 +24,12 @@ _KINDS = (
 
 
 class AllowedPeers:
-    """Who may be heard; None: everybody. LocalProtocolError for what is no address or network, and for none at all."""
+    """Who may be heard; None: everybody. InvalidArgument for what is no address or network, and for none at all."""
 
     def __init__(self, peers: Peers | None) -> None:
         self._networks = None if peers is None else tuple(map(_network, _several(peers)))
         if self._networks == ():
-            raise LocalProtocolError(
-                "peers is empty: name at least one IP address or network, or leave it out"
-            )
+            raise InvalidArgument("peers is empty: name at least one IP address or network, or leave it out")
 
     def allows(self, host: str) -> bool:
         """Whether this IP address is among them."""
@@ -58,6 +56,6 @@ def _network(item: object) -> Network:
             return ipaddress.ip_network(item)
         except ValueError as refused:
             error = refused
-    raise LocalProtocolError(
+    raise InvalidArgument(
         f"peers: {shown(item)} is no IP address or network, such as '10.0.0.7' or '10.0.0.0/24' ({error})"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 from .address import LinkAddress, parse_address
 
@@ -20,12 +20,12 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers |
     """The link that a connection string describes; nothing is opened yet.
 
     ``baud`` is for serial ports whose string does not say one. ``peers`` are the IP addresses and networks that are
-    listened to, where anybody could send or connect: udpin, udpbcast, tcpin. Raises LocalProtocolError for a wrong
+    listened to, where anybody could send or connect: udpin, udpbcast, tcpin. Raises InvalidArgument for a wrong
     address, with the reason and the accepted forms, and for wrong ``peers``.
     """
     where = address if isinstance(address, LinkAddress) else parse_address(address)
     if peers is not None and where.kind not in ("udpin", "udpbcast", "tcpin"):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"peers = … is not allowed with {where}: nobody else can send there (allowed: udpin, udpbcast, tcpin)"
         )
     if where.kind == "serial":

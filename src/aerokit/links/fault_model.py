@@ -6,7 +6,7 @@ import math
 import random
 from collections.abc import Sequence
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 from aerokit.snapshot import Snapshot
 
@@ -20,7 +20,7 @@ class FaultModel(Snapshot):
     """One direction of a radio link. Without arguments it changes nothing.
 
     Shares are probabilities from 0 to 1 for each frame, independent of each other and of what came before.
-    Raises LocalProtocolError for a field that makes no sense.
+    Raises InvalidArgument for a field that makes no sense.
     """
 
     loss: float = 0.0
@@ -53,10 +53,10 @@ class FaultModel(Snapshot):
             _check_number(name, getattr(self, name), 0.0, 3600.0)
         for name in ("bandwidth", "queue_bytes"):
             if not getattr(self, name) > 0:
-                raise LocalProtocolError(f"{name} = {getattr(self, name)!r} is not allowed: above 0")
+                raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: above 0")
         for begin, end in self.outages:
             if not begin <= end:
-                raise LocalProtocolError(f"outages: ({begin!r}, {end!r}) is not allowed: begin before end")
+                raise InvalidArgument(f"outages: ({begin!r}, {end!r}) is not allowed: begin before end")
 
 
 class Air:
@@ -183,4 +183,4 @@ def _end_of_frame(data: bytes, begin: int) -> int | None:
 
 def _check_number(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
-        raise LocalProtocolError(f"{name} = {value!r} is not allowed: {low:g} to {high:g}")
+        raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}")

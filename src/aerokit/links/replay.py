@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Generator, Iterator
 
-from aerokit.errors import LocalProtocolError, RecordingEnded
+from aerokit.errors import InvalidArgument, RecordingEnded
 from aerokit.mavlink.tlog import read_tlog
 
 from .address import LinkAddress
@@ -36,7 +36,7 @@ class Replay(BaseLink):
     def __init__(self, path: str | os.PathLike[str], speed: float | None = 1.0) -> None:
         factor = math.inf if speed is None else float(speed)
         if not factor > 0:
-            raise LocalProtocolError(f"the speed of a replay must be above 0, not {speed!r}")
+            raise InvalidArgument(f"the speed of a replay must be above 0, not {speed!r}")
         options = () if factor == 1.0 else (("speed", repr(factor).removesuffix(".0")),)
         super().__init__(str(LinkAddress("replay", path=os.fspath(path), options=options)))
         self.ignored_writes = 0

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from aerokit.errors import BusyError, ConnectionClosed, LinkLost, LinkOpenError, LocalProtocolError
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
 
 from .delays import Delays
 from .link import HelmListener, Link, Peer, Receiver, keeps_peers
@@ -63,10 +63,10 @@ class SeveralLinks(Link):
         self, make_links: Sequence[Callable[[], Link]], *, costly: Collection[int] = (), stays: bool = False
     ) -> None:
         if not make_links:
-            raise LocalProtocolError("several links: none was given")
+            raise InvalidArgument("several links: none was given")
         wrong = [index for index in costly if not 0 <= index < len(make_links)]
         if wrong:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"costly = {wrong} is not allowed: there are links 0 to {len(make_links) - 1}"
             )
         self.costly: frozenset[int] = frozenset(costly)

@@ -154,7 +154,7 @@ class TcpListen(_TcpLink):
     """``tcpin:`` serves clients; each is a peer, and losing one, or all of them, does not lose the link.
 
     Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
-    IP addresses and networks that may connect (None: all); LocalProtocolError for what is none.
+    IP addresses and networks that may connect (None: all); InvalidArgument for what is none.
     """
 
     def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:

@@ -159,7 +159,7 @@ class UdpListen(_UdpLink):
     """``udpin:`` binds a port and talks to everybody who was heard on it; each of them is a peer.
 
     Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
-    IP addresses and networks that are listened to (None: all); LocalProtocolError for what is none.
+    IP addresses and networks that are listened to (None: all); InvalidArgument for what is none.
     """
 
     def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import anyio
 
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 
 from .freshness import Ears
 from .handover import Handover
@@ -49,7 +49,7 @@ class ZenohConnect(NetworkLink):
         open_timeout_s: seconds that opening waits for the vehicle side, above 0.
 
     Raises:
-        LocalProtocolError: an argument is wrong.
+        InvalidArgument: an argument is wrong.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class ZenohConnect(NetworkLink):
     ) -> None:
         super().__init__(f"zenoh://{check_name('fleet', fleet)}/{check_name('name', name)}")
         if wish not in WISHES:
-            raise LocalProtocolError(f"helm = {wish!r} is not allowed: {', '.join(WISHES)}")
+            raise InvalidArgument(f"helm = {wish!r} is not allowed: {', '.join(WISHES)}")
         self.client: str = check_name("client", client or _own_name())
         """Who we are, to the others: the name that has the helm."""
         self._place = Place(fleet, name)

@@ -20,7 +20,7 @@ import json
 import re
 import struct
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 
 __all__ = ["VERSION", "Beacon", "Place", "Stamp", "Told", "Wish", "check_name", "read_sent_at", "sent_at"]
@@ -46,14 +46,12 @@ def check_name(what: str, name: str) -> str:
     A client must not be called "all".
 
     Raises:
-        LocalProtocolError: it may not.
+        InvalidArgument: it may not.
     """
     if what == "client" and name == _EVERYBODY:
-        raise LocalProtocolError(
-            f"client = {name!r} is not allowed: it is the key of what is for all of them"
-        )
+        raise InvalidArgument(f"client = {name!r} is not allowed: it is the key of what is for all of them")
     if not _NAME.fullmatch(name):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"{what} = {name!r} is not allowed: up to 63 letters, digits, '_', '.' and '-', a letter or digit first"
         )
     return name

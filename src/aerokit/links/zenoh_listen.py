@@ -12,7 +12,7 @@ from typing import Any
 
 import anyio
 
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 
 from .freshness import BEACON_EVERY_S, Judge
 from .handover import Handover
@@ -47,7 +47,7 @@ class ZenohListen(NetworkLink):
         options: how this program is connected to the network.
 
     Raises:
-        LocalProtocolError: an argument is wrong.
+        InvalidArgument: an argument is wrong.
     """
 
     def __init__(self, fleet: str, name: str, *, options: NetworkOptions | None = None) -> None:
@@ -184,7 +184,7 @@ class ZenohListen(NetworkLink):
         if gate is None and len(self._clients) >= MAX_CLIENTS:
             self._forget_one_that_is_silent()
         if gate is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(LocalProtocolError):  # not a name: somebody else's key
+            with contextlib.suppress(InvalidArgument):  # not a name: somebody else's key
                 gate = self._clients[client] = Gate(check_name("client", client), self._helm)
                 gate.heard_at = self._now()
         return gate

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from aerokit.errors import LinkOpenError, LocalProtocolError
+from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.snapshot import Snapshot
 
 from .base import BaseLink
@@ -98,7 +98,7 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
 
     Raises:
         LinkOpenError: zenoh is not installed, or could not open it.
-        LocalProtocolError: the configuration is wrong.
+        InvalidArgument: the configuration is wrong.
     """
     zenoh = zenoh_module(address)
     config = _config(zenoh, address, options)
@@ -149,12 +149,12 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
-        raise LocalProtocolError(f"{address}: config={options.config}: {_reason(error)}") from error
+        raise InvalidArgument(f"{address}: config={options.config}: {_reason(error)}") from error
     try:
         for key, value in _settings(options):
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise LocalProtocolError(f"{address}: {_reason(error)}") from error
+        raise InvalidArgument(f"{address}: {_reason(error)}") from error
     for key, value in (_NO_WAITING, *(_SETTINGS if not options.config else ())):
         with contextlib.suppress(zenoh.ZError):  # another version's
             config.insert_json5(key, json.dumps(value))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
 from aerokit.whole_file import read_bounded
@@ -186,7 +186,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
     """Read a file and everything it includes, the included first.
 
     Includes are looked for beside the file, then in the folders of ``search``.
-    Raises LocalProtocolError when a file is missing, has more than 16 MB or is no MAVLink XML.
+    Raises InvalidArgument when a file is missing, has more than 16 MB or is no MAVLink XML.
     """
     found: dict[str, DialectDefinition] = {}
     pending: set[str] = set()
@@ -205,7 +205,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 
 def read_xml(path: Path) -> DialectDefinition:
-    """Read one file, without what it includes; LocalProtocolError when it is no MAVLink XML."""
+    """Read one file, without what it includes; InvalidArgument when it is no MAVLink XML."""
     from xml.etree.ElementTree import (
         ParseError,  # not for those who have definitions of pymavlink's classes only
     )
@@ -221,11 +221,11 @@ def read_xml(path: Path) -> DialectDefinition:
             includes=tuple((node.text or "").strip() for node in root.findall("include")),
         )
     except FileNotFoundError:
-        raise LocalProtocolError(f"no dialect file {path}") from None
-    except LocalProtocolError:
+        raise InvalidArgument(f"no dialect file {path}") from None
+    except InvalidArgument:
         raise
     except (ParseError, LookupError, ValueError) as error:
-        raise LocalProtocolError(f"{path} is not a MAVLink dialect: {error!r}") from error
+        raise InvalidArgument(f"{path} is not a MAVLink dialect: {error!r}") from error
 
 
 def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
@@ -252,7 +252,7 @@ def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
         if os.path.isfile(folder / include):  # whatever the name is: Path.is_file raises for a long one
             return folder / include
     looked = ", ".join(str(folder) for folder in folders)
-    raise LocalProtocolError(f"{file.name} includes {include}, which is in none of: {looked}")
+    raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {looked}")
 
 
 def _message(node: Element, origin: str) -> MessageDefinition:

@@ -12,7 +12,7 @@ from enum import IntFlag
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import enums, messages
 from aerokit.mavlink.enumeration import make_enum
 
@@ -56,7 +56,7 @@ class Dialect:
     def from_xml(cls, path: str | Path) -> Dialect:
         """Read an XML file and all it includes, beside it or in pymavlink's package.
 
-        Raises LocalProtocolError when a file is missing or wrong, or an id is defined twice.
+        Raises InvalidArgument when a file is missing or wrong, or an id is defined twice.
         """
         from aerokit.mavlink.runtime_dialect import dialect_from_xml
 
@@ -66,7 +66,7 @@ class Dialect:
     def from_pymavlink(cls, module: str | ModuleType) -> Dialect:
         """Take over a pymavlink dialect: the module, its dotted name, or the last part of it (``"storm32"``).
 
-        Raises LocalProtocolError when there is no such module or it is no dialect.
+        Raises InvalidArgument when there is no such module or it is no dialect.
         """
         from aerokit.mavlink.runtime_dialect import dialect_from_pymavlink
 
@@ -81,17 +81,17 @@ class Dialect:
         return self[message_id] if message_id in self.rows else None
 
     def by_name(self, name: str) -> type[Message]:
-        """The class of the standard's name, ``"GLOBAL_POSITION_INT"``; LocalProtocolError when there is none."""
+        """The class of the standard's name, ``"GLOBAL_POSITION_INT"``; InvalidArgument when there is none."""
         for message_class in self:
             if name == message_class.NAME:
                 return message_class
-        raise LocalProtocolError(f"dialect {self.name!r} has no message {name!r}")
+        raise InvalidArgument(f"dialect {self.name!r} has no message {name!r}")
 
     def enum(self, name: str) -> type[Any]:
-        """The enum of the standard's name, ``"MAV_CMD"``; LocalProtocolError when there is none."""
+        """The enum of the standard's name, ``"MAV_CMD"``; InvalidArgument when there is none."""
         if name in self._enums:
             return self._enums[name]
-        raise LocalProtocolError(f"dialect {self.name!r} has no enum {name!r}")
+        raise InvalidArgument(f"dialect {self.name!r} has no enum {name!r}")
 
     def __contains__(self, message_id: object) -> bool:
         return message_id in self.rows
@@ -115,10 +115,10 @@ class Dialect:
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
-        """Both together. LocalProtocolError when an id means one message here and another there."""
+        """Both together. InvalidArgument when an id means one message here and another there."""
         for message_id in self.rows.keys() & other.rows.keys():
             if self.rows[message_id] != other.rows[message_id]:
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"message id {message_id} is {self[message_id].NAME} (CRC_EXTRA {self.rows[message_id][0]}) in"
                     f" {self.name!r}, but {other[message_id].NAME} (CRC_EXTRA {other.rows[message_id][0]}) in"
                     f" {other.name!r}"
@@ -161,7 +161,7 @@ class _Extended(Dialect):
         for part in self._parts:
             try:
                 found.append(part.enum(name))
-            except LocalProtocolError:
+            except InvalidArgument:
                 continue
         if len(found) < 2 or found[1].__members__.keys() <= found[0].__members__.keys():
             return found[0] if found else super().enum(name)

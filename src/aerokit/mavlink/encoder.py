@@ -5,7 +5,7 @@ from __future__ import annotations
 from struct import Struct
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED
 from aerokit.mavlink.message import Message
@@ -27,16 +27,16 @@ class FrameEncoder:
     """
 
     def __init__(self, system_id: int, component_id: int, *, version: int = 2) -> None:
-        """``system_id`` is 1..255, ``component_id`` 0..255, ``version`` 1 or 2; LocalProtocolError otherwise.
+        """``system_id`` is 1..255, ``component_id`` 0..255, ``version`` 1 or 2; InvalidArgument otherwise.
 
         Component 0 addresses everyone and is nobody's id; it is allowed because old ground stations call themselves so.
         """
         if not 1 <= system_id <= 255:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"system_id = {system_id!r} must be in 1..255 (0 addresses everyone, and is nobody)"
             )
         if not 0 <= component_id <= 255:
-            raise LocalProtocolError(f"component_id = {component_id!r} must be in 0..255")
+            raise InvalidArgument(f"component_id = {component_id!r} must be in 0..255")
         self.system_id: int = int(system_id)
         self.component_id: int = int(component_id)
         self.sequence: int = 0
@@ -48,17 +48,17 @@ class FrameEncoder:
 
     @property
     def version(self) -> int:
-        """Of the next frames, 1 or 2; LocalProtocolError when it is set to anything else."""
+        """Of the next frames, 1 or 2; InvalidArgument when it is set to anything else."""
         return self._version
 
     @version.setter
     def version(self, version: int) -> None:
         if version not in (1, 2):
-            raise LocalProtocolError(f"version = {version!r} must be 1 or 2")
+            raise InvalidArgument(f"version = {version!r} must be 1 or 2")
         self._version = int(version)
 
     def encode(self, message: Message, now: float = 0.0) -> bytes:
-        """The whole frame. LocalProtocolError names a field that does not fit; the sequence number is not used then.
+        """The whole frame. InvalidArgument names a field that does not fit; the sequence number is not used then.
 
         MAVLink 2 drops zeros from the end of the payload, MAVLink 1 all extension fields; it has no ids above 255.
         ``now`` is seconds since 1970, for the time stamp of a signature.
@@ -74,7 +74,7 @@ class FrameEncoder:
             body, magic = body + payload, _MAGIC_V2
         else:
             if number > 255:
-                raise LocalProtocolError(f"{message.NAME} has id {number}, MAVLink 1 has none above 255")
+                raise InvalidArgument(f"{message.NAME} has id {number}, MAVLink 1 has none above 255")
             payload = payload[: message.BASE_LENGTH]
             source = self.system_id, self.component_id
             body, magic = bytes((len(payload), self.sequence, *source, number)) + payload, _MAGIC_V1

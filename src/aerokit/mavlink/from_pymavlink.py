@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.runtime_dialect import class_from_pymavlink
@@ -32,7 +32,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
             change: only the copy gets it). None and 0 leave what is there. ``target_component`` always stays.
 
     Raises:
-        LocalProtocolError: a ValueError; a value does not fit its field, or this is no message.
+        InvalidArgument: a ValueError; a value does not fit its field, or this is no message.
     """
     if isinstance(message, Message):
         message_class: type[Message] = type(message)
@@ -46,7 +46,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
     try:
         copy = message_class(**values)
     except TypeError as error:
-        raise LocalProtocolError(f"{message_class.NAME} cannot be sent: {error}") from None
+        raise InvalidArgument(f"{message_class.NAME} cannot be sent: {error}") from None
     copy.encode()
     return copy
 
@@ -58,14 +58,14 @@ def _class_of(message: Any) -> type[Message]:
     try:
         return STANDARD.by_name(message.get_type())
     except AttributeError:
-        raise LocalProtocolError(f"{message!r} is no MAVLink message") from None
+        raise InvalidArgument(f"{message!r} is no MAVLink message") from None
 
 
 @cache
 def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
     """The standard's class when it is about the same bytes, else one like it made of pymavlink's."""
     if message_id < 0 or not given.ordered_fieldnames:
-        raise LocalProtocolError(f"{given.__name__} is nothing that can be sent")
+        raise InvalidArgument(f"{given.__name__} is nothing that can be sent")
     standard = STANDARD.get(message_id)
     if standard is not None and crc_extra == standard.CRC_EXTRA:
         return standard
@@ -85,7 +85,7 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
         try:
             value = _text_given(message, name) if field.type == "char" else getattr(message, name)
         except AttributeError:
-            raise LocalProtocolError(f"{message_class.NAME}.{name} cannot be sent: it is missing") from None
+            raise InvalidArgument(f"{message_class.NAME}.{name} cannot be sent: it is missing") from None
         values[field.name] = _converted(message_class, field, value)
     return values
 
@@ -146,8 +146,8 @@ def _real(value: Any) -> Any:
         return value
 
 
-def _error(message_class: type[Message], field: Field, value: Any, complaint: str) -> LocalProtocolError:
-    return LocalProtocolError(f"{message_class.NAME}.{field.name} = {value!r} cannot be sent: {complaint}")
+def _error(message_class: type[Message], field: Field, value: Any, complaint: str) -> InvalidArgument:
+    return InvalidArgument(f"{message_class.NAME}.{field.name} = {value!r} cannot be sent: {complaint}")
 
 
 # ------------------------------------------------------------------------------------------ texts

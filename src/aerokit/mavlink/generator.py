@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.definitions import EnumDefinition, MessageDefinition, merged_enums, read_xml
 from aerokit.mavlink.rendering import render_enum_row, render_enum_stub, render_message
 from aerokit.mavlink.union import read_additions, with_added_enums, with_added_messages
@@ -169,7 +169,7 @@ def xml_folder() -> Path:
     """Where the installed pymavlink keeps its XML."""
     spec = importlib.util.find_spec("pymavlink")
     if spec is None or not spec.submodule_search_locations:
-        raise LocalProtocolError("pymavlink is not installed, and the XML is in its package")
+        raise InvalidArgument("pymavlink is not installed, and the XML is in its package")
     return Path(spec.submodule_search_locations[0]) / "dialects" / "v20"
 
 
@@ -331,7 +331,7 @@ def _refuse_doubles(names: Iterable[str]) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise LocalProtocolError(f"two definitions would both be called {name}")
+            raise InvalidArgument(f"two definitions would both be called {name}")
         seen.add(name)
 
 

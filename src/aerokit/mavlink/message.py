@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import HEADER_LENGTH
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ else:  # importing typing_extensions would cost more than everything else here
 __all__ = ["SECRET_FIELDS", "Field", "Message", "field_names", "offset_of"]
 
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
-"""What packing a wrong value can raise; the generated classes turn it into LocalProtocolError."""
+"""What packing a wrong value can raise; the generated classes turn it into InvalidArgument."""
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
 BYTES_IN_CHARS = frozenset(
@@ -142,7 +142,7 @@ def offset_of(message_type: type[Message], field: str) -> int:
         if each.name == field:
             return offset
         offset += SIZES[each.type] * (each.array_length or 1)
-    raise LocalProtocolError(f"{message_type.NAME} has no field {field!r}")
+    raise InvalidArgument(f"{message_type.NAME} has no field {field!r}")
 
 
 def field_names(message: Message) -> tuple[str, ...]:
@@ -195,7 +195,7 @@ class Message:
             raise NotImplementedError
 
         def encode(self) -> bytes:
-            """The whole payload; LocalProtocolError names the field, the value and the allowed range."""
+            """The whole payload; InvalidArgument names the field, the value and the allowed range."""
             raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
@@ -211,14 +211,14 @@ class Message:
         fields = ", ".join(f"{name}={_shown(name, getattr(self, name))}" for name in field_names(self))
         return f"{type(self).__name__}({fields})"
 
-    def _encode_error(self) -> LocalProtocolError:
+    def _encode_error(self) -> InvalidArgument:
         for field in self.FIELDS:
             value = getattr(self, field.name, None)
             complaint = field.complaint(value)
             if complaint:
                 shown = _shown(field.name, value)
-                return LocalProtocolError(f"{self.NAME}.{field.name} = {shown} cannot be sent: {complaint}")
-        return LocalProtocolError(f"{self!r} cannot be sent")
+                return InvalidArgument(f"{self.NAME}.{field.name} = {shown} cannot be sent: {complaint}")
+        return InvalidArgument(f"{self!r} cannot be sent")
 
 
 def _shown(name: str, value: object) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 __all__ = ["MessageFactory"]
 
@@ -76,7 +76,7 @@ def _taking_text(encode: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return encode(self, *given, **named)
         except AttributeError:
-            raise LocalProtocolError(f"{encode.__name__}: a text must be str or bytes") from None
+            raise InvalidArgument(f"{encode.__name__}: a text must be str or bytes") from None
 
     return encode_text
 

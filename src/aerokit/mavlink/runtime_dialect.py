@@ -10,7 +10,7 @@ from struct import Struct
 from types import ModuleType
 from typing import Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import message as message_module
 from aerokit.mavlink.definitions import (
     EntryDefinition,
@@ -44,7 +44,7 @@ def dialect_from_pymavlink(module: str | ModuleType) -> Dialect:
         module = _import(module)
     known: dict[int, Any] | None = getattr(module, "mavlink_map", None)
     if known is None:
-        raise LocalProtocolError(f"{module.__name__} is no pymavlink dialect: it has no mavlink_map")
+        raise InvalidArgument(f"{module.__name__} is no pymavlink dialect: it has no mavlink_map")
     definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     return _dialect(module.__name__.rpartition(".")[2], definitions, [enum for enum in enums if enum.entries])
@@ -53,7 +53,7 @@ def dialect_from_pymavlink(module: str | ModuleType) -> Dialect:
 def class_from_pymavlink(message_class: Any) -> type[Message]:
     """The class for one of pymavlink's message classes: the committed one, if that says the same about the bytes.
 
-    Raises LocalProtocolError when pymavlink's class does not agree with its own CRC_EXTRA.
+    Raises InvalidArgument when pymavlink's class does not agree with its own CRC_EXTRA.
     """
     definition = _message(message_class)
     return _standard_class(definition) or compile_message(definition)
@@ -83,7 +83,7 @@ def _dialect(name: str, definitions: Iterable[MessageDefinition], enums: Iterabl
     for definition in definitions:
         other = by_id.setdefault(definition.id, definition)
         if other != definition and (other.name, other.crc_extra) != (definition.name, definition.crc_extra):
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"message id {definition.id} is defined twice in {name}: {other.name} in {other.origin},"
                 f" {definition.name} in {definition.origin}"
             )
@@ -103,7 +103,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
             is_from_outside=True,
         )
     except (TypeError, ValueError) as error:  # two of a name, names that Python keeps for itself
-        raise LocalProtocolError(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
+        raise InvalidArgument(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
 
 
 def _standard_class(definition: MessageDefinition) -> type[Message] | None:
@@ -128,7 +128,7 @@ def _import(name: str) -> ModuleType:
         except ModuleNotFoundError as error:
             if error.name is None or not candidate.startswith(error.name):
                 raise
-    raise LocalProtocolError(f"no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
+    raise InvalidArgument(f"no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
 
 
 def _message(cls: Any) -> MessageDefinition:
@@ -164,7 +164,7 @@ def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra:
         )
         if guess.crc_extra == crc_extra and [f.name for f in guess.wire_fields] == order:
             return guess
-    raise LocalProtocolError(f"{definition.name}: CRC_EXTRA {crc_extra} fits none of its field orders")
+    raise InvalidArgument(f"{definition.name}: CRC_EXTRA {crc_extra} fits none of its field orders")
 
 
 def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:

@@ -13,7 +13,7 @@ from hmac import compare_digest
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
 
 if TYPE_CHECKING:
@@ -58,23 +58,21 @@ class SigningKey:
     __slots__ = ("_secret",)
 
     def __init__(self, secret: bytes) -> None:
-        """Take 32 bytes that are not all zero (zeros mean "no signing" on the wire); LocalProtocolError otherwise."""
+        """Take 32 bytes that are not all zero (zeros mean "no signing" on the wire); InvalidArgument otherwise."""
         if not isinstance(secret, (bytes, bytearray)) or len(secret) != KEY_LENGTH:
-            raise LocalProtocolError(
-                "a signing key must be 32 bytes; SigningKey.from_passphrase takes a text"
-            )
+            raise InvalidArgument("a signing key must be 32 bytes; SigningKey.from_passphrase takes a text")
         if not any(secret):
-            raise LocalProtocolError("a signing key of zeros only is no key: it turns signing off")
+            raise InvalidArgument("a signing key of zeros only is no key: it turns signing off")
         self._secret = bytes(secret)
 
     @classmethod
     def from_passphrase(cls, passphrase: str) -> SigningKey:
         """The SHA-256 of a text, as Mission Planner, MAVProxy and QGroundControl make a key of it.
 
-        LocalProtocolError for an empty one.
+        InvalidArgument for an empty one.
         """
         if not passphrase:
-            raise LocalProtocolError("the passphrase of a signing key is empty")
+            raise InvalidArgument("the passphrase of a signing key is empty")
         return cls(sha256(passphrase.encode()).digest())
 
     @classmethod
@@ -151,18 +149,16 @@ class Signing:
                 most, whole or not at all, and before the time stamps are used.
 
         Raises:
-            LocalProtocolError: a number is out of range, or ``key`` is no key.
+            InvalidArgument: a number is out of range, or ``key`` is no key.
             FileFormatError: the file of ``keep`` holds no time stamp.
             OSError: it cannot be read or written. Later :attr:`keep_error` tells; signing goes on.
         """
         if not isinstance(key, SigningKey):
-            raise LocalProtocolError(
-                "key must be a SigningKey: SigningKey(32 bytes), or from_passphrase(text)"
-            )
+            raise InvalidArgument("key must be a SigningKey: SigningKey(32 bytes), or from_passphrase(text)")
         if not 0 <= link_id <= 255:
-            raise LocalProtocolError(f"link_id = {link_id!r} must be in 0..255")
+            raise InvalidArgument(f"link_id = {link_id!r} must be in 0..255")
         if not 0 <= timestamp <= LAST_TIMESTAMP:
-            raise LocalProtocolError(f"timestamp = {timestamp!r} must be in 0..{LAST_TIMESTAMP}")
+            raise InvalidArgument(f"timestamp = {timestamp!r} must be in 0..{LAST_TIMESTAMP}")
         self.key = key
         self.link_id: int = int(link_id)
         self.timestamp: int = int(timestamp)
@@ -196,12 +192,12 @@ class Signing:
     def sign(self, frame: bytes, now: float = 0.0) -> bytes:
         """The 13 bytes that go behind a whole MAVLink 2 frame whose header says that it is signed.
 
-        ``now`` is seconds since 1970; 0: there is no clock, and time stamps just count on. LocalProtocolError when
+        ``now`` is seconds since 1970; 0: there is no clock, and time stamps just count on. InvalidArgument when
         48 bits hold no later time stamp: this key has come to its end.
         """
         stamp = self.timestamp_now(now)
         if stamp > LAST_TIMESTAMP:
-            raise LocalProtocolError(f"the time stamps of {self.key!r} are used up: agree on another key")
+            raise InvalidArgument(f"the time stamps of {self.key!r} are used up: agree on another key")
         self._advance(stamp + 1)
         place = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
         return place + self._hash(frame + place)

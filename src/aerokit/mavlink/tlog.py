@@ -10,7 +10,7 @@ from os import PathLike
 from struct import Struct
 from typing import BinaryIO
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 
 __all__ = ["TlogWriter", "read_tlog"]
@@ -116,7 +116,7 @@ class TlogWriter:
         """Add one frame as it was sent or received; ``timestamp_s`` is seconds since 1970, kept to the microsecond."""
         microseconds = round(timestamp_s * 1e6)
         if not 0 <= microseconds < 1 << 64:
-            raise LocalProtocolError(f"timestamp_s = {timestamp_s!r} must be seconds since 1970")
+            raise InvalidArgument(f"timestamp_s = {timestamp_s!r} must be seconds since 1970")
         self._file.write(_TIME.pack(microseconds) + raw)
 
     def flush(self) -> None:

@@ -1,6 +1,6 @@
 """Builders for what is done on the way: speed, waiting, headings, servos, relays, jumps, transitions.
 
-What cannot be right raises :class:`~aerokit.errors.LocalProtocolError` with the argument and what is allowed.
+What cannot be right raises :class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions.places import action, in_range, whole
 
@@ -48,7 +48,7 @@ def change_speed(
     without airspeed sensor, None leaves it. https://mavlink.io/en/messages/common.html#MAV_CMD_DO_CHANGE_SPEED
     """
     if kind not in _SPEEDS:
-        raise LocalProtocolError(f"kind = {kind!r} is not allowed: {', '.join(map(repr, _SPEEDS))}")
+        raise InvalidArgument(f"kind = {kind!r} is not allowed: {', '.join(map(repr, _SPEEDS))}")
     return action(
         MavCmd.DO_CHANGE_SPEED,
         _SPEEDS[kind],
@@ -63,9 +63,7 @@ def delay(duration_s: float) -> MissionItem:
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_DELAY
     """
     if duration_s == 0:
-        raise LocalProtocolError(
-            "duration_s = 0 is not allowed: ArduPilot takes it for a time of day; above 0"
-        )
+        raise InvalidArgument("duration_s = 0 is not allowed: ArduPilot takes it for a time of day; above 0")
     return action(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _LONGEST_S), -1.0, -1.0, -1.0)
 
 
@@ -112,9 +110,7 @@ def condition_yaw(
     """
     directions = {"shortest": 0.0, "clockwise": 1.0, "counterclockwise": -1.0}
     if direction not in directions:
-        raise LocalProtocolError(
-            f"direction = {direction!r} is not allowed: {', '.join(map(repr, directions))}"
-        )
+        raise InvalidArgument(f"direction = {direction!r} is not allowed: {', '.join(map(repr, directions))}")
     return action(
         MavCmd.CONDITION_YAW,
         in_range("heading_deg", heading_deg, 0, 360),
@@ -174,7 +170,7 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
     """
     states = {"multicopter": 3.0, "fixed_wing": 4.0}
     if to not in states:
-        raise LocalProtocolError(f"to = {to!r} is not allowed: {', '.join(map(repr, states))}")
+        raise InvalidArgument(f"to = {to!r} is not allowed: {', '.join(map(repr, states))}")
     return action(MavCmd.DO_VTOL_TRANSITION, states[to])
 
 

@@ -1,6 +1,6 @@
 """Builders for cameras and gimbals: photos, video, where to look.
 
-What cannot be right raises :class:`~aerokit.errors.LocalProtocolError` with the argument and what is allowed.
+What cannot be right raises :class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 

@@ -6,7 +6,7 @@ import math
 import struct
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
 from aerokit.missions.commands import (
     DEFAULT_XY,
@@ -36,7 +36,7 @@ _GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
 def check_items(
     items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None
 ) -> None:
-    """Raise :class:`LocalProtocolError`, which names item, field, value and what is allowed, unless all can be sent.
+    """Raise :class:`InvalidArgument`, which names item, field, value and what is allowed, unless all can be sent.
 
     ``mission_type`` is the MAV_MISSION_TYPE. ``home_is_item_0`` is True for missions of ArduPilot: one item fewer
     fits; False for those of others: 0°, 0° as "where the vehicle is" is ArduPilot's alone; None: not known.
@@ -45,7 +45,7 @@ def check_items(
     for index, item in enumerate(items):
         check_item(item, f"item {index}", mission_type)
         if home_is_item_0 is False and item.command in DESTINATIONS and item.x == item.y == 0:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"item {index} ({item.name}): x, y = 0, 0 is not allowed: only ArduPilot takes it for the place where"
                 " the vehicle is; give a latitude and a longitude"
             )
@@ -53,16 +53,16 @@ def check_items(
 
 
 def check_count(count: int, *, home_is_item_0: bool = False) -> None:
-    """Raise :class:`LocalProtocolError` when there are more items than the protocol can count."""
+    """Raise :class:`InvalidArgument` when there are more items than the protocol can count."""
     most = MOST_ITEMS - home_is_item_0
     if count > most:
-        raise LocalProtocolError(f"{count} items are too many: at most {most} fit")
+        raise InvalidArgument(f"{count} items are too many: at most {most} fit")
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`LocalProtocolError`, which begins with ``where``, unless MISSION_ITEM_INT can carry the item."""
+    """Raise :class:`InvalidArgument`, which begins with ``where``, unless MISSION_ITEM_INT can carry the item."""
     if not isinstance(item, MissionItem):
-        raise LocalProtocolError(f"{where} = {item!r} is no MissionItem")
+        raise InvalidArgument(f"{where} = {item!r} is no MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)
     where = f"{where} ({item.name})"
     _check_command(where, item.command, mission_type)
@@ -77,7 +77,7 @@ def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) ->
 
 
 def check_jumps(items: Sequence[MissionItem]) -> None:
-    """Raise :class:`LocalProtocolError` when a DO_JUMP or DO_JUMP_TAG leads nowhere; items are counted from 0."""
+    """Raise :class:`InvalidArgument` when a DO_JUMP or DO_JUMP_TAG leads nowhere; items are counted from 0."""
     tags = {item.param1 for item in items if item.command == MavCmd.JUMP_TAG}
     for index, item in enumerate(items):
         where = f"item {index} ({item.name})" if item.command in (MavCmd.DO_JUMP, MavCmd.DO_JUMP_TAG) else ""
@@ -91,8 +91,8 @@ def check_jumps(items: Sequence[MissionItem]) -> None:
             raise _wrong(where, "param1", item.param1, allowed)
 
 
-def _wrong(where: str, field: str, value: object, allowed: str) -> LocalProtocolError:
-    return LocalProtocolError(f"{where}: {field} = {value!r} is not allowed, but {allowed}")
+def _wrong(where: str, field: str, value: object, allowed: str) -> InvalidArgument:
+    return InvalidArgument(f"{where}: {field} = {value!r} is not allowed, but {allowed}")
 
 
 def _check_integer(where: str, field: str, value: object, high: int) -> None:

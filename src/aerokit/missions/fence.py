@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.check import check_items
 from aerokit.missions.compare import items_differences
@@ -40,9 +40,9 @@ class FencePolygon(Snapshot):
         object.__setattr__(self, "vertices", tuple(self.vertices))
         for index, vertex in enumerate(self.vertices):
             if not isinstance(vertex, Position):
-                raise LocalProtocolError(f"vertices[{index}] = {vertex!r} is no Position")
+                raise InvalidArgument(f"vertices[{index}] = {vertex!r} is no Position")
         if len(self.vertices) < 3:
-            raise LocalProtocolError(f"vertices has {len(self.vertices)} places, a polygon needs at least 3")
+            raise InvalidArgument(f"vertices has {len(self.vertices)} places, a polygon needs at least 3")
 
 
 class FenceCircle(Snapshot):
@@ -54,9 +54,9 @@ class FenceCircle(Snapshot):
 
     def _check(self) -> None:
         if not isinstance(self.center, Position):
-            raise LocalProtocolError(f"center = {self.center!r} is no Position")
+            raise InvalidArgument(f"center = {self.center!r} is no Position")
         if not isinstance(self.radius_m, (float, int, Real)) or not 0 < self.radius_m < 3e7:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"radius_m = {self.radius_m!r} is not allowed: above 0 m, and on this planet"
             )
 
@@ -75,7 +75,7 @@ class Fence(Snapshot):
     return_point: Position | None = None
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`LocalProtocolError` unless it can be sent; a fence never has home in it."""
+        """Raise :class:`InvalidArgument` unless it can be sent; a fence never has home in it."""
         check_items(self.to_items(), self.MISSION_TYPE)
 
     def differences(self, found: Fence, storage: Storage = Storage.ANY) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ class Fence(Snapshot):
             object.__setattr__(self, name, values)
             for index, value in enumerate(values):
                 if not isinstance(value, kind):
-                    raise LocalProtocolError(f"{name}[{index}] = {value!r} is no {kind.__name__}")
+                    raise InvalidArgument(f"{name}[{index}] = {value!r} is no {kind.__name__}")
 
 
 def _item(command: MavCmd, place: Position, param1: float) -> MissionItem:
@@ -161,7 +161,7 @@ def _read_circle(item: MissionItem, index: int) -> FenceCircle:
     center = _place(item, index)
     try:
         return FenceCircle(center, item.param1, item.command == _CIRCLE[True])
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
 
 
@@ -169,7 +169,7 @@ def _place(item: MissionItem, index: int) -> Position:
     """Its latitude and longitude; of the return point also the altitude."""
     try:
         place = Position(item.x / 1e7, item.y / 1e7)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
     if item.command != MavCmd.NAV_FENCE_RETURN_POINT or (item.z == 0 and item.frame == MavFrame.GLOBAL):
         return place

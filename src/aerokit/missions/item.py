@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavFrame
 from aerokit.missions.commands import DEFAULT_XY, canonical_frame, command_name, xy_scale
 from aerokit.position import Position
@@ -64,7 +64,7 @@ class MissionItem(Snapshot):
                 altitude_amsl_m=altitude if frame == MavFrame.GLOBAL else None,
                 altitude_relative_m=altitude if frame == MavFrame.GLOBAL_RELATIVE_ALT else None,
             )
-        except LocalProtocolError:
+        except InvalidArgument:
             return None
 
     def _key(self) -> tuple[Any, ...]:

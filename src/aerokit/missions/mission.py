@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, overload
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.missions.check import check_items
 from aerokit.missions.compare import items_differences
 from aerokit.missions.item import MissionItem
@@ -36,7 +36,7 @@ class Mission(Snapshot):
     home: Position | None = None
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`LocalProtocolError`, which names item, field, value and what is allowed, unless it can be sent.
+        """Raise :class:`InvalidArgument`, which names item, field, value and what is allowed, unless it can be sent.
 
         NaN passes where the standard gives it a meaning ("not given"): headings, reserved parameters. With
         ``home_is_item_0``, which says whether it is for an ArduPilot, more can be said: one item fewer fits there,
@@ -68,7 +68,7 @@ class Mission(Snapshot):
         object.__setattr__(self, "items", tuple(self.items))
         for index, item in enumerate(self.items):
             if not isinstance(item, MissionItem):
-                raise LocalProtocolError(f"item {index} = {item!r} is no MissionItem")
+                raise InvalidArgument(f"item {index} = {item!r} is no MissionItem")
 
     def __len__(self) -> int:
         return len(self.items)

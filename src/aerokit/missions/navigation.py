@@ -3,7 +3,7 @@
 Latitudes and longitudes are degrees (WGS 84). Each place has exactly one altitude, in metres: ``altitude_relative_m``
 above home, ``altitude_amsl_m`` above mean sea level, ``altitude_terrain_m`` above the ground below (ArduPilot with
 terrain data; PX4 refuses it). ``yaw_deg`` is a heading in degrees from north, None: as the vehicle likes.
-What cannot be right raises :class:`~aerokit.errors.LocalProtocolError` with the argument and what is allowed.
+What cannot be right raises :class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions.check import MOST_ITEMS
 from aerokit.missions.wire import from_wire, to_wire
@@ -69,7 +69,7 @@ def pack_items(
     file it refuses half way leaves half a mission.
     """
     if len(items) + first > MOST_ITEMS:
-        raise LocalProtocolError(f"{len(items) + first} items are too many: at most {MOST_ITEMS} fit")
+        raise InvalidArgument(f"{len(items) + first} items are too many: at most {MOST_ITEMS} fit")
     header = HEADER.pack(MAGIC, mission_type, options, first, len(items))
     return header + b"".join(
         to_wire(

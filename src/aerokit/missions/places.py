@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.geo import check_place
 from aerokit.mavlink.enums import MavFrame
 from aerokit.missions.item import MissionItem
@@ -32,7 +32,7 @@ def place(
     if latitude_deg is None and longitude_deg is None:
         return MissionItem(command, frame, *_four(parameters), z=z)
     if latitude_deg is None or longitude_deg is None:
-        raise LocalProtocolError("latitude_deg and longitude_deg: give both or none of them")
+        raise InvalidArgument("latitude_deg and longitude_deg: give both or none of them")
     in_range("latitude_deg", latitude_deg, -90, 90)
     in_range("longitude_deg", longitude_deg, -180, 180)
     check_place(latitude_deg, longitude_deg)
@@ -54,7 +54,7 @@ def altitude_and_frame(
         if value is not None
     }
     if len(given) != 1:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             "give exactly one of altitude_relative_m (above home), altitude_amsl_m (above mean sea level) and"
             f" altitude_terrain_m (above the ground), not {' and '.join(given) or 'none'}"
         )
@@ -69,7 +69,7 @@ def action(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
 
 
 def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[float, ...] = ()) -> float:
-    """The value; :class:`LocalProtocolError` unless it is a number from low to high, or one of ``or_``."""
+    """The value; :class:`InvalidArgument` unless it is a number from low to high, or one of ``or_``."""
     if (
         isinstance(value, (int, float))
         and not isinstance(value, bool)
@@ -77,14 +77,14 @@ def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[fl
     ):
         return float(value)
     others = "".join(f", or {other:g}" for other in or_)
-    raise LocalProtocolError(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{others}")
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{others}")
 
 
 def whole(name: str, value: object, low: int, high: int) -> float:
-    """The value; :class:`LocalProtocolError` unless it is a whole number from low to high."""
+    """The value; :class:`InvalidArgument` unless it is a whole number from low to high."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
-    raise LocalProtocolError(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")
 
 
 def heading(name: str, value: float | None) -> float:

@@ -10,7 +10,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.commands import canonical_frame
 from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
@@ -73,19 +73,17 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
 def format_plan(plan: Plan) -> str:
     """The text of a file. A plan that was read keeps all that stood there, but for what has become different.
 
-    Raises :class:`LocalProtocolError` for what such a file cannot keep: rally points and a return point of the fence
+    Raises :class:`InvalidArgument` for what such a file cannot keep: rally points and a return point of the fence
     with altitudes other than above home, numbers that are infinite.
     """
     try:
         return json.dumps(_document(plan), indent=4, allow_nan=False) + "\n"
     except RecursionError:
-        raise LocalProtocolError(
-            "the plan was read from a file that is nested too deep to be written"
-        ) from None
-    except LocalProtocolError:
+        raise InvalidArgument("the plan was read from a file that is nested too deep to be written") from None
+    except InvalidArgument:
         raise
     except ValueError as error:
-        raise LocalProtocolError("a number of the plan is not finite: a .plan file cannot keep it") from error
+        raise InvalidArgument("a number of the plan is not finite: a .plan file cannot keep it") from error
 
 
 def _document(plan: Plan) -> dict[str, Any]:
@@ -165,7 +163,7 @@ def _read_circle(value: JsonValue) -> FenceCircle:
         return FenceCircle(center, radius.number(), value["inclusion"].boolean())
     except FileFormatError:
         raise
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise radius.error("a number of metres above 0") from error
 
 
@@ -256,7 +254,7 @@ def _fence_members(fence: Fence) -> dict[str, Any]:
     point = fence.return_point
     if point is not None:
         if point.altitude_amsl_m is not None:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"return_point.altitude_amsl_m = {point.altitude_amsl_m!r}: a .plan file keeps it above home only"
             )
         members["breachReturn"] = _place_members(point, point.altitude_relative_m)
@@ -265,7 +263,7 @@ def _fence_members(fence: Fence) -> dict[str, Any]:
 
 def _rally_point(item: MissionItem, index: int) -> list[int | float | None]:
     if canonical_frame(item.frame) != MavFrame.GLOBAL_RELATIVE_ALT:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"rally[{index}]: frame = {item.frame!r}: a .plan file keeps rally points above home only"
         )
     return [*map(json_number, (*in_degrees(item), item.z))]

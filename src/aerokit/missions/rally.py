@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, overload
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.missions.check import check_items
 from aerokit.missions.compare import items_differences
 from aerokit.missions.item import MissionItem
@@ -40,7 +40,7 @@ class RallyPoints(Snapshot):
         return tuple(item.position for item in self.items if item.position is not None)
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`LocalProtocolError`, which names item, field and what is allowed, unless it can be sent."""
+        """Raise :class:`InvalidArgument`, which names item, field and what is allowed, unless it can be sent."""
         check_items(self.items, self.MISSION_TYPE)
 
     def differences(self, found: RallyPoints, storage: Storage = Storage.ANY) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ class RallyPoints(Snapshot):
         object.__setattr__(self, "items", tuple(self.items))
         for index, item in enumerate(self.items):
             if not isinstance(item, MissionItem):
-                raise LocalProtocolError(f"item {index} = {item!r} is no MissionItem")
+                raise InvalidArgument(f"item {index} = {item!r} is no MissionItem")
 
     def __len__(self) -> int:
         return len(self.items)

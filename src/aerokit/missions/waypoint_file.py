@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.commands import canonical_frame, xy_scale
 from aerokit.missions.item import MissionItem
@@ -78,12 +78,10 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     """The text of a file, in Mission Planner's form; more digits where those would not do.
 
-    Raises :class:`LocalProtocolError` for numbers that are infinite.
+    Raises :class:`InvalidArgument` for numbers that are infinite.
     """
     if version not in (110, 120):
-        raise LocalProtocolError(
-            f"version = {version!r} is not allowed: 110 (home is item 0) or 120 (no home)"
-        )
+        raise InvalidArgument(f"version = {version!r} is not allowed: 110 (home is item 0) or 120 (no home)")
     rows = [f"QGC WPL {version}"]
     items = mission.items
     if version == 110:
@@ -172,7 +170,7 @@ def _item_row(item: MissionItem, index: int) -> str:
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
-        raise LocalProtocolError(f"{item!r} has an infinite number, which a file cannot keep")
+        raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot keep")
     texts = (*map(str, integers), *(_text(number, 8) for number in numbers), _text(item.z, 6))
     return "\t".join((*texts, str(int(item.autocontinue))))
 

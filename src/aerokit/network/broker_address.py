@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NoReturn
 from urllib.parse import unquote, urlsplit
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links.address import host_and_port
 from aerokit.links.zenoh_keys import Place, check_name
 from aerokit.snapshot import Snapshot
@@ -38,13 +38,13 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     """Read an address; ``schemes`` are those that are allowed, none: all.
 
     Raises:
-        LocalProtocolError: it is none. What was given is not repeated in there where it may have a password.
+        InvalidArgument: it is none. What was given is not repeated in there where it may have a password.
     """
     allowed = schemes or tuple(PORTS)
 
     def fail(reason: str) -> NoReturn:
         shown = f"{scheme}://…" if "@" in text else text
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"address = {shown!r} is not allowed: {reason}, as in"
             f" {allowed[0]}://10.0.0.5:{PORTS[allowed[0]]}/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
         )
@@ -66,7 +66,7 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
     fleet, _, name = parts.path.strip("/").partition("/")
     try:
         place = Place(check_name("fleet", fleet), check_name("name", name))
-    except LocalProtocolError:
+    except InvalidArgument:
         fail("fleet and name are up to 63 letters, digits, '_', '.' and '-', a letter or digit first")
     user, password = (None if each is None else unquote(each) for each in (parts.username, parts.password))
     return BrokerAddress(scheme, host, port or PORTS[scheme], place, user, password)

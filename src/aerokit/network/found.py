@@ -40,7 +40,7 @@ async def found(
         The names, sorted.
 
     Raises:
-        LocalProtocolError: an argument is wrong.
+        InvalidArgument: an argument is wrong.
         LinkOpenError: there is no network, or eclipse-zenoh is not installed.
     """
     check_name("fleet", fleet)

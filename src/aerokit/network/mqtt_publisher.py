@@ -163,7 +163,7 @@ async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
         What :func:`publishing` takes.
 
     Raises:
-        LocalProtocolError: this is no address of a broker of MQTT.
+        InvalidArgument: this is no address of a broker of MQTT.
         LinkOpenError: the broker cannot be reached or refuses, or paho-mqtt is not installed.
     """
     where = parse_broker(address, "mqtt", "mqtts")

@@ -13,7 +13,7 @@ import anyio
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.network.publishers import publisher_for
 from aerokit.plain import plain
 from aerokit.runtime.background import Background
@@ -114,18 +114,16 @@ async def publishing(
         states: names as in docs/states.md, and ``"link"``; none: all of them.
 
     Raises:
-        LocalProtocolError: an argument is wrong, or there is no such state.
+        InvalidArgument: an argument is wrong, or there is no such state.
         LinkOpenError: there is no network or broker, or the package that it takes is not installed.
         ConnectionClosed, LinkLost: the vehicle's connection has ended.
     """
     if not 0 < rate_hz <= HIGHEST_RATE_HZ:
-        raise LocalProtocolError(f"rate_hz = {rate_hz} is not allowed: above 0, at most {HIGHEST_RATE_HZ:g}")
+        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {HIGHEST_RATE_HZ:g}")
     wanted = frozenset(states)
     unknown = sorted(wanted - vehicle.telemetry.cells.keys() - {"link"})
     if unknown:
-        raise LocalProtocolError(
-            f"states = … has {unknown[0]!r}, which is no state (docs/states.md has them)"
-        )
+        raise InvalidArgument(f"states = … has {unknown[0]!r}, which is no state (docs/states.md has them)")
     connection = vehicle.connection
     connection.raise_if_ended()
     async with AsyncExitStack() as stack:

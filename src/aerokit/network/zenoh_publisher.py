@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links.address import parse_address
 from aerokit.links.create import network_options
 from aerokit.links.zenoh_keys import Place
@@ -59,12 +59,12 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
         What :func:`publishing` takes.
 
     Raises:
-        LocalProtocolError: this is no address of a zenoh network.
+        InvalidArgument: this is no address of a zenoh network.
         LinkOpenError: there is no network, or eclipse-zenoh is not installed.
     """
     where = parse_address(address)
     if where.kind not in ("zenoh", "zenohin"):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"address = {address!r} is not allowed: it is not on a network, as zenoh://fleet/alpha is"
         )
     fleet, _, name = where.path.partition("/")

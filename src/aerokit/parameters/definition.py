@@ -12,7 +12,7 @@ from itertools import islice
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters.number_text import parse_number
 from aerokit.parameters.setting import SettingValue, checked_setting, setting_key, settings_equal
@@ -197,14 +197,14 @@ class CameraDefinition(Snapshot):
     def checked(self, name: str, value: object, values: Values) -> SettingValue:
         """The value that is to be sent for a value, or for the name of an option, while the others are as told.
 
-        Raises :class:`LocalProtocolError` where the setting can only be read, is excluded now, or does not take it.
+        Raises :class:`InvalidArgument` where the setting can only be read, is excluded now, or does not take it.
         """
         own = self.settings[name]
         if own.read_only:
-            raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: it can only be read")
+            raise InvalidArgument(f"{name} = {shown(value)} is not allowed: it can only be read")
         reasons = self.excluded_by(name, values)
         if reasons:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{name} = {shown(value)} is not allowed now: excluded by {', '.join(reasons)}"
             )
         options, restricted_by = self._options(name, values)
@@ -273,7 +273,7 @@ def _among(
     now = f" while {', '.join(restricted_by)}" if restricted_by else ""
     names = ", ".join(f"{name!r} ({shown(known)})" for name, known in list(by_name.items())[:SHOWN_OPTIONS])
     more = f" and {len(by_name) - SHOWN_OPTIONS} more" if len(by_name) > SHOWN_OPTIONS else ""
-    raise LocalProtocolError(
+    raise InvalidArgument(
         f"{own.name} = {shown(value)} is not allowed{now}: {names or 'nothing'}{more}{did_you_mean(value, by_name)}"
     )
 
@@ -284,18 +284,18 @@ def _in_range(own: SettingDefinition, value: object) -> SettingValue:
         return number
     if own.type == "bool":
         if number not in (0, 1):
-            raise LocalProtocolError(f"{own.name} = {shown(value)} is not allowed: True or False")
+            raise InvalidArgument(f"{own.name} = {shown(value)} is not allowed: True or False")
         return bool(number)
     low, high, step = own.minimum, own.maximum, own.step
     is_below = low is not None and number < low and not settings_equal(number, low)
     is_above = high is not None and number > high and not settings_equal(number, high)
     if is_below or is_above:
         bounds = f"{'' if low is None else f'{low:g}'}..{'' if high is None else f'{high:g}'}"
-        raise LocalProtocolError(f"{own.name} = {shown(value)} is not allowed: {bounds}")
+        raise InvalidArgument(f"{own.name} = {shown(value)} is not allowed: {bounds}")
     if isinstance(number, int) and isinstance(step, int) and step > 1:
         first = low if isinstance(low, int) else 0
         if (number - first) % step:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{own.name} = {shown(value)} is not allowed: {first}, {first + step}, {first + 2 * step} …"
             )
     return number
@@ -462,7 +462,7 @@ def _value(text: str | None, wire_type: int) -> SettingValue | None:
     value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)
-    except LocalProtocolError:
+    except InvalidArgument:
         return None
 
 

@@ -13,7 +13,7 @@ import math
 from struct import Struct
 from typing import TypeVar
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.messages import ParamSet, ParamValue
 from aerokit.parameters.parameter import Parameter, ParameterType
@@ -50,7 +50,7 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
     if not bytewise or type is ParameterType.REAL32:
         return _FLOAT.pack(value)
     if type not in _FORMATS:
-        raise LocalProtocolError(f"{value!r}: an {type.name} has eight bytes, the message has room for four")
+        raise InvalidArgument(f"{value!r}: an {type.name} has eight bytes, the message has room for four")
     return _FORMATS[type].pack(value).ljust(4, b"\0")
 
 

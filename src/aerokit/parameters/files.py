@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters.differences import ParameterValues, plain_values
 from aerokit.parameters.number_text import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
@@ -118,7 +118,7 @@ def write_parameter_file(
 ) -> None:
     """Write a table, the values of another file, or a dict, sorted by name, with the digits that 32-bit numbers have.
 
-    The file appears whole or not at all. Raises :class:`LocalProtocolError` for names and values that cannot be sent,
+    The file appears whole or not at all. Raises :class:`InvalidArgument` for names and values that cannot be sent,
     before anything is written. ``system_id`` and ``component_id`` stand in QGroundControl's format only.
     """
     text = parameter_file_text(
@@ -137,10 +137,10 @@ def parameter_file_text(
 ) -> str:
     """What :func:`write_parameter_file` writes."""
     if format not in ("missionplanner", "mavproxy", "qgroundcontrol"):
-        raise LocalProtocolError(f"format = {format!r} must be missionplanner, mavproxy or qgroundcontrol")
+        raise InvalidArgument(f"format = {format!r} must be missionplanner, mavproxy or qgroundcontrol")
     rows = sorted(_rows(values), key=lambda row: row[0])
     if not rows:
-        raise LocalProtocolError("there are no parameters to write")
+        raise InvalidArgument("there are no parameters to write")
     lines = [f"# {line}".rstrip() for comment in comments for line in comment.splitlines() or [""]]
     if format == "qgroundcontrol":
         lines += ["# Vehicle-Id Component-Id Name Value Type"]
@@ -213,7 +213,7 @@ def _put(values: dict[str, int | float], place: str, name: str, text: str, kind:
         raise FileFormatError(f"{place}: {name} = {text!r} is no finite number") from None
     try:
         checked = checked_value(check_name(name), number, kind)
-    except LocalProtocolError as error:
+    except InvalidArgument as error:
         raise FileFormatError(f"{place}: {error}") from None
     if name in values:
         raise FileFormatError(f"{place}: {name} stands in the file a second time")
@@ -243,7 +243,7 @@ def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
 def _writable(name: str) -> str:
     """A name that its line can be read back with."""
     if any(character in check_name(name) for character in "#,"):
-        raise LocalProtocolError(f"parameter name = {name!r} cannot stand in a file: it has a # or a comma")
+        raise InvalidArgument(f"parameter name = {name!r} cannot stand in a file: it has a # or a comma")
     return name
 
 

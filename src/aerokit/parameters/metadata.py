@@ -19,7 +19,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
 
-from aerokit.errors import FileFormatError, LocalProtocolError
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.snapshot import Snapshot
 from aerokit.whole_file import read_bounded, unpacked
 
@@ -109,12 +109,12 @@ class Metadata(Mapping[str, ParameterMetadata]):
         return tuple(name for name in names if name in self and self[name].reboot_required)
 
     def check(self, name: str, value: float) -> None:
-        """Raise :class:`LocalProtocolError` for a value outside the recommended range; unknown names pass."""
+        """Raise :class:`InvalidArgument` for a value outside the recommended range; unknown names pass."""
         if math.isnan(value):
-            raise LocalProtocolError(f"{name} = {value!r} is not a number")
+            raise InvalidArgument(f"{name} = {value!r} is not a number")
         complaint = self[name].complaint(value) if name in self else None
         if complaint:
-            raise LocalProtocolError(complaint)
+            raise InvalidArgument(complaint)
 
 
 def load_metadata(path: str | os.PathLike[str]) -> Metadata:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from struct import Struct
 from typing import NamedTuple, NoReturn
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.parameters.parameter import NAME_LENGTH, Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
 
@@ -96,7 +96,7 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
 
     The vehicle puts the parameters in when the file is closed, and skips unknown and read-only ones without a word, so
     read back what you wrote. The third number of its header is the length of the file, which thus ends at 65,535
-    bytes: :class:`LocalProtocolError` beyond, and for names and values that do not fit (INT32 is the widest type).
+    bytes: :class:`InvalidArgument` beyond, and for names and values that do not fit (INT32 is the widest type).
     """
     rows = list(_rows(parameters))
     body = bytearray()
@@ -107,9 +107,7 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
         last = name
     length = HEADER.size + len(body)
     if length > _LONGEST:
-        raise LocalProtocolError(
-            f"{len(rows)} parameters make {length} bytes, at most {_LONGEST} are possible"
-        )
+        raise InvalidArgument(f"{len(rows)} parameters make {length} bytes, at most {_LONGEST} are possible")
     return HEADER.pack(MAGIC, len(rows), length) + bytes(body)
 
 
@@ -125,11 +123,11 @@ def pack_served(
     """The file that a vehicle with these parameters serves when it is read in blocks of that size; nothing is checked.
 
     ``count`` 0 means all from ``start``. A value and its default lie in one block (PX4), or, without
-    ``whole_defaults``, the default alone (ArduPilot). LocalProtocolError when ``start`` is beyond the list.
+    ``whole_defaults``, the default alone (ArduPilot). InvalidArgument when ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
-        raise LocalProtocolError(f"start = {start!r} must be in 0..{len(rows) - 1}")
+        raise InvalidArgument(f"start = {start!r} must be in 0..{len(rows) - 1}")
     chosen = rows[start : start + count if count else None]
     file = bytearray(HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else MAGIC, len(chosen), len(rows)))
     last = b""
@@ -224,9 +222,7 @@ def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator
 
 def _code_of(parameter: Parameter) -> int:
     if parameter.type not in _CODE_OF:
-        raise LocalProtocolError(
-            f"{parameter.name} is an {parameter.type.name}, which param.pck cannot carry"
-        )
+        raise InvalidArgument(f"{parameter.name} is an {parameter.type.name}, which param.pck cannot carry")
     return _CODE_OF[parameter.type]
 
 

@@ -7,7 +7,7 @@ from enum import IntEnum
 from struct import Struct
 from typing import SupportsFloat, SupportsIndex
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.snapshot import Snapshot
 from aerokit.wording import shown
 
@@ -103,34 +103,34 @@ class Parameter(Snapshot):
 def check_name(name: str) -> str:
     """The name, when a message can carry it.
 
-    Raises :class:`LocalProtocolError` unless it is 1 to 16 printable ASCII characters without spaces.
+    Raises :class:`InvalidArgument` unless it is 1 to 16 printable ASCII characters without spaces.
     """
     if not isinstance(name, str):
-        raise LocalProtocolError(f"parameter name = {shown(name)} is no text")
+        raise InvalidArgument(f"parameter name = {shown(name)} is no text")
     if not 0 < len(name) <= NAME_LENGTH:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"parameter name = {shown(name)} has {len(name)} characters, 1 to {NAME_LENGTH} are possible"
         )
     if not all("!" <= character <= "~" for character in name):
-        raise LocalProtocolError(f"parameter name = {shown(name)}: ASCII without spaces is possible only")
+        raise InvalidArgument(f"parameter name = {shown(name)}: ASCII without spaces is possible only")
     return name
 
 
 def checked_value(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
     """The value as a vehicle holds it in that type: an int, or the nearest 32-bit number.
 
-    Raises :class:`LocalProtocolError` for what the type cannot hold: NaN, infinity, 300 as an INT8, 1.5 as an
+    Raises :class:`InvalidArgument` for what the type cannot hold: NaN, infinity, 300 as an INT8, 1.5 as an
     integer. ``True`` is 1.
     """
     number = number_of(name, value)
     if isinstance(number, float) and not math.isfinite(number):
-        raise LocalProtocolError(f"{name} = {shown(value)}: a finite number is allowed only")
+        raise InvalidArgument(f"{name} = {shown(value)}: a finite number is allowed only")
     if type.is_integer and number != int(number):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"{name} = {shown(value)}: whole numbers are allowed only (it is an {type.name})"
         )
     if not type.low <= number <= type.high:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"{name} = {shown(value)} must be in {type.low}..{type.high} (it is an {type.name})"
         )
     if type.is_integer:
@@ -139,14 +139,14 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
 
 
 def number_of(name: str, value: object) -> int | float:
-    """An int, a float, or what says that it is one of them, as numpy's numbers do; else LocalProtocolError."""
+    """An int, a float, or what says that it is one of them, as numpy's numbers do; else InvalidArgument."""
     if isinstance(value, (int, float)):
         return value
     if isinstance(value, SupportsIndex):
         return value.__index__()
     if isinstance(value, SupportsFloat):
         return float(value)
-    raise LocalProtocolError(f"{name} = {shown(value)} is no number")
+    raise InvalidArgument(f"{name} = {shown(value)} is no number")
 
 
 def to_float32(value: float) -> float:

@@ -9,7 +9,7 @@ import math
 import struct
 from struct import Struct
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters.parameter import ParameterType, checked_value
 from aerokit.snapshot import Snapshot
@@ -88,25 +88,23 @@ def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
 def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noqa: A002
     """The value as the component holds it: an int, a float of 32 bits, a text or bytes.
 
-    Raises :class:`LocalProtocolError` for what the type cannot hold: 300 as a UINT8, 1.5 as an integer, a text for a
+    Raises :class:`InvalidArgument` for what the type cannot hold: 300 as a UINT8, 1.5 as an integer, a text for a
     number, a number for a text, more than 128 bytes.
     """
     if type in _STRUCTS:
         if isinstance(value, (str, bytes, bytearray)):
-            raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: a number")
+            raise InvalidArgument(f"{name} = {shown(value)} is not allowed: a number")
         return checked_value(name, value, ParameterType(type))  # type: ignore[arg-type]  # it checks that, too
     if not isinstance(value, (str, bytes, bytearray)):
-        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: a text or bytes")
+        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: a text or bytes")
     try:
         data = value.encode() if isinstance(value, str) else bytes(value)
     except UnicodeEncodeError:
-        raise LocalProtocolError(f"{name} = {shown(value)} has characters that cannot be encoded") from None
+        raise InvalidArgument(f"{name} = {shown(value)} has characters that cannot be encoded") from None
     if len(data) > LONGEST_VALUE:
-        raise LocalProtocolError(
-            f"{name} = {shown(value)} has {len(data)} bytes, at most {LONGEST_VALUE} fit"
-        )
+        raise InvalidArgument(f"{name} = {shown(value)} has {len(data)} bytes, at most {LONGEST_VALUE} fit")
     if data.endswith(b"\0"):
-        raise LocalProtocolError(f"{name} = {shown(value)}: zeros at its end would be lost")
+        raise InvalidArgument(f"{name} = {shown(value)}: zeros at its end would be lost")
     return setting_value(data, type)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Protocol
 
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError
+from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
 from aerokit.protocols.exchange import Exchange
@@ -55,13 +55,11 @@ def command_long(
     """Build a COMMAND_LONG; ``params`` are param1 to param7, missing ones are 0, NaN is allowed.
 
     Raises:
-        LocalProtocolError: more than seven parameters, not a number, infinite, or no target system.
+        InvalidArgument: more than seven parameters, not a number, infinite, or no target system.
     """
     _check_target(target_system, command)
     if len(params) > 7:
-        raise LocalProtocolError(
-            f"{command_name(command)} takes at most 7 parameters, {len(params)} were given"
-        )
+        raise InvalidArgument(f"{command_name(command)} takes at most 7 parameters, {len(params)} were given")
     return CommandLong(target_system, target_component, command, 0, *_checked_params(command, params, 7))
 
 
@@ -80,16 +78,16 @@ def command_int(
     (or 1e-4 m in local frames), ``z`` the altitude in metres in ``frame`` (MAV_FRAME).
 
     Raises:
-        LocalProtocolError: more than four parameters, a value outside its type, or no target system.
+        InvalidArgument: more than four parameters, a value outside its type, or no target system.
     """
     _check_target(target_system, command)
     if len(params) > 4:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"{command_name(command)} as COMMAND_INT takes at most 4 parameters beside x, y, z"
         )
     for field, value in (("x", x), ("y", y)):
         if not isinstance(value, int) or not -(2**31) <= value < 2**31:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits"
             )
     param1, param2, param3, param4 = _checked_params(command, params, 4)
@@ -150,10 +148,10 @@ class CommandExchange(Exchange[CommandAck]):
             attempt_timeout = ATTEMPT_TIMEOUT_S * (ATTEMPTS if is_order_once else 1)
         attempt_timeout = max(attempt_timeout, answers_within_s) if attempt_timeout > 0 else attempt_timeout
         if attempts < 1:
-            raise LocalProtocolError(f"attempts = {attempts} is not allowed: at least 1")
+            raise InvalidArgument(f"attempts = {attempts} is not allowed: at least 1")
         for name, seconds in (("attempt_timeout", attempt_timeout), ("progress_timeout", progress_timeout)):
             if not seconds > 0:
-                raise LocalProtocolError(f"{name} = {seconds!r} is not allowed: above 0")
+                raise InvalidArgument(f"{name} = {seconds!r} is not allowed: above 0")
         self._message = message
         self._own = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
@@ -307,7 +305,7 @@ _HINTS: dict[int, str] = {
 
 def _check_target(target_system: int, command: int) -> None:
     if not 1 <= target_system <= 255:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"{command_name(command)}: target_system = {target_system} is not allowed: 1 to 255"
             " (0 would command every vehicle on the link)"
         )
@@ -328,7 +326,7 @@ def _checked_number(command: int, field: str, value: float) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):
-        raise LocalProtocolError(f"{command_name(command)}: {field} = {value!r} is not a number") from None
+        raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a number") from None
     if math.isinf(number) or abs(number) > FLOAT32_MAX:
-        raise LocalProtocolError(f"{command_name(command)}: {field} = {value!r} does not fit into 32 bits")
+        raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} does not fit into 32 bits")
     return number

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
-from aerokit.errors import FileError, LocalProtocolError
+from aerokit.errors import FileError, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.snapshot import Snapshot
 
@@ -148,18 +148,18 @@ def path_bytes(path: str) -> bytes:
     """A path as it is sent.
 
     Raises:
-        LocalProtocolError: it is empty, not text that UTF-8 can encode, has a NUL, or is longer than 238 bytes.
+        InvalidArgument: it is empty, not text that UTF-8 can encode, has a NUL, or is longer than 238 bytes.
     """
     if not isinstance(path, str):
-        raise LocalProtocolError(f"path = {path!r} is not allowed: text")
+        raise InvalidArgument(f"path = {path!r} is not allowed: text")
     try:
         encoded = path.encode()
     except UnicodeEncodeError:
-        raise LocalProtocolError(f"path = {path!r} is not allowed: text that UTF-8 can encode") from None
+        raise InvalidArgument(f"path = {path!r} is not allowed: text that UTF-8 can encode") from None
     if not encoded or b"\0" in encoded:
-        raise LocalProtocolError(f"path = {path!r} is not allowed: not empty, without NUL")
+        raise InvalidArgument(f"path = {path!r} is not allowed: not empty, without NUL")
     if len(encoded) > PATH_SIZE:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"path = {path!r} is not allowed: {len(encoded)} bytes, one message has room for {PATH_SIZE}"
         )
     return encoded

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, TypeVar
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.protocols.exchange import Exchange
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.snapshot import Snapshot
@@ -80,7 +80,7 @@ class Transfer(Exchange[ResultT]):
     ) -> None:
         super().__init__()
         if not patience_s > 0:
-            raise LocalProtocolError(f"patience_s = {patience_s!r} is not allowed: above 0")
+            raise InvalidArgument(f"patience_s = {patience_s!r} is not allowed: above 0")
         self.target_system: int = target_system
         self.target_component: int = target_component
         self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip

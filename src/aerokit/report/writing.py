@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checked
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.flights.failsafes import failsafes
 from aerokit.flights.reading import check_log_name, read_flight
 from aerokit.report.comparing import NAMES, comparison
@@ -62,19 +62,19 @@ def write_report(
         on_progress: called now and then with the bytes that were read, of each log in its turn.
 
     Raises:
-        LocalProtocolError: the file is there already, or is a log itself.
+        InvalidArgument: the file is there already, or is a log itself.
         FileFormatError: a log is none, or has nothing that can be read.
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``report`` is not installed.
     """
     to = Path(target)
     if to.suffix.lower() not in (".html", ".htm"):
-        raise LocalProtocolError(f"{to} is no name of a report: it must end in .html")
+        raise InvalidArgument(f"{to} is no name of a report: it must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
     for each in logs:
         check_log_name(Path(each))  # before the target, whose name is made of it
     if to.exists() and not force:
-        raise LocalProtocolError(f"{to} is there already: it is replaced with force (--force) only")
+        raise InvalidArgument(f"{to} is there already: it is replaced with force (--force) only")
     flights = [read_flight(each, system_id=system_id, on_progress=on_progress) for each in logs]
     found = [figures(flight) for flight in flights]
     told = [summary(*each) for each in zip(flights, found, strict=True)]

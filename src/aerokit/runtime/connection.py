@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import anyio
 
 from aerokit.arguments import checked
-from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkLost, LocalProtocolError
+from aerokit.errors import AerokitError, BusyError, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -89,12 +89,12 @@ class Connection:
         heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     ) -> None:
         if not 1 <= source_system <= 255:
-            raise LocalProtocolError(f"source_system = {source_system} is not allowed: 1 to 255")
+            raise InvalidArgument(f"source_system = {source_system} is not allowed: 1 to 255")
         if not 0 <= source_component <= 255:
-            raise LocalProtocolError(f"source_component = {source_component} is not allowed: 0 to 255")
+            raise InvalidArgument(f"source_component = {source_component} is not allowed: 0 to 255")
         _check_version(mavlink_version)
         if dialect.get(Heartbeat.ID) is not Heartbeat:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"dialect {dialect.name!r} has no HEARTBEAT: pass Dialect.extended_by of the standard one"
             )
         self.link = link
@@ -158,7 +158,7 @@ class Connection:
         or for one that was never heard.
 
         Raises:
-            LocalProtocolError: a field is out of range; nothing was sent.
+            InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
@@ -175,12 +175,12 @@ class Connection:
         signature, or that it has none, stays as it is.
 
         Raises:
-            LocalProtocolError: this is not exactly one MAVLink frame; nothing was sent.
+            InvalidArgument: this is not exactly one MAVLink frame; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
         if not is_whole_frame(data):
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{len(data)} bytes beginning with {bytes(data[:3]).hex()!r} are not one frame"
             )
         frame = Frame.parse(bytes(data))
@@ -225,7 +225,7 @@ class Connection:
     def mavlink_version(self) -> int:
         """Of what we send, 1 or 2. MAVLink 1 has no message ids above 255 and no extension fields.
 
-        May be set while the connection is open, to what the vehicle speaks; LocalProtocolError for another number.
+        May be set while the connection is open, to what the vehicle speaks; InvalidArgument for another number.
         """
         return self._encoder.version
 
@@ -240,7 +240,7 @@ class Connection:
         """What signs the frames that we send and checks those that we receive; None: neither.
 
         It has the time stamp to keep (``signing.timestamp``) and counts refused frames (``signing.refused``). May be
-        set while the connection is open; LocalProtocolError while we send MAVLink 1, which has no signatures.
+        set while the connection is open; InvalidArgument while we send MAVLink 1, which has no signatures.
         """
         return self._encoder.signing
 
@@ -259,7 +259,7 @@ class Connection:
         """Return a stream of these messages or events, of one system (or of all: 0), for use in a ``with`` block.
 
         Raises:
-            LocalProtocolError: no type, or a type that the dialect does not hold.
+            InvalidArgument: no type, or a type that the dialect does not hold.
         """
         self.check_types(types)
 
@@ -307,14 +307,14 @@ class Connection:
         return self._taps.add_sent(sink)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise LocalProtocolError unless each of these can be subscribed to."""
+        """Raise InvalidArgument unless each of these can be subscribed to."""
         if not types:
-            raise LocalProtocolError("name at least one message or event class to subscribe to")
+            raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
             if not isinstance(item, type) or not issubclass(item, (Message, Event)):
-                raise LocalProtocolError(f"{item!r} is neither a message class nor an event class")
+                raise InvalidArgument(f"{item!r} is neither a message class nor an event class")
             if issubclass(item, Message) and self.bus.dialect.get(item.ID) is None:
-                raise LocalProtocolError(f"{item.NAME} is not in this connection's dialect")
+                raise InvalidArgument(f"{item.NAME} is not in this connection's dialect")
 
     def on_end(self, ender: Callable[[Exception], None]) -> Detach:
         """Have ``ender(error)`` called when the connection ends; at once if it has ended already."""
@@ -532,4 +532,4 @@ def _only(system_id: int, sink: Sink) -> Sink:
 
 def _check_version(version: int) -> None:
     if version not in (1, 2):
-        raise LocalProtocolError(f"mavlink_version = {version} is not allowed: 1 or 2")
+        raise InvalidArgument(f"mavlink_version = {version} is not allowed: 1 or 2")

@@ -9,7 +9,7 @@ import anyio
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links import ReconnectingLink, create_link
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
@@ -85,12 +85,12 @@ async def open_connection(
             knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
 
     Raises:
-        LocalProtocolError: an argument is wrong; nothing was opened.
+        InvalidArgument: an argument is wrong; nothing was opened.
         LinkOpenError: the link or the file for the recording could not be opened.
         ConnectionClosed, BusyError: the link given was used before.
     """
     if not baud > 0:
-        raise LocalProtocolError(f"baud = {baud} is not allowed: above 0")
+        raise InvalidArgument(f"baud = {baud} is not allowed: above 0")
     link = _link(address, baud, reconnect, peers)
     connection = Connection(
         link,
@@ -126,12 +126,12 @@ def _link(
     if not isinstance(address, Link):
         return _several(address, baud, reconnect, peers)
     if reconnect:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             "reconnect = True is not allowed with a link, which can be opened once only: pass an address,"
             " or a ReconnectingLink of aerokit.links"
         )
     if peers is not None:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             "peers = … is not allowed with a link: pass an address, or give them to the link (UdpListen, TcpListen)"
         )
     return address
@@ -141,12 +141,12 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
     if not isinstance(addresses, (list, tuple)) or not all(
         isinstance(each, (str, Link)) for each in addresses
     ):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"address = {shown(addresses)} is not allowed: an address, a link, or a list of these"
         )
     if len(addresses) < 2:
         if not addresses:
-            raise LocalProtocolError("address = [] is not allowed: at least one")
+            raise InvalidArgument("address = [] is not allowed: at least one")
         return _link(addresses[0], baud, reconnect, peers)
     from aerokit.links import SeveralLinks, parse_address  # few programs have several
 
@@ -161,7 +161,7 @@ def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers:
         if where.option("costly") == "1":
             costly.add(index)
         if where.kind == "replay":
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"{address} is not allowed among several links: a recording is no link to a vehicle"
             )
         listened_to = peers if where.kind in ("udpin", "udpbcast", "tcpin") else None
@@ -175,7 +175,7 @@ def _refuse_twice(addresses: Sequence[str | Link], places: Sequence[Link | LinkA
     for address, place in zip(addresses, places):  # noqa: B905 - as many
         which = _which(place)
         if which in seen:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"address = {shown(addresses)} is not allowed: {shown(address)} is named twice; each link once"
             )
         if which is not None:

@@ -6,7 +6,7 @@ import logging
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavAutopilot, MavState, MavType
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.events import HeartbeatPaused, HeartbeatResumed
@@ -41,12 +41,10 @@ class OwnHeartbeat(Snapshot):
 
     def _check(self) -> None:
         if not isinstance(self.type, int) or not 0 <= self.type <= 255:
-            raise LocalProtocolError(f"type = {shown(self.type)} is not allowed: a MAV_TYPE, 0 to 255")
+            raise InvalidArgument(f"type = {shown(self.type)} is not allowed: a MAV_TYPE, 0 to 255")
         limit = self.fed_within_s
         if limit is not None and not (isinstance(limit, (int, float)) and limit >= 1):
-            raise LocalProtocolError(
-                f"fed_within_s = {shown(limit)} is not allowed: at least 1 second, or None"
-            )
+            raise InvalidArgument(f"fed_within_s = {shown(limit)} is not allowed: at least 1 second, or None")
 
 
 class ProofOfLife:

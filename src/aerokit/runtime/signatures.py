@@ -7,7 +7,7 @@ import logging
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.errors import BusyError, LocalProtocolError
+from aerokit.errors import BusyError, InvalidArgument
 from aerokit.mavlink.frame import SIGNED
 from aerokit.runtime.events import FrameRefused
 
@@ -50,7 +50,7 @@ class SignatureGate:
         """Whether everything is let in without looking at it."""
 
     def use(self, signing: Signing | None) -> None:
-        """Sign and check with this from now on; None: neither. LocalProtocolError while we send MAVLink 1."""
+        """Sign and check with this from now on; None: neither. InvalidArgument while we send MAVLink 1."""
         check_signing(signing, self._encoder.version)
         self._encoder.signing = signing
         self._update()
@@ -172,6 +172,6 @@ class _Handover:
 
 
 def check_signing(signing: Signing | None, mavlink_version: int) -> None:
-    """Raise LocalProtocolError when this version has no signatures."""
+    """Raise InvalidArgument when this version has no signatures."""
     if signing is not None and mavlink_version == 1:
-        raise LocalProtocolError("signing needs MAVLink 2: mavlink_version = 1 has no signatures")
+        raise InvalidArgument("signing needs MAVLink 2: mavlink_version = 1 has no signatures")

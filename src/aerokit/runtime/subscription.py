@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 import anyio
 
 from aerokit.arguments import checked
-from aerokit.errors import BusyError, LocalProtocolError, OperationTimeout, SubscriptionOverflow
+from aerokit.errors import BusyError, InvalidArgument, OperationTimeout, SubscriptionOverflow
 from aerokit.runtime.endings import raisable
 
 if TYPE_CHECKING:
@@ -44,9 +44,9 @@ class Subscription(Generic[ItemT]):
         overflow: Overflow = "drop_oldest",
     ) -> None:
         if capacity < 1:
-            raise LocalProtocolError(f"capacity = {capacity} is not allowed: at least 1")
+            raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'"
             )
         self._explain_timeout: Callable[[], str] = str
@@ -94,13 +94,13 @@ class Subscription(Generic[ItemT]):
         Raises:
             OperationTimeout: none came within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
-            LocalProtocolError: it is read outside its ``with``.
+            InvalidArgument: it is read outside its ``with``.
         """
         with anyio.move_on_after(timeout):
             try:
                 return await self.__anext__()
             except StopAsyncIteration:
-                raise LocalProtocolError("this subscription is closed: read it inside its `with`") from None
+                raise InvalidArgument("this subscription is closed: read it inside its `with`") from None
         why = self._explain_timeout()
         raise OperationTimeout(
             f"nothing came on this subscription within {timeout:g} s{f'; {why}' if why else ''}"
@@ -140,7 +140,7 @@ class Subscription(Generic[ItemT]):
 
     async def _wait(self) -> None:
         if self._waiter is not None:
-            raise LocalProtocolError("a subscription has one reader; open a second one for a second reader")
+            raise InvalidArgument("a subscription has one reader; open a second one for a second reader")
         self._waiter = asyncio.get_running_loop().create_future()
         try:
             await self._waiter

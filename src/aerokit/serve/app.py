@@ -107,7 +107,7 @@ def make_app(
         attribution: text that the tile server wants to be shown.
 
     Raises:
-        LocalProtocolError: an argument that cannot be right.
+        InvalidArgument: an argument that cannot be right.
         ConnectionClosed, LinkLost: the connection has ended.
     """
     token = secrets.token_urlsafe(24) if token is None else token

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.serve.problems import Problem, problem_response
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ _TOKEN_CHARACTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvw
 
 
 def check_token(token: str) -> str:
-    """Raise LocalProtocolError unless it can stand in headers and is not short; its value is in no text."""
+    """Raise InvalidArgument unless it can stand in headers and is not short; its value is in no text."""
     if not (SHORTEST_TOKEN <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"a token has {SHORTEST_TOKEN} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this one has {len(token)},"
             " or others"
         )
@@ -85,7 +85,7 @@ def content_policy(tiles: str | None) -> str:
             or any(f"{{{each}}}" not in tiles for each in "xyz")
             or set(tiles) & set(" \t\n\"';,<>\\")
         ):
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"tiles = {tiles!r} is no URL of tiles: https://tiles.example/{{z}}/{{x}}/{{y}}.png"
             )
         pictures += f" {place.scheme}://{place.netloc}"

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import BusyError, HeartbeatTimeout, LocalProtocolError
+from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument
 from aerokit.plain import plain
 from aerokit.position import Position
 from aerokit.runtime.background import Background
@@ -56,16 +56,16 @@ class OrderKind:
     rests: bool = False
 
     def check(self, given: Mapping[str, Any]) -> None:
-        """Raise LocalProtocolError unless these are its arguments; their values are checked by the library."""
+        """Raise InvalidArgument unless these are its arguments; their values are checked by the library."""
         for name in given:
             if name not in self.arguments:
                 known = ", ".join(self.arguments) or "none"
-                raise LocalProtocolError(f"{self.name}: {name[:40]!r} is no argument; there are: {known}")
+                raise InvalidArgument(f"{self.name}: {name[:40]!r} is no argument; there are: {known}")
         for name, argument in self.arguments.items():
             if isinstance(given.get(name), bool):  # Python's True is 1, a flight mode
-                raise LocalProtocolError(f"{self.name}: {name} = {given[name]} is no {argument.type}")
+                raise InvalidArgument(f"{self.name}: {name} = {given[name]} is no {argument.type}")
             if argument.is_required and given.get(name) is None:
-                raise LocalProtocolError(f"{self.name}: {name} is missing ({argument.text})")
+                raise InvalidArgument(f"{self.name}: {name} is missing ({argument.text})")
 
 
 async def _go_to(vehicle: Vehicle, given: dict[str, Any]) -> None:

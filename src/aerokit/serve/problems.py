@@ -12,8 +12,8 @@ from aerokit.errors import (
     BusyError,
     ConnectionClosed,
     HeartbeatTimeout,
+    InvalidArgument,
     LinkError,
-    LocalProtocolError,
     OperationRejected,
     OperationTimeout,
     RemoteProtocolError,
@@ -23,7 +23,7 @@ from aerokit.errors import (
 __all__ = ["Problem", "json_response", "problem_of", "problem_response"]
 
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
-    (LocalProtocolError, 400),
+    (InvalidArgument, 400),
     (HeartbeatTimeout, 503),
     (LinkError, 503),
     (ConnectionClosed, 503),

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.plain import plain
 from aerokit.runtime.background import Background
 from aerokit.runtime.connection import Connection
@@ -57,7 +57,7 @@ class Watch:
         elif isinstance(source, Mapping):
             self._vehicles = source
         else:
-            raise LocalProtocolError(f"{source!r} is no connection, no vehicle and no mapping of vehicles")
+            raise InvalidArgument(f"{source!r} is no connection, no vehicle and no mapping of vehicles")
         self._look()
 
     @property

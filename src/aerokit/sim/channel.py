@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Hashable, Iterable
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.sim.fitting import fitted
 from aerokit.sim.hearing import Hearing
@@ -64,7 +64,7 @@ class Channel:
             encoder.signing = self.signing
         try:
             return encoder.encode(message)
-        except LocalProtocolError:
+        except InvalidArgument:
             # NaN of a parameter, a place beyond the world: whatever made it, vehicles go on
             return encoder.encode(fitted(message))
 

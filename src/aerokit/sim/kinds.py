@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.wording import did_you_mean, shown
 
 if TYPE_CHECKING:
@@ -30,9 +30,9 @@ def kind_names() -> tuple[str, ...]:
 
 
 def kind_class(name: str) -> type[SimulatedVehicle]:
-    """The class of a kind; LocalProtocolError lists the kinds when there is none of that name."""
+    """The class of a kind; InvalidArgument lists the kinds when there is none of that name."""
     if name not in _KINDS:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"vehicle = {shown(name)} is not one of: {', '.join(_KINDS)}{did_you_mean(name, _KINDS)}"
         )
     module, class_name = _KINDS[name]
@@ -43,6 +43,6 @@ def kind_class(name: str) -> type[SimulatedVehicle]:
 def simulated(name: str, **options: Any) -> SimulatedVehicle:
     """A vehicle of that kind, just switched on; ``options`` are its class's (``system_id``, ``home``, ``seed`` …).
 
-    LocalProtocolError when there is no such kind, TypeError when its class has no such option.
+    InvalidArgument when there is no such kind, TypeError when its class has no such option.
     """
     return kind_class(name)(**options)

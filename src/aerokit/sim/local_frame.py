@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 
 __all__ = ["GlobalPoint", "LocalFrame", "true_place"]
 
@@ -48,9 +48,9 @@ class LocalFrame:
 
 
 def true_place(vehicle: Any) -> GlobalPoint:
-    """Where a simulated vehicle really is, whatever it says; LocalProtocolError for one that is nowhere."""
+    """Where a simulated vehicle really is, whatever it says; InvalidArgument for one that is nowhere."""
     frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
     if frame is None or motion is None:
-        raise LocalProtocolError(f"{type(vehicle).__name__} has no true place")
+        raise InvalidArgument(f"{type(vehicle).__name__} has no true place")
     place: GlobalPoint = frame.to_global(motion.north, motion.east, motion.down)
     return place

@@ -8,7 +8,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
@@ -89,7 +89,7 @@ class _Writer(OpenFile):
         try:
             header = read_header(bytes(self._content))
             items = unpack_items(bytes(self._content[: header.length]))
-        except (RemoteProtocolError, LocalProtocolError):
+        except (RemoteProtocolError, InvalidArgument):
             raise FileFault(EINVAL) from None
         if len(self._content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
             raise FileFault(EINVAL)

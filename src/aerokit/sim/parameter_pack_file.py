@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError, RemoteProtocolError
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.parameters.pack import HEADER, MAGIC, pack_served, read_entry, read_header
 from aerokit.sim.file_tree import EINVAL, ENOENT, FileFault, Mount, OpenFile
 
@@ -82,7 +82,7 @@ class _Reader(OpenFile):
                 block_size=self._block,
                 whole_defaults=self._whole_defaults,
             )
-        except LocalProtocolError:
+        except InvalidArgument:
             raise FileFault(EINVAL) from None
 
     def read(self, offset: int, size: int) -> bytes:

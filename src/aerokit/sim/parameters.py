@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavParamType
 from aerokit.parameters import Parameter, ParameterType
 
@@ -91,13 +91,11 @@ class Parameters:
             self._names = None
 
     def change(self, values: Mapping[str, float]) -> None:
-        """Set several; LocalProtocolError for a name that is not there, with those that are like it."""
+        """Set several; InvalidArgument for a name that is not there, with those that are like it."""
         for name, value in values.items():
             if name not in self:
                 similar = ", ".join(get_close_matches(name, self._rows)) or "none"
-                raise LocalProtocolError(
-                    f"the simulated vehicle has no parameter {name!r}; similar: {similar}"
-                )
+                raise InvalidArgument(f"the simulated vehicle has no parameter {name!r}; similar: {similar}")
             self[name] = value
 
     def __contains__(self, name: object) -> bool:

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import AerokitError, LocalProtocolError
+from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.sim.track import metres_from
 from aerokit.whole_file import write_whole
 
@@ -34,10 +34,10 @@ _CORNERS = 90  # of a circle
 
 
 def check_picture(path: str | PathLike[str]) -> None:
-    """LocalProtocolError when this is no name of a picture; AerokitError when what draws it is not installed."""
+    """InvalidArgument when this is no name of a picture; AerokitError when what draws it is not installed."""
     suffix = Path(path).suffix.lower()
     if suffix not in (".svg", ".png"):
-        raise LocalProtocolError(f"{str(path)!r} is no picture: its name must end in .svg or .png")
+        raise InvalidArgument(f"{str(path)!r} is no picture: its name must end in .svg or .png")
     if suffix == ".png":
         _pillow("Image")
 

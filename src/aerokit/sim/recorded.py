@@ -42,7 +42,7 @@ class RecordedVehicle(SimulatedVehicle):
 
     ``system_id``: which vehicle of the recording, None for the first; ``start_s``: so much of the recording is left
     out; ``repeat``: it begins anew at its end, where it is silent else. Faults work as on any vehicle, but for those
-    of its sensors and parameters. LocalProtocolError when no vehicle is in the recording, OSError when it cannot be
+    of its sensors and parameters. InvalidArgument when no vehicle is in the recording, OSError when it cannot be
     read.
     """
 

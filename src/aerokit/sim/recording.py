@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, BinaryIO
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavMissionResult, MavType
@@ -64,7 +64,7 @@ class Plan:
 class FlightRecording:
     """A recording, read. Times are seconds since its first message of the vehicle, long silences cut.
 
-    ``system_id`` None takes the first autopilot that says HEARTBEAT. LocalProtocolError when there is none,
+    ``system_id`` None takes the first autopilot that says HEARTBEAT. InvalidArgument when there is none,
     OSError when the file cannot be read.
     """
 
@@ -205,4 +205,4 @@ def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tupl
         if heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS:
             return frame.system_id, frame.component_id
     which = "no vehicle" if system_id is None else f"no vehicle with system id {system_id}"
-    raise LocalProtocolError(f"the recording has {which} in it: no heartbeat of an autopilot")
+    raise InvalidArgument(f"the recording has {which} in it: no heartbeat of an autopilot")

@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import BusyError, LinkLost, LocalProtocolError
+from aerokit.errors import BusyError, InvalidArgument, LinkLost
 from aerokit.links import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 from aerokit.sim.channel import datagrams
 from aerokit.sim.hearing import SharedHearing
@@ -60,7 +60,7 @@ class SimulatorServer:
         vehicles_on: Sequence[Sequence[SimulatedVehicle]] | None = None,
     ) -> None:
         if not speedup > 0:
-            raise LocalProtocolError(f"speedup = {speedup!r} must be above 0")
+            raise InvalidArgument(f"speedup = {speedup!r} must be above 0")
         self.vehicles: tuple[SimulatedVehicle] | tuple[SimulatedVehicle, ...] = (
             (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
         )
@@ -69,9 +69,7 @@ class SimulatorServer:
             list[tuple[SimulatedVehicle] | tuple[SimulatedVehicle, ...]] | list[Sequence[SimulatedVehicle]]
         ) = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
         if len(self.vehicles_on) != len(self._links):
-            raise LocalProtocolError(
-                f"vehicles_on is for {len(self.vehicles_on)} links of {len(self._links)}"
-            )
+            raise InvalidArgument(f"vehicles_on is for {len(self.vehicles_on)} links of {len(self._links)}")
         self._speedup = speedup
         self._dues = [0.0] * len(self.vehicles)  # when each vehicle has something to do
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
@@ -376,7 +374,7 @@ async def open_simulator(
 ) -> AsyncIterator[SimulatorServer]:
     """Serve vehicles on addresses ("tcpin:0.0.0.0:5760", "udpout:127.0.0.1:14550") for other programs.
 
-    Raises LocalProtocolError for a wrong address, LinkOpenError for one that cannot be opened.
+    Raises InvalidArgument for a wrong address, LinkOpenError for one that cannot be opened.
     """
     links = [create_link(address) for address in addresses]
     async with SimulatorServer(vehicles, links, speedup=speedup) as server:

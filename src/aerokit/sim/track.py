@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 from aerokit import geo
 from aerokit.autopilots import autopilot_for
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.position import Position
 from aerokit.sim.ardupilot.fence_zones import Polygon
@@ -328,7 +328,7 @@ def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[flo
 
 
 def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
-    """Where a vehicle really is now, and how it is; LocalProtocolError for one that has no such place."""
+    """Where a vehicle really is now, and how it is; InvalidArgument for one that has no such place."""
     place, flown = true_place(vehicle), cast("Any", vehicle)
     return TrackPoint(
         vehicle.now,
@@ -345,11 +345,11 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
 def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track:
     """Note from now on where a vehicle is, every ``interval_s`` simulated seconds; reboots do not end it.
 
-    The vehicle's own timers do it; neither its bytes nor its noise change by that. Raises LocalProtocolError for a
+    The vehicle's own timers do it; neither its bytes nor its noise change by that. Raises InvalidArgument for a
     vehicle that has no true place, and for an interval that is not above 0.
     """
     if not interval_s > 0:
-        raise LocalProtocolError(f"interval_s = {interval_s!r} must be above 0")
+        raise InvalidArgument(f"interval_s = {interval_s!r} must be above 0")
     true_place(vehicle)
     origin = cast("Any", vehicle).frame.origin
     home = Position(origin.latitude_e7 * 1e-7, origin.longitude_e7 * 1e-7, origin.altitude_m)

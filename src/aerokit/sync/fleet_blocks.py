@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.sync.blocking_block import BlockingBlock
 from aerokit.sync.blocks import ConnectionTwin, TwinOf, VehicleTwin
 from aerokit.sync.loop_thread import Held, LoopThread
@@ -115,7 +115,7 @@ def opened_fleet(
     ]
     loops = {each._loop for each in given if isinstance(each, (ConnectionTwin, VehicleTwin))}
     if len(loops) > 1:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             "sources: these were opened apart, each on a loop of its own: open one connection for them"
         )
     loop = next(iter(loops), None) or LoopThread()

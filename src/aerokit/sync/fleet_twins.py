@@ -118,7 +118,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or a place is too far away. Nothing was sent.
+            InvalidArgument: a name is nobody's, or a place is too far away. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
@@ -157,7 +157,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             slack_s: for corridors: by how many seconds one may be early or late compared with another.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is missing.
+            InvalidArgument: a name is nobody's, or an argument is missing.
             ValueUnknownError: it is not known where one of them is.
         """
         return self._loop.call(
@@ -178,7 +178,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             origin: where its metres count from; without an altitude above the sea it is at the home of the first.
 
         Raises:
-            LocalProtocolError: a track is nobody's.
+            InvalidArgument: a track is nobody's.
             ValueUnknownError: it is not known where the first of them is.
         """
         return self._loop.call(self.aio.show_starts, show, origin)
@@ -209,7 +209,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             speed_m_s: ground speed on the way to the first points; None leaves it.
 
         Raises:
-            LocalProtocolError: a track is nobody's, or an argument is out of range. Nothing was sent.
+            InvalidArgument: a track is nobody's, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come nearer to each other than this fleet allows, or one of its members does not
                 take part. Nothing was sent.
             FleetError: one of them did not answer TIMESYNC or did not get to its first point. The show was not begun.
@@ -242,7 +242,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds that each of them has for a leg; None: as long as it takes.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
+            InvalidArgument: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
             ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
@@ -268,7 +268,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             max_speed_m_s: nobody is told to fly faster, in m/s.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is out of range.
+            InvalidArgument: a name is nobody's, or an argument is out of range.
             OperationRejected: the leader does not take part.
         """
         return Following(self._loop, self._loop.call(
@@ -299,7 +299,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds that each of them has; None: as long as something comes.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or a mission cannot be right. Nothing was sent.
+            InvalidArgument: a name is nobody's, or a mission cannot be right. Nothing was sent.
             OperationRejected: one of them does not take part now, or the ways come too near. Nothing was sent.
             FleetError: one of them did not take its mission: none of them will be started.
         """
@@ -348,7 +348,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             min_distance_m: metres that have to be between any two; None: the fleet's own.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is missing.
+            InvalidArgument: a name is nobody's, or an argument is missing.
             ValueUnknownError: it is not known where one of them is.
         """
         return self._loop.call(self.aio.compare_missions, missions, min_distance_m=min_distance_m)
@@ -372,7 +372,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             **options: of the method.
 
         Raises:
-            LocalProtocolError: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
         """
         return self._loop.run(self.aio.do, action, *arguments, timeout=timeout, stagger_s=stagger_s, **options)
 
@@ -416,7 +416,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             stagger_s: each begins so many seconds after the one before; None: all at once.
 
         Raises:
-            LocalProtocolError: the altitude is out of range. Nothing was sent.
+            InvalidArgument: the altitude is out of range. Nothing was sent.
         """
         return self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, stagger_s=stagger_s)
 
@@ -455,7 +455,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds that each of them has.
 
         Raises:
-            LocalProtocolError: one of them has no such mode. Nothing was sent.
+            InvalidArgument: one of them has no such mode. Nothing was sent.
         """
         return self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -501,7 +501,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Those of one group.
 
         Raises:
-            LocalProtocolError: there is no such group.
+            InvalidArgument: there is no such group.
         """
         return Selection(self._loop, self._loop.call(self.aio.group, name))
 
@@ -509,7 +509,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         """Those with one role.
 
         Raises:
-            LocalProtocolError: nobody has it.
+            InvalidArgument: nobody has it.
         """
         return Selection(self._loop, self._loop.call(self.aio.role, name))
 
@@ -545,7 +545,7 @@ class Fleet(FleetTwin):
             apart: what :meth:`plan_apart` has decided about these targets.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or a place is too far away. Nothing was sent.
+            InvalidArgument: a name is nobody's, or a place is too far away. Nothing was sent.
             ValueUnknownError: it is not known where one of them is. Nothing was sent.
             OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
                 out between two legs in layers: the others stay where they are.
@@ -584,7 +584,7 @@ class Fleet(FleetTwin):
             slack_s: for corridors: by how many seconds one may be early or late compared with another.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is missing.
+            InvalidArgument: a name is nobody's, or an argument is missing.
             ValueUnknownError: it is not known where one of them is.
         """
         return self._loop.call(
@@ -605,7 +605,7 @@ class Fleet(FleetTwin):
             origin: where its metres count from; without an altitude above the sea it is at the home of the first.
 
         Raises:
-            LocalProtocolError: a track is nobody's.
+            InvalidArgument: a track is nobody's.
             ValueUnknownError: it is not known where the first of them is.
         """
         return self._loop.call(self.aio.show_starts, show, origin)
@@ -636,7 +636,7 @@ class Fleet(FleetTwin):
             speed_m_s: ground speed on the way to the first points; None leaves it.
 
         Raises:
-            LocalProtocolError: a track is nobody's, or an argument is out of range. Nothing was sent.
+            InvalidArgument: a track is nobody's, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come nearer to each other than this fleet allows, or one of its members does not
                 take part. Nothing was sent.
             FleetError: one of them did not answer TIMESYNC or did not get to its first point. The show was not begun.
@@ -669,7 +669,7 @@ class Fleet(FleetTwin):
             timeout: seconds that each of them has for a leg; None: as long as it takes.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or two places are too near to each other. Nothing was sent.
+            InvalidArgument: a name is nobody's, or two places are too near to each other. Nothing was sent.
             OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
             ValueUnknownError: it is not known where the leader is, or one whose way is compared.
         """
@@ -695,7 +695,7 @@ class Fleet(FleetTwin):
             max_speed_m_s: nobody is told to fly faster, in m/s.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is out of range.
+            InvalidArgument: a name is nobody's, or an argument is out of range.
             OperationRejected: the leader does not take part.
         """
         return Following(self._loop, self._loop.call(
@@ -726,7 +726,7 @@ class Fleet(FleetTwin):
             timeout: seconds that each of them has; None: as long as something comes.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or a mission cannot be right. Nothing was sent.
+            InvalidArgument: a name is nobody's, or a mission cannot be right. Nothing was sent.
             OperationRejected: one of them does not take part now, or the ways come too near. Nothing was sent.
             FleetError: one of them did not take its mission: none of them will be started.
         """
@@ -775,7 +775,7 @@ class Fleet(FleetTwin):
             min_distance_m: metres that have to be between any two; None: the fleet's own.
 
         Raises:
-            LocalProtocolError: a name is nobody's, or an argument is missing.
+            InvalidArgument: a name is nobody's, or an argument is missing.
             ValueUnknownError: it is not known where one of them is.
         """
         return self._loop.call(self.aio.compare_missions, missions, min_distance_m=min_distance_m)
@@ -799,7 +799,7 @@ class Fleet(FleetTwin):
             **options: of the method.
 
         Raises:
-            LocalProtocolError: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
         """
         return self._loop.run(self.aio.do, action, *arguments, timeout=timeout, stagger_s=stagger_s, **options)
 
@@ -843,7 +843,7 @@ class Fleet(FleetTwin):
             stagger_s: each begins so many seconds after the one before; None: all at once.
 
         Raises:
-            LocalProtocolError: the altitude is out of range. Nothing was sent.
+            InvalidArgument: the altitude is out of range. Nothing was sent.
         """
         return self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, stagger_s=stagger_s)
 
@@ -882,7 +882,7 @@ class Fleet(FleetTwin):
             timeout: seconds that each of them has.
 
         Raises:
-            LocalProtocolError: one of them has no such mode. Nothing was sent.
+            InvalidArgument: one of them has no such mode. Nothing was sent.
         """
         return self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -928,7 +928,7 @@ class Fleet(FleetTwin):
         """Those of one group.
 
         Raises:
-            LocalProtocolError: there is no such group.
+            InvalidArgument: there is no such group.
         """
         return Selection(self._loop, self._loop.call(self.aio.group, name))
 
@@ -936,7 +936,7 @@ class Fleet(FleetTwin):
         """Those with one role.
 
         Raises:
-            LocalProtocolError: nobody has it.
+            InvalidArgument: nobody has it.
         """
         return Selection(self._loop, self._loop.call(self.aio.role, name))
 
@@ -946,7 +946,7 @@ class Fleet(FleetTwin):
         Nothing is sent: the next action goes to it, too. **Ask the pilot first.**
 
         Raises:
-            LocalProtocolError: there is no such member.
+            InvalidArgument: there is no such member.
         """
         self._loop.call(self.aio.take_back, name)
 
@@ -954,7 +954,7 @@ class Fleet(FleetTwin):
         """Order a member nothing any more, until :meth:`take_back`. Nothing is sent: it goes on with what it does.
 
         Raises:
-            LocalProtocolError: there is no such member.
+            InvalidArgument: there is no such member.
         """
         self._loop.call(self.aio.let_go, name, why)
 
@@ -968,7 +968,7 @@ class Fleet(FleetTwin):
             How many messages were sent on each link.
 
         Raises:
-            LocalProtocolError: one is longer, or there is none. Nothing was sent.
+            InvalidArgument: one is longer, or there is none. Nothing was sent.
             ConnectionClosed, LinkLost: a link has ended; the others before it have got them.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
@@ -988,7 +988,7 @@ class Fleet(FleetTwin):
             overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
 
         Raises:
-            LocalProtocolError: a type is no event.
+            InvalidArgument: a type is no event.
         """
         return Subscription(self._loop, self._loop.call(self.aio.events, *types, capacity=capacity, overflow=overflow))
 
@@ -1008,7 +1008,7 @@ class Fleet(FleetTwin):
             overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
 
         Raises:
-            LocalProtocolError: there is no such state, or none is named.
+            InvalidArgument: there is no such state, or none is named.
         """
         return Subscription(self._loop, self._loop.call(
             self.aio.states,
@@ -1056,7 +1056,7 @@ def fleet(
         rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
 
     Raises:
-        LocalProtocolError: an argument is wrong, or two vehicles have the same name.
+        InvalidArgument: an argument is wrong, or two vehicles have the same name.
         BusyError: this program has a vehicle object of one of ``system_ids`` on that connection already.
         LinkOpenError: a link could not be opened.
         LinkLost, ConnectionClosed: a link went down while waiting.

@@ -266,7 +266,8 @@ class StateCell(CellTwin[T]):
 class Changes(ChangesTwin[T]):
     """An endless asynchronous iterator over a cell; the latest value wins.
 
-    Raises the error that the cell was closed with. It is registered at the cell only while it waits.
+    Raises the error that the cell was closed with. It is registered at the cell only while it waits. Until it is
+    dropped, each value is decoded as it comes.
     """
 
     @property
@@ -294,7 +295,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         Raises:
             OperationTimeout: none came within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
-            LocalProtocolError: it is read outside its ``with``.
+            InvalidArgument: it is read outside its ``with``.
         """
         return self._loop.run(self.aio.get, timeout)
 
@@ -325,7 +326,7 @@ class Connection(ConnectionTwin):
         """What signs the frames that we send and checks those that we receive; None: neither.
 
         It has the time stamp to keep (``signing.timestamp``) and counts refused frames (``signing.refused``). May be
-        set while the connection is open; LocalProtocolError while we send MAVLink 1, which has no signatures.
+        set while the connection is open; InvalidArgument while we send MAVLink 1, which has no signatures.
         """
         return self.aio.signing
 
@@ -337,7 +338,7 @@ class Connection(ConnectionTwin):
         or for one that was never heard.
 
         Raises:
-            LocalProtocolError: a field is out of range; nothing was sent.
+            InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self._loop.call(self.aio.send, message, to=to)
@@ -373,7 +374,7 @@ class Connection(ConnectionTwin):
         """Return a stream of these messages or events, of one system (or of all: 0), for use in a ``with`` block.
 
         Raises:
-            LocalProtocolError: no type, or a type that the dialect does not hold.
+            InvalidArgument: no type, or a type that the dialect does not hold.
         """
         return Subscription(self._loop, self._loop.call(
             self.aio.subscribe,
@@ -415,7 +416,7 @@ class SetpointStream(StreamTwin[SetpointT]):
         """Take a new set-point; it is sent at the next tick, and resent until ``valid_for_s`` has passed.
 
         Raises:
-            LocalProtocolError: a value is out of range; the one before stays in force until it is too old.
+            InvalidArgument: a value is out of range; the one before stays in force until it is too old.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
         self._loop.call(self.aio.set, setpoint)
@@ -601,7 +602,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     another order was given to the gimbal, or control was lost. Then ``set`` and leaving the block raise.
 
     Entering raises:
-        LocalProtocolError: a rate is out of range. Nothing was sent.
+        InvalidArgument: a rate is out of range. Nothing was sent.
         NotSupported: the vehicle has no gimbal manager: mounts of old turn to angles only.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
@@ -621,7 +622,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
             yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
 
         Raises:
-            LocalProtocolError: a rate is out of range; those before stay in force until they are too old.
+            InvalidArgument: a rate is out of range; those before stay in force until they are too old.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
             GimbalTaken: control was lost in the block that has it.
         """
@@ -636,7 +637,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
             duration_s: for so long.
 
         Raises:
-            LocalProtocolError: a rate is out of range.
+            InvalidArgument: a rate is out of range.
             SetpointStreamStopped: the stream ended meanwhile.
             GimbalTaken: control was lost in the block that has it.
         """
@@ -688,7 +689,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             timeout: seconds until it has to be there.
 
         Raises:
-            LocalProtocolError: the tolerance is out of range. Nothing was sent.
+            InvalidArgument: the tolerance is out of range. Nothing was sent.
             NotSupported: the manager can do that with its first gimbal only. Nothing was sent.
             ValueUnknownError: home, or the vehicle's altitude, is not known and is needed here. Nothing was sent.
             CommandRejected: the manager refused.
@@ -720,7 +721,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             timeout: seconds until it has to be there.
 
         Raises:
-            LocalProtocolError: there is no such system id, or the tolerance is out of range. Nothing was sent.
+            InvalidArgument: there is no such system id, or the tolerance is out of range. Nothing was sent.
             NotSupported: the manager cannot do that. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
@@ -775,7 +776,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         that does not know that either.
 
         Raises:
-            LocalProtocolError: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
+            InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
                 asked for. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
@@ -879,7 +880,7 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             max_lag_s: how late the event loop may be.
 
         Raises:
-            LocalProtocolError: a value is out of range. Nothing was sent.
+            InvalidArgument: a value is out of range. Nothing was sent.
         """
         return GimbalRates(self._loop, self._loop.call(
             self.aio.rates,
@@ -915,7 +916,7 @@ class Gimbals(GimbalsTwin):
             device_id: 1 to 6 behind the autopilot, or a component id up to 255.
 
         Raises:
-            LocalProtocolError: there is no such id.
+            InvalidArgument: there is no such id.
             BusyError: too many gimbals were heard of already.
         """
         return Gimbal(self._loop, self._loop.call(self.aio.get, device_id))
@@ -951,7 +952,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit, or the block was left. Nothing was sent.
+            InvalidArgument: a parameter is no number or does not fit, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
             CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
@@ -995,7 +996,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: as for :meth:`command`.
 
         Raises:
-            LocalProtocolError: the order was not posted with it, or the block was left. Nothing was sent.
+            InvalidArgument: the order was not posted with it, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
             CommandTimeout: there was no answer.
             OperationTimeout: it accepted, and stays in another mode.
@@ -1021,7 +1022,7 @@ class Files(TwinOf["AsyncFiles"]):
     (None: no limit). Every method may be cancelled at any moment; the file is closed on the vehicle behind it.
 
     Every method raises:
-        LocalProtocolError: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
+        InvalidArgument: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; ``code`` and ``errno`` say why.
         FileTimeout: it did not end; ``missing`` has the ranges that did not arrive.
 
@@ -1267,7 +1268,7 @@ class Logs(TwinOf["AsyncLogs"]):
             on_progress: called with bytes, and the bytes there will be.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right. Nothing was sent.
+            InvalidArgument: an argument that cannot be right. Nothing was sent.
             FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
             FileTimeout: it did not arrive; ``missing`` has the ranges.
             OSError: the file cannot be written here.
@@ -1295,7 +1296,7 @@ class Logs(TwinOf["AsyncLogs"]):
         """Return the content of a log; arguments as for :meth:`download`.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right. Nothing was sent.
+            InvalidArgument: an argument that cannot be right. Nothing was sent.
             FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
             FileTimeout: it did not arrive; ``missing`` has the ranges.
         """
@@ -1459,7 +1460,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Ask the vehicle for one parameter; ``table[name]`` is what is known without asking.
 
         Raises:
-            LocalProtocolError: the name is none, or longer than 16 characters.
+            InvalidArgument: the name is none, or longer than 16 characters.
             ParameterRejected: the vehicle has no such parameter. It may say so, or answer others and not this one.
             ParameterTimeout: no answer.
         """
@@ -1480,7 +1481,7 @@ class Parameters(TwinOf["AsyncParameters"]):
             did not say itself that it has none, but answered others and not this one.
 
         Raises:
-            LocalProtocolError: a name is none, or longer than 16 characters. Nothing was sent.
+            InvalidArgument: a name is none, or longer than 16 characters. Nothing was sent.
         """
         return self._loop.run(self.aio.probe, *names, patience_s=patience_s, timeout=timeout)
 
@@ -1495,7 +1496,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         """Set one parameter, and return what the vehicle says it is then.
 
         Raises:
-            LocalProtocolError: a name that cannot be, NaN, or a value that the parameter's type cannot hold.
+            InvalidArgument: a name that cannot be, NaN, or a value that the parameter's type cannot hold.
             ParameterRejected: the vehicle has no such parameter, or keeps the value it had; ``code`` says why.
             ParameterTimeout: not confirmed. It may have been set all the same.
         """
@@ -1514,7 +1515,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         A parameter that appears only when another one of them is set (ArduPilot's ``…_ENABLE``) is set after it.
 
         Raises:
-            LocalProtocolError: one of the names or values cannot be; then none of them was set.
+            InvalidArgument: one of the names or values cannot be; then none of them was set.
         """
         return self._loop.run(
             self.aio.set_many,
@@ -1542,7 +1543,7 @@ class Parameters(TwinOf["AsyncParameters"]):
         vehicle's own counts, and the other has no result.
 
         Raises:
-            LocalProtocolError, FileFormatError: a name, a value or the file cannot be; then nothing was set.
+            InvalidArgument, FileFormatError: a name, a value or the file cannot be; then nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         return self._loop.run(
@@ -1661,7 +1662,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
+            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -1692,7 +1693,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Read what the vehicle holds; arguments as for :meth:`upload`.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: items are missing in the end; ``missing`` has them.
             RemoteProtocolError: what it sent makes no sense.
@@ -1711,7 +1712,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it fell silent.
             VerificationFailed: it confirmed, and still holds items.
@@ -1746,7 +1747,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         place to go to (a DO command) is run through: ``current`` then shows the one behind it.
 
         Raises:
-            LocalProtocolError: there is no such item. Nothing was sent.
+            InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: somebody else steers, or a newer order was given, before it was confirmed.
             OperationTimeout: MISSION_CURRENT did not confirm it.
@@ -1762,7 +1763,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Sends MISSION_START to ArduPilot, which takes off then also from the ground, and changes the mode of others.
 
         Raises:
-            LocalProtocolError: there is no such item. Nothing was sent.
+            InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: it is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; ``reasons`` tells.
             OperationTimeout: it accepted and stayed in another mode.
@@ -1855,7 +1856,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
+            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -1886,7 +1887,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         """Read what the vehicle holds; arguments as for :meth:`upload`.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: items are missing in the end; ``missing`` has them.
             RemoteProtocolError: what it sent makes no sense.
@@ -1905,7 +1906,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it fell silent.
             VerificationFailed: it confirmed, and still holds items.
@@ -1964,7 +1965,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
+            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -1995,7 +1996,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         """Read what the vehicle holds; arguments as for :meth:`upload`.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: items are missing in the end; ``missing`` has them.
             RemoteProtocolError: what it sent makes no sense.
@@ -2014,7 +2015,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it fell silent.
             VerificationFailed: it confirmed, and still holds items.
@@ -2115,7 +2116,7 @@ class Camera(TwinOf["AsyncCamera"]):
             on_progress: called with 0–100, or None.
 
         Raises:
-            LocalProtocolError: ``number`` is out of range. Nothing was sent.
+            InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
             CommandTimeout: it did not answer; it may be formatting.
             OperationTimeout: no camera was heard.
@@ -2154,7 +2155,7 @@ class Camera(TwinOf["AsyncCamera"]):
             status_hz: how often it shall tell, above 0 to 50.
 
         Raises:
-            LocalProtocolError: an argument is out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
@@ -2181,7 +2182,7 @@ class Camera(TwinOf["AsyncCamera"]):
             status_hz: how often it shall tell, above 0 to 50.
 
         Raises:
-            LocalProtocolError: an argument is out of range, or the rectangle is none. Nothing was sent.
+            InvalidArgument: an argument is out of range, or the rectangle is none. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
@@ -2209,7 +2210,7 @@ class Camera(TwinOf["AsyncCamera"]):
             steps: −100 to 100.
 
         Raises:
-            LocalProtocolError: ``steps`` is out of range. Nothing was sent.
+            InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer; it may have zoomed.
@@ -2234,7 +2235,7 @@ class Camera(TwinOf["AsyncCamera"]):
             speed: −1 (out) to 1 (in); most cameras know these two.
 
         Raises:
-            LocalProtocolError: ``speed`` is out of range. Nothing was sent.
+            InvalidArgument: ``speed`` is out of range. Nothing was sent.
         """
         return CameraBlock(self._loop, self._loop.call(self.aio.zooming, speed))
 
@@ -2247,7 +2248,7 @@ class Camera(TwinOf["AsyncCamera"]):
             steps: −100 to 100.
 
         Raises:
-            LocalProtocolError: ``steps`` is out of range. Nothing was sent.
+            InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer; it may have moved.
@@ -2283,7 +2284,7 @@ class Camera(TwinOf["AsyncCamera"]):
             speed: −1 (nearer) to 1 (farther); most cameras know these two.
 
         Raises:
-            LocalProtocolError: ``speed`` is out of range. Nothing was sent.
+            InvalidArgument: ``speed`` is out of range. Nothing was sent.
         """
         return CameraBlock(self._loop, self._loop.call(self.aio.focusing, speed))
 
@@ -2314,7 +2315,7 @@ class Camera(TwinOf["AsyncCamera"]):
             timeout: seconds until it must be recording.
 
         Raises:
-            LocalProtocolError: ``status_hz`` is out of range. Nothing was sent.
+            InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: it did not answer; it may be recording.
@@ -2339,7 +2340,7 @@ class Camera(TwinOf["AsyncCamera"]):
         Entering raises what :meth:`start_video` does.
 
         Raises:
-            LocalProtocolError: ``status_hz`` is not 0 to 10. Nothing was sent.
+            InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
         """
         return CameraBlock(self._loop, self._loop.call(self.aio.video, status_hz=status_hz))
 
@@ -2359,7 +2360,7 @@ class Camera(TwinOf["AsyncCamera"]):
             stream: its number, 0 (all of them) to 255.
 
         Raises:
-            LocalProtocolError: there can be no such stream. Nothing was sent.
+            InvalidArgument: there can be no such stream. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
             CommandRejected: the camera refused; there is no such stream.
             CommandTimeout: it did not answer.
@@ -2430,7 +2431,7 @@ class Camera(TwinOf["AsyncCamera"]):
             count: 0 (until the block ends) to 32767; after so many the iterator ends.
 
         Raises:
-            LocalProtocolError: an argument is out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
         """
         return PhotoInterval(self._loop, self._loop.call(self.aio.photo_interval, seconds, count))
 
@@ -2553,7 +2554,7 @@ class Settings(TwinOf["AsyncSettings"]):
         Raises:
             NotSupported: the camera names no definition file.
             CommandRejected, OperationTimeout: it did not tell what it is.
-            LocalProtocolError: an address of another kind.
+            InvalidArgument: an address of another kind.
             FileFormatError: what came is none, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
             OperationRejected: the web server does not give it.
@@ -2618,7 +2619,7 @@ class Settings(TwinOf["AsyncSettings"]):
         """Ask the component for one setting; ``table[name]`` is what is known without asking.
 
         Raises:
-            LocalProtocolError: the name is none, or longer than 16 characters.
+            InvalidArgument: the name is none, or longer than 16 characters.
             ParameterRejected: the component answers for other settings, and not for this one.
             ParameterTimeout: no answer.
         """
@@ -2638,7 +2639,7 @@ class Settings(TwinOf["AsyncSettings"]):
         again before it returns. What decides on this setting and is not known yet is read before.
 
         Raises:
-            LocalProtocolError: a name or value that cannot be; with a definition: an option or a value that is not
+            InvalidArgument: a name or value that cannot be; with a definition: an option or a value that is not
                 allowed, a setting that can only be read or is excluded now. It was not set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
             ParameterTimeout: not confirmed. It may have been set all the same.
@@ -2711,7 +2712,7 @@ class Component(TwinOf["AsyncComponent"]):
             patience_s: give up when nothing has come for so many seconds.
 
         Raises:
-            LocalProtocolError: the address is another one.
+            InvalidArgument: the address is another one.
             FileFormatError: the file has more than 16 MB.
             FileError, FileTimeout, OperationRejected: it was not given.
         """
@@ -3026,7 +3027,7 @@ class Vehicle(VehicleTwin):
         See https://mavlink.io/en/services/command.html.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            InvalidArgument: a parameter is no number or does not fit. Nothing was sent.
             CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
             CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
         """
@@ -3085,7 +3086,7 @@ class Vehicle(VehicleTwin):
         set-point is newer than what was :meth:`posted` about motion. Neither is, to another system than this vehicle.
 
         Raises:
-            LocalProtocolError: a field is out of range; nothing was sent.
+            InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
         self._loop.call(self.aio.send, message)
@@ -3115,7 +3116,7 @@ class Vehicle(VehicleTwin):
             armed: whether it arms or disarms; one about ``"arm"`` has to say.
 
         Raises:
-            LocalProtocolError: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
+            InvalidArgument: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
         """
         return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 
@@ -3136,7 +3137,7 @@ class Vehicle(VehicleTwin):
         camera or another component is to be asked for: ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
+            InvalidArgument: no type, a rate out of range, or a message that the dialect does not hold.
         """
         return Subscription(self._loop, self._loop.call(self.aio.subscribe, *types, capacity=capacity, overflow=overflow, rate_hz=rate_hz))
 
@@ -3153,7 +3154,7 @@ class Vehicle(VehicleTwin):
         common states is asked for as by :meth:`rate`.
 
         Raises:
-            LocalProtocolError: the rate is not above 0 and at most 1000. Nothing was sent.
+            InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
         """
         return self._block(self.aio.streams(rate_hz))
 
@@ -3171,7 +3172,7 @@ class Vehicle(VehicleTwin):
         ``vehicle.component(100).message(...)``.
 
         Raises:
-            LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
+            InvalidArgument: the rate is out of range, or the dialect does not hold the message.
         """
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
@@ -3234,7 +3235,7 @@ class Vehicle(VehicleTwin):
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
 
         Raises:
-            LocalProtocolError: this vehicle has no such mode; the text lists those it has. Nothing was sent.
+            InvalidArgument: this vehicle has no such mode; the text lists those it has. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: it accepted and stayed in another mode, or did not answer.
@@ -3327,7 +3328,7 @@ class Vehicle(VehicleTwin):
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
 
         Raises:
-            LocalProtocolError: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
+            InvalidArgument: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
             CommandTimeout: there was no answer, and it did not arm; the text says whether the order may still arrive.
@@ -3431,7 +3432,7 @@ class Vehicle(VehicleTwin):
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
 
         Raises:
-            LocalProtocolError: the target is no place on earth or too far away, or another argument is out of range.
+            InvalidArgument: the target is no place on earth or too far away, or another argument is out of range.
                 Nothing was sent.
             ValueUnknownError: position or home is not known and is needed here.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
@@ -3457,7 +3458,7 @@ class Vehicle(VehicleTwin):
         ArduPilot takes it only while it is under way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` sees to that.
 
         Raises:
-            LocalProtocolError: out of range. Nothing was sent.
+            InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
         """
         self._loop.run(self.aio.set_speed, speed_m_s)
@@ -3486,7 +3487,7 @@ class Vehicle(VehicleTwin):
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
-            LocalProtocolError: out of range. Nothing was sent.
+            InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed on the way.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
@@ -3513,7 +3514,7 @@ class Vehicle(VehicleTwin):
         old firmware, which does not know it as COMMAND_INT: to within a metre then.
 
         Raises:
-            LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
+            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it knows no position, or the place is none.
             CommandTimeout: there was no answer.
             OperationTimeout: it accepted, and HOME_POSITION did not tell it.
@@ -3545,7 +3546,7 @@ class Vehicle(VehicleTwin):
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
-            LocalProtocolError: the altitude is out of range. Nothing was sent.
+            InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
             OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
                 way.
@@ -3604,7 +3605,7 @@ class Vehicle(VehicleTwin):
         """One of them, to talk to: ``vehicle.component(100).command(…)``. It need not have been heard yet.
 
         Raises:
-            LocalProtocolError: the id is not from 1 to 255.
+            InvalidArgument: the id is not from 1 to 255.
         """
         return Component(self._loop, self._loop.call(self.aio.component, component_id))
 
@@ -3631,7 +3632,7 @@ class Vehicle(VehicleTwin):
             number: its component id (100 to 105, at most 255), or 1 to 6 behind the autopilot.
 
         Raises:
-            LocalProtocolError: there can be no such camera.
+            InvalidArgument: there can be no such camera.
         """
         return Camera(self._loop, self._loop.call(self.aio.camera_at, number))
 
@@ -3750,7 +3751,7 @@ def open_connection(
             knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
 
     Raises:
-        LocalProtocolError: an argument is wrong; nothing was opened.
+        InvalidArgument: an argument is wrong; nothing was opened.
         LinkOpenError: the link or the file for the recording could not be opened.
         ConnectionClosed, BusyError: the link given was used before.
     """
@@ -3825,7 +3826,7 @@ def connect(
             connection: ``async with aerokit.hub.shared(connection, […])``.
 
     Raises:
-        LocalProtocolError: an argument is wrong. Nothing was opened.
+        InvalidArgument: an argument is wrong. Nothing was opened.
         BusyError: this system has a vehicle object on this connection already.
         LinkOpenError: the link, one to share it on, or the file to record to, could not be opened.
         LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.

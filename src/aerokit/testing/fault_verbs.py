@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.sim.faults import Faults
 from aerokit.sim.motion import Wind
 from aerokit.sim.track import TrackPoint, true_point
@@ -23,7 +23,7 @@ OnStage = Callable[[Callable[[Stagehand], None]], None]
 class FaultInjector:
     """Every verb acts at once, or ``after_s`` simulated seconds from now, and, where it says so, for ``for_s``.
 
-    Before the flight is opened, seconds count from its opening. Raises LocalProtocolError for times and shares
+    Before the flight is opened, seconds count from its opening. Raises InvalidArgument for times and shares
     that make no sense. What is planned happens even if the vehicle reboots meanwhile.
     """
 
@@ -66,7 +66,7 @@ class FaultInjector:
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
         """Lose this share of the packets, 0 to 1, in both directions; the same ones for the same seed."""
         if not 0.0 <= share <= 1.0:
-            raise LocalProtocolError(f"share = {share!r} is not allowed: 0 to 1")
+            raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)
         self._set("loss_incoming", share, 0.0, after_s, for_s)
 
@@ -99,7 +99,7 @@ class FaultInjector:
     def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
         """So much charge is left, 0 to 100; it is drained from there."""
         if not 0.0 <= percent <= 100.0:
-            raise LocalProtocolError(f"percent = {percent!r} is not allowed: 0 to 100")
+            raise InvalidArgument(f"percent = {percent!r} is not allowed: 0 to 100")
         self._plan(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:
@@ -116,11 +116,11 @@ class FaultInjector:
 
     def _plan(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
-            raise LocalProtocolError(f"after_s = {after_s!r} must be 0 or more seconds")
+            raise InvalidArgument(f"after_s = {after_s!r} must be 0 or more seconds")
         self._on_stage(lambda hand: hand.do(action, after_s=after_s))
 
 
 def _duration(for_s: float) -> float:
     if not for_s > 0.0:
-        raise LocalProtocolError(f"for_s = {for_s!r} must be above 0 seconds")
+        raise InvalidArgument(f"for_s = {for_s!r} must be above 0 seconds")
     return for_s

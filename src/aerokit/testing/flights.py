@@ -19,7 +19,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import aerokit
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.links import memory_link_pair
 from aerokit.sim.kinds import simulated
 from aerokit.sim.picture import save_picture
@@ -250,7 +250,7 @@ async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Fli
     ``connect=False`` leaves connecting to the program, by ``flight.link``; ``latency_s`` passes on the way in
     both directions; ``record=True`` keeps all that goes over the link, for the report of a test that fails. Other
     options are those of the simulated vehicle: ``seed``, ``home``, ``parameters``, ``battery_percent`` …
-    Raises LocalProtocolError for a kind that does not exist.
+    Raises InvalidArgument for a kind that does not exist.
     """
     fleet = Fleet(kind, **options)
     async with fleet.open():
@@ -266,10 +266,10 @@ def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> Abstrac
 
 
 def repeated(kinds: Sequence[str], count: int | None) -> Sequence[str]:
-    """The kinds, or one kind so many times; LocalProtocolError for what makes no sense."""
+    """The kinds, or one kind so many times; InvalidArgument for what makes no sense."""
     kinds = kinds or ("copter",)
     if count is None:
         return kinds
     if len(kinds) != 1 or count < 1:
-        raise LocalProtocolError(f"count = {count!r} goes with one kind, and is 1 or more")
+        raise InvalidArgument(f"count = {count!r} goes with one kind, and is 1 or more")
     return list(kinds) * count

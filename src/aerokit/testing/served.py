@@ -117,7 +117,7 @@ def hosted_flight(
 
     It waits ``speedup`` times as long for what the program sends by its own clock, unless ``parameters`` says
     otherwise: see `aerokit.sim.patience.wait_longer`.
-    Raises LocalProtocolError for a wrong kind or address, LinkOpenError for one that cannot be opened, and at the
+    Raises InvalidArgument for a wrong kind or address, LinkOpenError for one that cannot be opened, and at the
     end what the vehicle raised, if nobody was told of it.
     """
     from anyio.from_thread import start_blocking_portal

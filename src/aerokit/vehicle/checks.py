@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.wording import one, shown
 
 __all__ = ["check_kind", "check_range"]
 
 
 def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise LocalProtocolError unless ``value`` is of that class: where type hints say "of the same kind" only."""
+    """Raise InvalidArgument unless ``value`` is of that class: where type hints say "of the same kind" only."""
     if not isinstance(value, kind):
-        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: {one(kind.__name__)}")
+        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: {one(kind.__name__)}")
 
 
 def check_range(name: str, value: float, lowest: float, highest: float, *, above: bool = False) -> None:
-    """Raise LocalProtocolError unless ``value`` is from ``lowest`` (with ``above``: above it) to ``highest``."""
+    """Raise InvalidArgument unless ``value`` is from ``lowest`` (with ``above``: above it) to ``highest``."""
     try:
         is_allowed = lowest <= value <= highest and not (above and value == lowest)
     except TypeError:
         is_allowed = False
     if not is_allowed:
         begin = f"above {lowest:g}" if above else f"{lowest:g}"
-        raise LocalProtocolError(f"{name} = {shown(value)} is not allowed: {begin} to {highest:g}")
+        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: {begin} to {highest:g}")

@@ -11,7 +11,7 @@ import anyio
 
 from aerokit.arguments import checked
 from aerokit.async_block import async_block
-from aerokit.errors import BusyError, ConnectFailed, LocalProtocolError
+from aerokit.errors import BusyError, ConnectFailed, InvalidArgument
 from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
@@ -104,7 +104,7 @@ async def connect(
             connection: ``async with aerokit.hub.shared(connection, […])``.
 
     Raises:
-        LocalProtocolError: an argument is wrong. Nothing was opened.
+        InvalidArgument: an argument is wrong. Nothing was opened.
         BusyError: this system has a vehicle object on this connection already.
         LinkOpenError: the link, one to share it on, or the file to record to, could not be opened.
         LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.
@@ -113,27 +113,25 @@ async def connect(
     _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
         if record is not None:
-            raise LocalProtocolError(
-                "record = … is not allowed here: the connection is open; use its record()"
-            )
+            raise InvalidArgument("record = … is not allowed here: the connection is open; use its record()")
         if signing is not None:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 "signing = … is not allowed here: the connection is open; set its attribute signing"
             )
         if reconnect:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 "reconnect = True is not allowed here: the connection is open; say it to open_connection"
             )
         if heartbeat != OwnHeartbeat():
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 "heartbeat = … is not allowed here: the connection is open; say it to open_connection"
             )
         if peers is not None or may_move:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 "peers and may_move are not allowed here: the connection is open; say it to open_connection"
             )
         if share:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 "share = … is not allowed here: the connection is open; use aerokit.hub.shared(connection, …)"
             )
         async with _attached(address, system_id, timeout, rates) as vehicle:
@@ -186,15 +184,15 @@ def _check(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
     if system_id is not None and not 1 <= system_id <= 255:
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"system_id = {system_id} is not allowed: 1 to 255, or None for the first heard"
         )
     if not timeout > 0:
-        raise LocalProtocolError(f"timeout = {timeout} is not allowed: above 0")
+        raise InvalidArgument(f"timeout = {timeout} is not allowed: above 0")
     for message_type, hz in (rates or {}).items():
         check_rate(message_type, hz)
         if dialect.get(message_type.ID) is not message_type:
-            raise LocalProtocolError(f"{message_type.NAME} is not in the dialect {dialect.name!r}")
+            raise InvalidArgument(f"{message_type.NAME} is not in the dialect {dialect.name!r}")
 
 
 @asynccontextmanager

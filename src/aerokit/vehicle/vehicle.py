@@ -81,7 +81,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         """One of them, to talk to: ``vehicle.component(100).command(…)``. It need not have been heard yet.
 
         Raises:
-            LocalProtocolError: the id is not from 1 to 255.
+            InvalidArgument: the id is not from 1 to 255.
         """
         return self._components.component(component_id)
 
@@ -114,7 +114,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
             number: its component id (100 to 105, at most 255), or 1 to 6 behind the autopilot.
 
         Raises:
-            LocalProtocolError: there can be no such camera.
+            InvalidArgument: there can be no such camera.
         """
         return self._cameras.at(number)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
 from aerokit.sim.commands import CommandServer, whole
@@ -33,7 +33,7 @@ class SimulatedComponent:
     command that it does not know is left to the others; one that is for it alone is UNSUPPORTED. `faults` mistreats
     what it alone hears and says: what happens to the vehicle's link happens to it besides.
 
-    A component belongs to one vehicle: LocalProtocolError when it is given to a second one.
+    A component belongs to one vehicle: InvalidArgument when it is given to a second one.
     """
 
     TYPE: ClassVar[int]
@@ -69,9 +69,9 @@ class SimulatedComponent:
 
     @property
     def vehicle(self) -> SimulatedVehicle:
-        """Whose links it is on; LocalProtocolError before there is one."""
+        """Whose links it is on; InvalidArgument before there is one."""
         if self._vehicle is None:
-            raise LocalProtocolError("the component is not on a vehicle yet: pass it as one of components=")
+            raise InvalidArgument("the component is not on a vehicle yet: pass it as one of components=")
         return self._vehicle
 
     @property
@@ -92,7 +92,7 @@ class SimulatedComponent:
     def join(self, vehicle: SimulatedVehicle) -> None:
         """Called by the vehicle that it is given to."""
         if self._vehicle is not None:
-            raise LocalProtocolError("the component is on another vehicle already")
+            raise InvalidArgument("the component is on another vehicle already")
         self._vehicle = vehicle
         self._builders = self.builders()
         self._commands = {

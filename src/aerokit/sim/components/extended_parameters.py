@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamExtType, ParamAck
 from aerokit.parameters.setting import setting_bytes, setting_value, settings_equal
@@ -126,7 +126,7 @@ class ExtendedParameters:
             value = type(value)(max(low, min(high, value)))
         try:
             return ParamAck.ACCEPTED, definition.checked(name, value, self.values)
-        except LocalProtocolError:
+        except InvalidArgument:
             return ParamAck.VALUE_UNSUPPORTED, value
 
     def _finish(self, name: str, value: SettingValue) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.sim.local_frame import true_place
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     """None of a vehicle that is nowhere, such as a recording."""
     try:
         place = true_place(vehicle)
-    except LocalProtocolError:
+    except InvalidArgument:
         return None
     motion = vehicle.motion  # type: ignore[attr-defined]
     height = getattr(vehicle, "altitude_m", -motion.down)

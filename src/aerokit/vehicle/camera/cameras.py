@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavType
 from aerokit.runtime.cells import Source, StateCell
@@ -64,7 +64,7 @@ class Cameras:
     def at(self, number: int) -> Camera:
         """The object of one camera, the same each time; it need not have been heard yet."""
         if number not in BEHIND and not 7 <= number <= 255:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"number = {number} is not allowed: 1 to 6 behind the autopilot, or a component id up to 255"
             )
         if number not in self._made:

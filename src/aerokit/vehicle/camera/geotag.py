@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit.arguments import checked
-from aerokit.errors import AerokitError, FileFormatError, LocalProtocolError
+from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
 from aerokit.vehicle.camera.capture import LAST_SECOND, Capture
 from aerokit.whole_file import write_whole
 
@@ -72,12 +72,12 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
     GPSTimeStamp, DateTimeOriginal, and CameraElevationAngle (from the horizon), as far as the capture knows them.
 
     Raises:
-        LocalProtocolError: the capture has no place.
+        InvalidArgument: the capture has no place.
         FileFormatError: these bytes are no JPEG, or their EXIF cannot be read.
         AerokitError: Pillow is not installed.
     """
     if capture.place is None:
-        raise LocalProtocolError(f"capture {capture.index} of camera {capture.camera} has no place")
+        raise InvalidArgument(f"capture {capture.index} of camera {capture.camera} has no place")
     segments, rest = _split(jpeg)
     before = next((each for each in segments if _is_exif(each)), b"")
     image = _pillow("Image")

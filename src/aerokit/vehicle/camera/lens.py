@@ -35,7 +35,7 @@ class LensCalls(CameraPart):
             steps: −100 to 100.
 
         Raises:
-            LocalProtocolError: ``steps`` is out of range. Nothing was sent.
+            InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer; it may have zoomed.
@@ -63,7 +63,7 @@ class LensCalls(CameraPart):
             speed: −1 (out) to 1 (in); most cameras know these two.
 
         Raises:
-            LocalProtocolError: ``speed`` is out of range. Nothing was sent.
+            InvalidArgument: ``speed`` is out of range. Nothing was sent.
         """
         check_range("speed", speed, -1, 1)
         return self._moving("zooming", HAS_ZOOM, ZOOM, CameraZoomType.CONTINUOUS, speed)
@@ -77,7 +77,7 @@ class LensCalls(CameraPart):
             steps: −100 to 100.
 
         Raises:
-            LocalProtocolError: ``steps`` is out of range. Nothing was sent.
+            InvalidArgument: ``steps`` is out of range. Nothing was sent.
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer; it may have moved.
@@ -116,7 +116,7 @@ class LensCalls(CameraPart):
             speed: −1 (nearer) to 1 (farther); most cameras know these two.
 
         Raises:
-            LocalProtocolError: ``speed`` is out of range. Nothing was sent.
+            InvalidArgument: ``speed`` is out of range. Nothing was sent.
         """
         check_range("speed", speed, -1, 1)
         return self._moving("focusing", HAS_FOCUS, FOCUS, SetFocusType.CONTINUOUS, speed)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import FileFormatError, LocalProtocolError, NotSupported
+from aerokit.errors import FileFormatError, InvalidArgument, NotSupported
 from aerokit.vehicle.camera.album import LONGEST, Album
 from aerokit.vehicle.camera.capture import Capture
 from aerokit.vehicle.camera.part import CameraPart
@@ -70,7 +70,7 @@ class PhotoCalls(CameraPart):
             count: 0 (until the block ends) to 32767; after so many the iterator ends.
 
         Raises:
-            LocalProtocolError: an argument is out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
         """
         check_range("seconds", seconds, 0, 3600, above=True)
         check_range("count", count, 0, MOST)
@@ -130,5 +130,5 @@ class PhotoCalls(CameraPart):
             return await self._line.component.fetch(f"mftp://{url}" if url.startswith("/") else url)
         except FileFormatError:
             raise
-        except LocalProtocolError as error:
+        except InvalidArgument as error:
             raise NotSupported(f"read_picture: {error}; nothing was sent") from None

@@ -109,7 +109,7 @@ class StorageCalls(CameraPart):
             on_progress: called with 0–100, or None.
 
         Raises:
-            LocalProtocolError: ``number`` is out of range. Nothing was sent.
+            InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
             CommandTimeout: it did not answer; it may be formatting.
             OperationTimeout: no camera was heard.

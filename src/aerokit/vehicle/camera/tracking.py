@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.camera.decoding import tracked_place_of, tracking_of
@@ -58,7 +58,7 @@ class TrackingCalls(CameraPart):
             status_hz: how often it shall tell, above 0 to 50.
 
         Raises:
-            LocalProtocolError: an argument is out of range. Nothing was sent.
+            InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
@@ -84,7 +84,7 @@ class TrackingCalls(CameraPart):
             status_hz: how often it shall tell, above 0 to 50.
 
         Raises:
-            LocalProtocolError: an argument is out of range, or the rectangle is none. Nothing was sent.
+            InvalidArgument: an argument is out of range, or the rectangle is none. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
@@ -94,7 +94,7 @@ class TrackingCalls(CameraPart):
             check_range(name, value, 0, 1)
         check_range("status_hz", status_hz, 0, 50, above=True)
         if left >= right or top >= bottom:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"left = {left:g}, top = {top:g}, right = {right:g}, bottom = {bottom:g} is no rectangle"
             )
         await self._line.able("track_rectangle", "has_tracking_rectangle")

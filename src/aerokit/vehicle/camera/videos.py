@@ -65,7 +65,7 @@ class VideoCalls(CameraPart):
             timeout: seconds until it must be recording.
 
         Raises:
-            LocalProtocolError: ``status_hz`` is out of range. Nothing was sent.
+            InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: it did not answer; it may be recording.
@@ -104,7 +104,7 @@ class VideoCalls(CameraPart):
         Entering raises what :meth:`start_video` does.
 
         Raises:
-            LocalProtocolError: ``status_hz`` is not 0 to 10. Nothing was sent.
+            InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
         """
         check_range("status_hz", status_hz, 0, 10)
         return CameraBlock(
@@ -166,7 +166,7 @@ class VideoCalls(CameraPart):
             stream: its number, 0 (all of them) to 255.
 
         Raises:
-            LocalProtocolError: there can be no such stream. Nothing was sent.
+            InvalidArgument: there can be no such stream. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
             CommandRejected: the camera refused; there is no such stream.
             CommandTimeout: it did not answer.

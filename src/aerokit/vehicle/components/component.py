@@ -120,7 +120,7 @@ class Component(ReadOnly):
             patience_s: give up when nothing has come for so many seconds.
 
         Raises:
-            LocalProtocolError: the address is another one.
+            InvalidArgument: the address is another one.
             FileFormatError: the file has more than 16 MB.
             FileError, FileTimeout, OperationRejected: it was not given.
         """

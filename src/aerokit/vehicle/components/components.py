@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.components.component import Component
@@ -57,7 +57,7 @@ class Components:
     def component(self, component_id: int) -> Component:
         """The object of one component, the same each time; it need not have been heard yet."""
         if not 1 <= component_id <= 255:
-            raise LocalProtocolError(f"component_id = {component_id} is not allowed: 1 to 255")
+            raise InvalidArgument(f"component_id = {component_id} is not allowed: 1 to 255")
         if component_id not in self._made:
             self._made[component_id] = self._new(component_id)
         return self._made[component_id]

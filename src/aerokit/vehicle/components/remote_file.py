@@ -10,7 +10,7 @@ from urllib.parse import unquote
 
 import anyio
 
-from aerokit.errors import FileTimeout, LocalProtocolError, OperationRejected
+from aerokit.errors import FileTimeout, InvalidArgument, OperationRejected
 from aerokit.whole_file import LARGEST_FILE, too_large
 from aerokit.wording import shown
 
@@ -37,7 +37,7 @@ async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, p
     """The content of a file, at most 16 MB.
 
     Raises:
-        LocalProtocolError: the address is neither ``mftp://`` nor ``http://``, ``https://``.
+        InvalidArgument: the address is neither ``mftp://`` nor ``http://``, ``https://``.
         FileFormatError: it has more than 16 MB.
         FileError, FileTimeout, RemoteProtocolError: MAVFTP did not give it.
         OperationRejected: the server of the web did not give it.
@@ -47,11 +47,11 @@ async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, p
     if found is not None:
         owner = int(found[1]) if found[1] else component_id
         if not 1 <= owner <= 255:
-            raise LocalProtocolError(f"uri = {shown(uri)} is not allowed: components are 1 to 255")
+            raise InvalidArgument(f"uri = {shown(uri)} is not allowed: components are 1 to 255")
         return await _read(files_of(owner), unquote(found[2]), patience_s)
     if uri.lower().startswith(WEB):
         return await _Web(uri, patience_s).content()
-    raise LocalProtocolError(f"uri = {shown(uri)} is not allowed: mftp://…, http://… or https://…")
+    raise InvalidArgument(f"uri = {shown(uri)} is not allowed: mftp://…, http://… or https://…")
 
 
 async def _read(files: Files, path: str, patience_s: float) -> bytes:
@@ -143,7 +143,7 @@ class _Web:
                 if answer.length:  # of a server that says how much there is
                     raise OSError(f"{answer.length} bytes did not come")
                 return bytes(content)
-        except LocalProtocolError:
+        except InvalidArgument:
             raise
         except (OSError, HTTPException, ValueError) as error:
             if isinstance(getattr(error, "reason", error), TimeoutError):

@@ -135,7 +135,7 @@ class Settings:
         Raises:
             NotSupported: the camera names no definition file.
             CommandRejected, OperationTimeout: it did not tell what it is.
-            LocalProtocolError: an address of another kind.
+            InvalidArgument: an address of another kind.
             FileFormatError: what came is none, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
             OperationRejected: the web server does not give it.
@@ -212,7 +212,7 @@ class Settings:
         """Ask the component for one setting; ``table[name]`` is what is known without asking.
 
         Raises:
-            LocalProtocolError: the name is none, or longer than 16 characters.
+            InvalidArgument: the name is none, or longer than 16 characters.
             ParameterRejected: the component answers for other settings, and not for this one.
             ParameterTimeout: no answer.
         """
@@ -236,7 +236,7 @@ class Settings:
         again before it returns. What decides on this setting and is not known yet is read before.
 
         Raises:
-            LocalProtocolError: a name or value that cannot be; with a definition: an option or a value that is not
+            InvalidArgument: a name or value that cannot be; with a definition: an option or a value that is not
                 allowed, a setting that can only be read or is excluded now. It was not set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
             ParameterTimeout: not confirmed. It may have been set all the same.

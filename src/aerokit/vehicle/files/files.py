@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import FileError, LocalProtocolError, RemoteProtocolError, VerificationFailed
+from aerokit.errors import FileError, InvalidArgument, RemoteProtocolError, VerificationFailed
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp import DATA_SIZE, path_bytes
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
@@ -52,7 +52,7 @@ class Files:
     (None: no limit). Every method may be cancelled at any moment; the file is closed on the vehicle behind it.
 
     Every method raises:
-        LocalProtocolError: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
+        InvalidArgument: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; ``code`` and ``errno`` say why.
         FileTimeout: it did not end; ``missing`` has the ranges that did not arrive.
 
@@ -180,7 +180,7 @@ class Files:
         path_bytes(path)
         data = bytes(data)
         if len(data) > LARGEST:
-            raise LocalProtocolError(f"data of {len(data)} bytes is not allowed: at most {LARGEST}")
+            raise InvalidArgument(f"data of {len(data)} bytes is not allowed: at most {LARGEST}")
         channel, missing = self._channel, lambda: ((0, len(data)),)
         async with channel.operation(
             f"write {path}", timeout=timeout, patience_s=patience_s, missing=missing
@@ -224,7 +224,7 @@ class Files:
     ) -> None:
         """Cut a file to ``size`` bytes, or make it as long with zeros. PX4 can, ArduPilot cannot."""
         if not isinstance(size, int) or not 0 <= size <= LARGEST:
-            raise LocalProtocolError(f"size = {size!r} is not allowed: 0 to {LARGEST}")
+            raise InvalidArgument(f"size = {size!r} is not allowed: 0 to {LARGEST}")
         await self._request(MavFtpOpcode.TRUNCATEFILE, path, patience_s, timeout, offset=size)
 
     # --------------------------------------------------------------------- names and directories
@@ -253,7 +253,7 @@ class Files:
         """Give a file or directory another name or place; both paths must fit into one message together."""
         data = path_bytes(path) + b"\0" + path_bytes(new_path) + b"\0"
         if len(data) > DATA_SIZE:
-            raise LocalProtocolError(
+            raise InvalidArgument(
                 f"path = {path!r} and new_path = {new_path!r} are not allowed together: {len(data) - 2} bytes,"
                 f" one message has room for {DATA_SIZE - 2}"
             )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import AerokitError, FileError, FileTimeout, LocalProtocolError, OperationTimeout
+from aerokit.errors import AerokitError, FileError, FileTimeout, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
 from aerokit.protocols.log_list import LogList
@@ -101,7 +101,7 @@ class Logs:
             on_progress: called with bytes, and the bytes there will be.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right. Nothing was sent.
+            InvalidArgument: an argument that cannot be right. Nothing was sent.
             FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
             FileTimeout: it did not arrive; ``missing`` has the ranges.
             OSError: the file cannot be written here.
@@ -136,7 +136,7 @@ class Logs:
         """Return the content of a log; arguments as for :meth:`download`.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right. Nothing was sent.
+            InvalidArgument: an argument that cannot be right. Nothing was sent.
             FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
             FileTimeout: it did not arrive; ``missing`` has the ranges.
         """
@@ -338,7 +338,7 @@ class Logs:
 def _check(log: LogEntry | int) -> None:
     log_id = log.id if isinstance(log, LogEntry) else log
     if not isinstance(log_id, int) or not 0 <= log_id <= LARGEST_ID:
-        raise LocalProtocolError(f"log = {log!r} is not allowed: an entry, or an id from 0 to {LARGEST_ID}")
+        raise InvalidArgument(f"log = {log!r} is not allowed: an entry, or an id from 0 to {LARGEST_ID}")
 
 
 def _make_entry(log_id: int, size: int, time_utc: int) -> LogEntry:

@@ -96,7 +96,7 @@ class Gimbal(ReadOnly, PointActions, PlaceActions):
             max_lag_s: how late the event loop may be.
 
         Raises:
-            LocalProtocolError: a value is out of range. Nothing was sent.
+            InvalidArgument: a value is out of range. Nothing was sent.
         """
         is_from_north = frame == "earth"
         return GimbalRates(

@@ -54,7 +54,7 @@ class Gimbals:
             device_id: 1 to 6 behind the autopilot, or a component id up to 255.
 
         Raises:
-            LocalProtocolError: there is no such id.
+            InvalidArgument: there is no such id.
             BusyError: too many gimbals were heard of already.
         """
         check_range("device_id", device_id, 1, 255)

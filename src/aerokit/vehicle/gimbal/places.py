@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.gimbal.arrival import Aim, arrive, told_often
@@ -37,7 +37,7 @@ class PlaceActions(GimbalPart):
             timeout: seconds until it has to be there.
 
         Raises:
-            LocalProtocolError: the tolerance is out of range. Nothing was sent.
+            InvalidArgument: the tolerance is out of range. Nothing was sent.
             NotSupported: the manager can do that with its first gimbal only. Nothing was sent.
             ValueUnknownError: home, or the vehicle's altitude, is not known and is needed here. Nothing was sent.
             CommandRejected: the manager refused.
@@ -78,7 +78,7 @@ class PlaceActions(GimbalPart):
             timeout: seconds until it has to be there.
 
         Raises:
-            LocalProtocolError: there is no such system id, or the tolerance is out of range. Nothing was sent.
+            InvalidArgument: there is no such system id, or the tolerance is out of range. Nothing was sent.
             NotSupported: the manager cannot do that. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
@@ -88,7 +88,7 @@ class PlaceActions(GimbalPart):
             HeartbeatTimeout: the vehicle fell silent.
         """
         if isinstance(system_id, bool):
-            raise LocalProtocolError(f"system_id = {system_id} is not allowed: 1 to 255")
+            raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255")
         check_range("system_id", system_id, 1, 255)
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         orders = self._orders

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import GimbalDeviceFlags, MavMountMode
 from aerokit.vehicle.checks import check_range
 from aerokit.vehicle.gimbal.arrival import Aim, Rest, arrive, told_often
@@ -49,7 +49,7 @@ class PointActions(GimbalPart):
         that does not know that either.
 
         Raises:
-            LocalProtocolError: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
+            InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
                 asked for. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
@@ -157,4 +157,4 @@ class PointActions(GimbalPart):
             turns = (-360, 0, 360) if name == "yaw_deg" else (0,)
             if not any(allowed[0] <= angle + turn <= allowed[1] for turn in turns):
                 text = f"{self._orders.name} turns from {allowed[0]:g} to {allowed[1]:g}"
-                raise LocalProtocolError(f"{name} = {angle:g} is not allowed: {text}")
+                raise InvalidArgument(f"{name} = {angle:g} is not allowed: {text}")

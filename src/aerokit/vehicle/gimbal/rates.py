@@ -43,7 +43,7 @@ class GimbalRates:
     another order was given to the gimbal, or control was lost. Then ``set`` and leaving the block raise.
 
     Entering raises:
-        LocalProtocolError: a rate is out of range. Nothing was sent.
+        InvalidArgument: a rate is out of range. Nothing was sent.
         NotSupported: the vehicle has no gimbal manager: mounts of old turn to angles only.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
@@ -87,7 +87,7 @@ class GimbalRates:
             yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
 
         Raises:
-            LocalProtocolError: a rate is out of range; those before stay in force until they are too old.
+            InvalidArgument: a rate is out of range; those before stay in force until they are too old.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
             GimbalTaken: control was lost in the block that has it.
         """
@@ -106,7 +106,7 @@ class GimbalRates:
             duration_s: for so long.
 
         Raises:
-            LocalProtocolError: a rate is out of range.
+            InvalidArgument: a rate is out of range.
             SetpointStreamStopped: the stream ended meanwhile.
             GimbalTaken: control was lost in the block that has it.
         """

@@ -13,7 +13,7 @@ from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
     HeartbeatTimeout,
-    LocalProtocolError,
+    InvalidArgument,
     OperationRejected,
     OperationTimeout,
 )
@@ -112,7 +112,7 @@ class ArmingActions(Part):
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
 
         Raises:
-            LocalProtocolError: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
+            InvalidArgument: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
                 estimator lacks. They are asked for again where the vehicle can run its checks on request.
             CommandTimeout: there was no answer, and it did not arm; the text says whether the order may still arrive.
@@ -189,7 +189,7 @@ class ArmingActions(Part):
         if mode is not None:
             wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if wanted.name in self.autopilot.unarmable_modes:
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}"
                 )
             if self.telemetry.is_armed and wanted != self.telemetry.mode.latest:

@@ -61,7 +61,7 @@ class FlightActions(Part):
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
-            LocalProtocolError: the altitude is out of range. Nothing was sent.
+            InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
             OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
                 way.

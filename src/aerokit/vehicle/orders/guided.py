@@ -200,7 +200,7 @@ class SetpointStream(Generic[SetpointT]):
         """Take a new set-point; it is sent at the next tick, and resent until ``valid_for_s`` has passed.
 
         Raises:
-            LocalProtocolError: a value is out of range; the one before stays in force until it is too old.
+            InvalidArgument: a value is out of range; the one before stays in force until it is too old.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
         check_kind("setpoint", setpoint, type(self._setpoint))

@@ -25,7 +25,7 @@ class ModeActions(Part):
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
 
         Raises:
-            LocalProtocolError: this vehicle has no such mode; the text lists those it has. Nothing was sent.
+            InvalidArgument: this vehicle has no such mode; the text lists those it has. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: it accepted and stayed in another mode, or did not answer.

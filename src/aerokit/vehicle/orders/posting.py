@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected, CommandTimeout, LocalProtocolError, OperationTimeout
+from aerokit.errors import CommandRejected, CommandTimeout, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import command_name, rejection
 from aerokit.vehicle.orders.progress import Arrivals
@@ -64,7 +64,7 @@ class PostedOrder:
             component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit, or the block was left. Nothing was sent.
+            InvalidArgument: a parameter is no number or does not fit, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
             CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
         """
@@ -100,13 +100,13 @@ class PostedOrder:
             component_id: as for :meth:`command`.
 
         Raises:
-            LocalProtocolError: the order was not posted with it, or the block was left. Nothing was sent.
+            InvalidArgument: the order was not posted with it, or the block was left. Nothing was sent.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
             CommandTimeout: there was no answer.
             OperationTimeout: it accepted, and stays in another mode.
         """
         if mode not in self._posted.modes:
-            raise LocalProtocolError(f"mode = {mode} is not allowed: the order was not posted with it")
+            raise InvalidArgument(f"mode = {mode} is not allowed: the order was not posted with it")
         for attempts_left in reversed(range(MODE_ATTEMPTS)):
             try:
                 await self._request_mode(mode, component_id)
@@ -182,9 +182,7 @@ class PostedOrder:
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> None:
         if self._is_over:
-            raise LocalProtocolError(
-                f"the block of this order was left: {command_name(command)} was not sent"
-            )
+            raise InvalidArgument(f"the block of this order was left: {command_name(command)} was not sent")
         if self._has_begun and self._posted.lost:
             raise CommandTimeout(f"{command_name(command)} was not sent: {self._posted.lost}")
         self._has_begun, self._started = True, self._talk.connection.now()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.messages import (
     SetAttitudeTarget,
@@ -123,7 +123,7 @@ def wants_motion(setpoint: object, bridge: Bridge) -> bool:
 
 
 class SetpointEncoder:
-    """Turns set-points into messages for one vehicle; raises LocalProtocolError for what is no set-point."""
+    """Turns set-points into messages for one vehicle; raises InvalidArgument for what is no set-point."""
 
     def __init__(self, bridge: Bridge) -> None:
         self._talk, self._where = bridge.talk, bridge.where
@@ -208,7 +208,7 @@ class SetpointEncoder:
         """SET_ATTITUDE_TARGET with attitude and thrust."""
         _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
         if not 0 <= s.thrust <= 1:
-            raise LocalProtocolError(f"thrust = {s.thrust} is not allowed: 0 to 1")
+            raise InvalidArgument(f"thrust = {s.thrust} is not allowed: 0 to 1")
         return SetAttitudeTarget(
             self._time_ms(),
             self._talk.system_id,
@@ -231,7 +231,7 @@ _GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)
 def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
     """Type-mask bits, yaw in radians and yaw rate in radians per second."""
     if yaw_deg is not None and yaw_rate_deg_s is not None:
-        raise LocalProtocolError("give yaw_deg or yaw_rate_deg_s, not both")
+        raise InvalidArgument("give yaw_deg or yaw_rate_deg_s, not both")
     _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)
     mask = (IGNORE_YAW if yaw_deg is None else 0) | (IGNORE_YAW_RATE if yaw_rate_deg_s is None else 0)
     return mask, math.radians(yaw_deg or 0.0), math.radians(yaw_rate_deg_s or 0.0)
@@ -240,4 +240,4 @@ def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, floa
 def _check_finite(what: str, *values: float) -> None:
     for value in values:
         if not math.isfinite(value):
-            raise LocalProtocolError(f"{what}: {value!r} is not a finite number")
+            raise InvalidArgument(f"{what}: {value!r} is not a finite number")

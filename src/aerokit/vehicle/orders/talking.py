@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from aerokit.arguments import checks_arguments
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
@@ -67,7 +67,7 @@ class TalkActions(Part):
         See https://mavlink.io/en/services/command.html.
 
         Raises:
-            LocalProtocolError: a parameter is no number or does not fit. Nothing was sent.
+            InvalidArgument: a parameter is no number or does not fit. Nothing was sent.
             CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
             CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
         """
@@ -104,7 +104,7 @@ class TalkActions(Part):
         rest is as for :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
-            raise LocalProtocolError(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
+            raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
         kind = {} if or_long else {"frame": frame}
         return await self._orders.answered(
             self._talk.commands.send_place if or_long else self._talk.commands.send_int,
@@ -128,7 +128,7 @@ class TalkActions(Part):
         set-point is newer than what was :meth:`posted` about motion. Neither is, to another system than this vehicle.
 
         Raises:
-            LocalProtocolError: a field is out of range; nothing was sent.
+            InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
         self._talk.send(message)
@@ -171,12 +171,12 @@ class TalkActions(Part):
             armed: whether it arms or disarms; one about ``"arm"`` has to say.
 
         Raises:
-            LocalProtocolError: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
+            InvalidArgument: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
         """
         if not subjects:
-            raise LocalProtocolError("posted: no subject is named: mode, motion or arm")
+            raise InvalidArgument("posted: no subject is named: mode, motion or arm")
         if "arm" in subjects and armed is None:
-            raise LocalProtocolError("posted: an order about arm needs armed=True or armed=False")
+            raise InvalidArgument("posted: an order about arm needs armed=True or armed=False")
         with (
             self._helm.posting(subjects, modes=modes, armed=armed) as posted,
             PostedOrder(self._talk, self._helm, posted) as order,
@@ -202,7 +202,7 @@ class TalkActions(Part):
         camera or another component is to be asked for: ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            LocalProtocolError: no type, a rate out of range, or a message that the dialect does not hold.
+            InvalidArgument: no type, a rate out of range, or a message that the dialect does not hold.
         """
         return self._talk.hearing.subscribe(types, capacity, overflow, rate_hz, whole_system=True)
 
@@ -225,7 +225,7 @@ class TalkActions(Part):
         common states is asked for as by :meth:`rate`.
 
         Raises:
-            LocalProtocolError: the rate is not above 0 and at most 1000. Nothing was sent.
+            InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
         """
         with every_stream(self._talk, rate_hz):
             yield
@@ -241,7 +241,7 @@ class TalkActions(Part):
         ``vehicle.component(100).message(...)``.
 
         Raises:
-            LocalProtocolError: the rate is out of range, or the dialect does not hold the message.
+            InvalidArgument: the rate is out of range, or the dialect does not hold the message.
         """
         return self._talk.hearing.cell(message_type, rate_hz)
 

@@ -10,7 +10,7 @@ import anyio
 from aerokit.arguments import checks_arguments
 from aerokit.errors import (
     CommandRejected,
-    LocalProtocolError,
+    InvalidArgument,
     NotSupported,
     OperationRejected,
     OperationTimeout,
@@ -68,7 +68,7 @@ class TravelActions(Part):
         SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
 
         Raises:
-            LocalProtocolError: the target is no place on earth or too far away, or another argument is out of range.
+            InvalidArgument: the target is no place on earth or too far away, or another argument is out of range.
                 Nothing was sent.
             ValueUnknownError: position or home is not known and is needed here.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
@@ -188,7 +188,7 @@ class TravelActions(Part):
         ArduPilot takes it only while it is under way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` sees to that.
 
         Raises:
-            LocalProtocolError: out of range. Nothing was sent.
+            InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -218,7 +218,7 @@ class TravelActions(Part):
             max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
 
         Raises:
-            LocalProtocolError: out of range. Nothing was sent.
+            InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed or it disarmed on the way.
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
@@ -281,13 +281,13 @@ class TravelActions(Part):
         old firmware, which does not know it as COMMAND_INT: to within a metre then.
 
         Raises:
-            LocalProtocolError: the place has no altitude above mean sea level. Nothing was sent.
+            InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it knows no position, or the place is none.
             CommandTimeout: there was no answer.
             OperationTimeout: it accepted, and HOME_POSITION did not tell it.
         """
         if place is not None and place.altitude_amsl_m is None:
-            raise LocalProtocolError("place has no altitude_amsl_m: home needs one above mean sea level")
+            raise InvalidArgument("place has no altitude_amsl_m: home needs one above mean sea level")
         home = self.telemetry.home
         with self._helm.aside() as order:
             if place is None:

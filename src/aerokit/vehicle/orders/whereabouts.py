@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit import geo
-from aerokit.errors import LocalProtocolError
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
 from aerokit.vehicle.checks import check_range
@@ -45,7 +45,7 @@ class Whereabouts:
         return math.hypot(along, self._altitude_difference(here, target))
 
     def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
-        """Raise LocalProtocolError for a place that is farther away; none is while the position is unknown."""
+        """Raise InvalidArgument for a place that is farther away; none is while the position is unknown."""
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
         if here is None:
@@ -58,7 +58,7 @@ class Whereabouts:
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
-                raise LocalProtocolError(
+                raise InvalidArgument(
                     f"{name} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
                     f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
                     " sent. Pass a greater max_distance_m if that is meant"
@@ -106,7 +106,7 @@ class Whereabouts:
         is_relative = relative is not None
         altitude = relative if relative is not None else amsl
         if altitude is None:
-            raise LocalProtocolError("the target has no altitude, and the vehicle's own is not known")
+            raise InvalidArgument("the target has no altitude, and the vehicle's own is not known")
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.takes_relative_altitude:
             altitude, is_relative = altitude + self.home_altitude(), False

@@ -70,7 +70,7 @@ class ParameterNames:
     async def find(self, names: Iterable[str], patience_s: float) -> dict[str, Found | NotFound]:
         """Each of them as the vehicle has it; what is not known yet is read. Warns of other names.
 
-        Raises :class:`LocalProtocolError` for a name that no message can carry, before anything is sent.
+        Raises :class:`InvalidArgument` for a name that no message can carry, before anything is sent.
         """
         spelled = {check_name(name): self._spelled(name) for name in names}
         found: dict[str, Found | NotFound] = {}

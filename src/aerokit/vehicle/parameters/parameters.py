@@ -140,7 +140,7 @@ class Parameters(ReadOnly):
         """Ask the vehicle for one parameter; ``table[name]`` is what is known without asking.
 
         Raises:
-            LocalProtocolError: the name is none, or longer than 16 characters.
+            InvalidArgument: the name is none, or longer than 16 characters.
             ParameterRejected: the vehicle has no such parameter. It may say so, or answer others and not this one.
             ParameterTimeout: no answer.
         """
@@ -163,7 +163,7 @@ class Parameters(ReadOnly):
             did not say itself that it has none, but answered others and not this one.
 
         Raises:
-            LocalProtocolError: a name is none, or longer than 16 characters. Nothing was sent.
+            InvalidArgument: a name is none, or longer than 16 characters. Nothing was sent.
         """
         with self._transfers.limit(timeout):
             return await self._access.read(map(check_name, names), patience_s, are_doubtful=True)
@@ -176,7 +176,7 @@ class Parameters(ReadOnly):
         """Set one parameter, and return what the vehicle says it is then.
 
         Raises:
-            LocalProtocolError: a name that cannot be, NaN, or a value that the parameter's type cannot hold.
+            InvalidArgument: a name that cannot be, NaN, or a value that the parameter's type cannot hold.
             ParameterRejected: the vehicle has no such parameter, or keeps the value it had; ``code`` says why.
             ParameterTimeout: not confirmed. It may have been set all the same.
         """
@@ -199,7 +199,7 @@ class Parameters(ReadOnly):
         A parameter that appears only when another one of them is set (ArduPilot's ``…_ENABLE``) is set after it.
 
         Raises:
-            LocalProtocolError: one of the names or values cannot be; then none of them was set.
+            InvalidArgument: one of the names or values cannot be; then none of them was set.
         """
         with self._transfers.limit(timeout):
             return await self._writing.write(values, patience_s=patience_s, on_progress=on_progress)
@@ -222,7 +222,7 @@ class Parameters(ReadOnly):
         vehicle's own counts, and the other has no result.
 
         Raises:
-            LocalProtocolError, FileFormatError: a name, a value or the file cannot be; then nothing was set.
+            InvalidArgument, FileFormatError: a name, a value or the file cannot be; then nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         with self._transfers.limit(timeout):

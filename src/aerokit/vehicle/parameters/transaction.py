@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import AerokitError, LocalProtocolError, RollbackFailed, VerificationFailed
+from aerokit.errors import AerokitError, InvalidArgument, RollbackFailed, VerificationFailed
 from aerokit.parameters import Parameter
 from aerokit.parameters.parameter import same_value
 from aerokit.runtime.background import to_its_end
@@ -150,7 +150,7 @@ class Temporarily(_Block):
 
     async def __aenter__(self) -> dict[str, ParameterWrite]:
         if self._is_open:
-            raise LocalProtocolError("this block has been entered already; make another one")
+            raise InvalidArgument("this block has been entered already; make another one")
         self._is_open = True
         try:
             results = await self._write(self._values)
@@ -220,7 +220,7 @@ class Transaction(_Block):
     async def set_many(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
         """Set several; the first error is raised after all were tried."""
         if not self._is_open:
-            raise LocalProtocolError("this transaction is not open: it has ended, or was not entered")
+            raise InvalidArgument("this transaction is not open: it has ended, or was not entered")
         results = await self._write(values)
         for name in self._before:
             known = self._access.store.get(name)
@@ -235,7 +235,7 @@ class Transaction(_Block):
 
     async def __aenter__(self) -> Self:
         if self._is_open or self._before:
-            raise LocalProtocolError("this transaction has been entered already; make another one")
+            raise InvalidArgument("this transaction has been entered already; make another one")
         self._is_open = True
         return self
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from aerokit.errors import AerokitError, LocalProtocolError, ParameterRejected
+from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected
 from aerokit.parameters import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.parameter import same_value
 from aerokit.snapshot import Snapshot
@@ -56,7 +56,7 @@ class ParameterWriting:
     ) -> dict[str, ParameterWrite]:
         """One result for each value, in their order; with ``upload`` only what differs is sent, in one go if possible.
 
-        Raises :class:`LocalProtocolError` before anything is set.
+        Raises :class:`InvalidArgument` before anything is set.
         """
         results: dict[str, ParameterWrite] = {}
         left = check_values(values)
@@ -105,7 +105,7 @@ class ParameterWriting:
                 plan = _plan(each, values[name])
                 _check_same(plan, plans.setdefault(plan.wanted.name, plan))
                 plans[name] = plan
-            except LocalProtocolError as error:
+            except InvalidArgument as error:
                 if is_first:
                     raise
                 errors[name] = error
@@ -131,14 +131,14 @@ def _plan(found: Found, value: int | float) -> _Plan:
 def _check_same(one: _Plan, other: _Plan) -> None:
     """Two names of one parameter must not be given different values."""
     if not same_value(one.wanted.value, other.wanted.value):
-        raise LocalProtocolError(
+        raise InvalidArgument(
             f"{one.found.asked} = {one.requested:g} and {other.found.asked} = {other.requested:g} contradict:"
             f" both are {one.wanted.name} on this vehicle"
         )
 
 
 def check_values(values: Mapping[str, float]) -> dict[str, int | float]:
-    """The values; raises :class:`LocalProtocolError` unless all of them are finite numbers with possible names."""
+    """The values; raises :class:`InvalidArgument` unless all of them are finite numbers with possible names."""
     return {check_name(name): _number(name, value) for name, value in values.items()}
 
 

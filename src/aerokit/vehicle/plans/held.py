@@ -67,7 +67,7 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         holds a part of both: the error says so.
 
         Raises:
-            LocalProtocolError: the plan cannot be right, or has a place that is too far away; nothing was sent.
+            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
             MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
             MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
             VerificationFailed: it confirmed, and holds something else.
@@ -96,7 +96,7 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         """Read what the vehicle holds; arguments as for :meth:`upload`.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: items are missing in the end; ``missing`` has them.
             RemoteProtocolError: what it sent makes no sense.
@@ -115,7 +115,7 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
 
         Raises:
-            LocalProtocolError: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument that cannot be right; nothing was sent.
             MissionRejected: the vehicle refused.
             MissionTimeout: it fell silent.
             VerificationFailed: it confirmed, and still holds items.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected, LocalProtocolError, OperationRejected, OperationTimeout
+from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S, await_progress
 from aerokit.vehicle.plans.held import HeldPlan
@@ -74,7 +74,7 @@ class MissionControl(HeldPlan["Mission"]):
         place to go to (a DO command) is run through: ``current`` then shows the one behind it.
 
         Raises:
-            LocalProtocolError: there is no such item. Nothing was sent.
+            InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: somebody else steers, or a newer order was given, before it was confirmed.
             OperationTimeout: MISSION_CURRENT did not confirm it.
@@ -92,7 +92,7 @@ class MissionControl(HeldPlan["Mission"]):
         Sends MISSION_START to ArduPilot, which takes off then also from the ground, and changes the mode of others.
 
         Raises:
-            LocalProtocolError: there is no such item. Nothing was sent.
+            InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: it is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; ``reasons`` tells.
             OperationTimeout: it accepted and stayed in another mode.
@@ -209,9 +209,9 @@ class MissionControl(HeldPlan["Mission"]):
         count = self._watch.count.latest
         last = LAST_ITEM if count is None else count - 1
         if count == 0:
-            raise LocalProtocolError("the vehicle's mission is empty: upload() comes first; nothing was sent")
+            raise InvalidArgument("the vehicle's mission is empty: upload() comes first; nothing was sent")
         if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
-            raise LocalProtocolError(f"item = {item!r} is not allowed: 0 to {last}")
+            raise InvalidArgument(f"item = {item!r} is not allowed: 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, goes_on: bool = True) -> None:
         """``goes_on``: keep what it has counted of jumps. ArduPilot's item 0, home, stands for a fresh start."""

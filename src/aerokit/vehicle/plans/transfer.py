@@ -43,7 +43,7 @@ class Plan(Protocol):
     MISSION_TYPE: ClassVar[int]
 
     def check(self, *, home_is_item_0: bool) -> None:
-        """Raise LocalProtocolError unless it can be sent."""
+        """Raise InvalidArgument unless it can be sent."""
 
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
         """Its items."""

@@ -48,7 +48,7 @@ def subscription_rate_hz(message_type: type[Message]) -> float | None:
 
 
 def check_rate(message_type: type[Message], hz: float) -> None:
-    """Raise LocalProtocolError unless such a message can be asked for at ``hz``: above 0, at most 1000."""
+    """Raise InvalidArgument unless such a message can be asked for at ``hz``: above 0, at most 1000."""
     check_range(f"rate_hz of {message_type.NAME}", hz, 0, 1000, above=True)
 
 
