@@ -266,7 +266,8 @@ class StateCell(CellTwin[T]):
 class Changes(ChangesTwin[T]):
     """An endless asynchronous iterator over a cell; the latest value wins.
 
-    Raises the error that the cell was closed with. It is registered at the cell only while it waits.
+    Raises the error that the cell was closed with. It is registered at the cell only while it waits. Until it is
+    dropped, each value is decoded as it comes.
     """
 
     @property
