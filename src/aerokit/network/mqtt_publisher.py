@@ -94,9 +94,13 @@ class MqttLink(BrokerLink):
             self._send_waiting()
 
     def _read(self, client: Any, sock: Any) -> None:
-        client.loop_read()
-        while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
+        try:
             client.loop_read()
+            while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
+                client.loop_read()
+        except Exception as error:  # paho 2.1 raises whatever a malformed packet makes it run into
+            _cut(client)
+            self._on_disconnect(client, None, None, f"it sent no MQTT: {error}", None)
 
     def _look_after(self, client: Any) -> None:
         client.loop_misc()  # asks for signs of life, and closes without one
