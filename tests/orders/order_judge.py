@@ -24,6 +24,7 @@ from aerokit.mavlink.messages import (
 from aerokit.vehicle.orders.helm import FIRST_HEARTBEAT_S
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
+ENDS_FLIGHT = ("disarm", "land", "return_to_launch")
 KNOWN_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
 HEARD_S = 4.0
@@ -74,7 +75,7 @@ def _told(flown: Flown, since: int, until: int) -> list[State]:
 def _ends_flight(flown: Flown) -> bool:
     """Whether it lands, returns or disarms: that is meant under a failsafe, too."""
     modes = flown.case.row.modes[flown.case.autopilot == "px4"]
-    return flown.case.row.name == "disarm" or (bool(modes) and set(modes) <= {"LAND", "RTL"})
+    return flown.case.row.name in ENDS_FLIGHT or (bool(modes) and set(modes) <= {"LAND", "RTL"})
 
 
 def _state(heard: Crossing) -> State:

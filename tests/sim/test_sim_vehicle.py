@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from simulated_client import Client, flying_copter, ready_copter
 
@@ -253,6 +255,8 @@ def test_any_command_is_answered_once(command: int, numbers: tuple[float, ...], 
     frame=st.integers(0, 21),
     numbers=st.tuples(*(FLOATS,) * 11),
 )
+@example(mask=9, frame=0, numbers=(*(0.0,) * 6, math.inf, *(0.0,) * 4))
+@example(mask=9, frame=18, numbers=(0.0, 0.0, 0.0, -6e16, 6e16, -4e16, math.nan, 6e16, 0.0, 8e37, -5e16))
 def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
     rates_and_thrust = numbers[4], numbers[5], numbers[6], numbers[7]
     copter, client = flying_copter()

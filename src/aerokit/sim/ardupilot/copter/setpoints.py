@@ -74,7 +74,8 @@ class Setpoints:
         no_position, no_velocity = bool(mask & _POSITION), bool(mask & _VELOCITY)
         no_acceleration = bool(mask & _ACCELERATION)
         force_not_supported = bool(mask & Mask.FORCE_SET) and not no_acceleration
-        if force_not_supported or (not no_velocity and not _is_sane(velocity)) or not _is_number(point):
+        is_sane = (no_velocity or _is_sane(velocity)) and (no_acceleration or _is_number(acceleration))
+        if force_not_supported or not is_sane or not _is_number(point):
             guided.enter(force=False)
             return
         velocity = (0.0, 0.0, 0.0) if no_velocity else self._rotated(velocity, rotate=rotate)
