@@ -1,4 +1,4 @@
-"""MAVLink's enums: ``from aerokit.enums import MavCmd``; the same module as :mod:`aerokit.mavlink.enums`."""
+"""MAVLink's enums: ``from aerokit.enums import MavCmd``; the module :mod:`aerokit.mavlink.enums` itself."""
 
 import sys
 from typing import TYPE_CHECKING

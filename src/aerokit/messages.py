@@ -1,4 +1,4 @@
-"""MAVLink's messages: ``from aerokit.messages import Heartbeat``; the same module as :mod:`aerokit.mavlink.messages`."""
+"""MAVLink's messages: ``from aerokit.messages import Heartbeat``; the module :mod:`aerokit.mavlink.messages` itself."""
 
 import sys
 from typing import TYPE_CHECKING
