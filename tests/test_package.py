@@ -61,3 +61,12 @@ def test_commands_say_so_when_ours_was_overwritten(tmp_path: Path) -> None:
     done = run(mixed(tmp_path, '__version__ = "1.5.0"\n'), "-m", "aerokit", "sim", "--help")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("aerokit: files of another project")
+
+
+def test_enums_and_messages_are_modules_of_their_own_and_imported_in_parts() -> None:
+    code = (
+        "import sys; from aerokit.enums import MavState; from aerokit.messages import Heartbeat; import aerokit;"
+        " assert aerokit.enums.MavState is MavState; assert aerokit.messages.Heartbeat is Heartbeat;"
+        " assert 'aerokit.mavlink.enums.development' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
