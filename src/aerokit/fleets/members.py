@@ -148,7 +148,7 @@ class Member:
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
             self._forgiven_state = None
-        elif is_worse(state, self._forgiven_state):
+        elif state is not None and is_worse(state, self._forgiven_state):
             return f"it is under a failsafe (MAV_STATE {MavState(state).name})"
         has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
         if has_ended_mission or self._who_steers() == self._taken_back:

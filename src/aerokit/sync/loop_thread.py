@@ -129,6 +129,7 @@ class LoopThread:
         finally:
             self.proof.waiting.discard(call)
             self.proof.feed()
+        assert call is not None
         return call.result()
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:

@@ -95,7 +95,8 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 def is_worse(state: int, before: int | None) -> bool:
     """Whether a failsafe is active in this MAV_STATE that was not in the one before, or a worse one."""
-    return state in FAILSAFE_STATES and (before not in FAILSAFE_STATES or state > before)
+    is_first = before is None or before not in FAILSAFE_STATES
+    return state in FAILSAFE_STATES and (is_first or state > (before or 0))
 
 
 def failsafe_text(state: int) -> str:
