@@ -149,11 +149,8 @@ class Orders:
             raise NotSupported(f"{action}: {self._talk.autopilot.firmware} has no mode for it")
         return mode
 
-    def stays_in(self, order: Order, *modes: Mode, ends_flight: bool = False) -> Callable[[], str | None]:
-        """What can go wrong on the way: another order, it disarms, or its mode becomes another one than these.
-
-        A failsafe goes wrong, too, unless the order ``ends_flight``: what lands or returns goes on under a failsafe.
-        """
+    def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
+        """What can go wrong on the way: another order, it disarms, or its mode becomes another one than these."""
         grace_until, settles_at = self._talk.connection.now() + MODE_GRACE_S, self._helm.mode_settles_at
         arrived = False
 
