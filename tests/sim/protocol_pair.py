@@ -14,7 +14,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.protocols.exchange import Exchange
 from aerokit.sim import SimulatedCopter, SimulatedLog, SimulatedPx4
-from aerokit.sim.streams import Streams
+from aerokit.sim.channel import Streams
 
 ResultT = TypeVar("ResultT")
 Vehicle = SimulatedCopter | SimulatedPx4

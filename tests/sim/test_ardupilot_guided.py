@@ -13,7 +13,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as Attitude
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, PlaneMode, RoverMode, SubMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.sim.kinds import simulated
-from aerokit.sim.rotations import quaternion_from_euler
+from aerokit.sim.motion import quaternion_from_euler
 
 POS = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE
 VEL = Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE

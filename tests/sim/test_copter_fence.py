@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import CopterMode, FenceBreach, MavCmd, MavMissionTyp
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedCopter
-from aerokit.sim.ardupilot.fence_zones import Circle, Polygon
+from aerokit.sim.ardupilot.fence import CircleZone, PolygonZone
 
 ARM = MavCmd.COMPONENT_ARM_DISARM
 FENCE = MavCmd.DO_FENCE_ENABLE
@@ -208,8 +208,8 @@ def test_status_is_streamed_only_while_the_fence_is_on() -> None:
 
 
 def test_distances() -> None:
-    square = Polygon([(0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)])
+    square = PolygonZone([(0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)])
     assert square.outside_m((5.0, 4.0)) == pytest.approx(-4.0)
     assert square.outside_m((5.0, 13.0)) == pytest.approx(3.0)
     assert square.outside_m((-3.0, -4.0)) == pytest.approx(5.0)
-    assert Circle((0.0, 0.0), 5.0).outside_m((3.0, 0.0)) == pytest.approx(-2.0)
+    assert CircleZone((0.0, 0.0), 5.0).outside_m((3.0, 0.0)) == pytest.approx(-2.0)

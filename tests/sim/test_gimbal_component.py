@@ -12,7 +12,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavType
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
-from aerokit.sim.rotations import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 
 GIMBAL = 154
 CONFIGURE, POINT = MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, MavCmd.DO_GIMBAL_MANAGER_PITCHYAW

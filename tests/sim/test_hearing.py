@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.sim.hearing import Hearing, SharedHearing
+from aerokit.sim.channel import Hearing, SharedHearing
 
 HEARTBEAT = m.Heartbeat(6, 8, 0, 0, 4, 3)
 PING = m.Ping(1, 2, 0, 0)

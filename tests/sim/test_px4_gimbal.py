@@ -10,8 +10,8 @@ from simulated_client import Client
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMountMode, MavResult
 from aerokit.sim import SimulatedPx4
+from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.px4.modes import RTL
-from aerokit.sim.rotations import euler_from_quaternion, quaternion_from_euler
 
 CONFIGURE, POINT = MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, MavCmd.DO_GIMBAL_MANAGER_PITCHYAW
 NAN = math.nan

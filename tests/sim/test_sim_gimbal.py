@@ -10,7 +10,7 @@ from simulated_client import Client, flying_copter, ready_copter
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavFrame, MavMountMode, MavResult
 from aerokit.sim import SimulatedCopter
-from aerokit.sim.rotations import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 
 NAN = math.nan
 RETRACT, NEUTRAL, LOCKED = 1, 2, 16

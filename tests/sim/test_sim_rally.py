@@ -9,7 +9,7 @@ from simulated_client import flying_copter, set_mode
 from vehicles import driving_rover, flying_plane, rally_points, ready_plane
 
 from aerokit.mavlink.enums import CopterMode, MavResult, PlaneMode, RoverMode
-from aerokit.sim.ardupilot.rally import best_return_place
+from aerokit.sim.ardupilot.navigation import best_return_place
 
 HOME = (0.0, 0.0, 0.0)
 

@@ -5,7 +5,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.sim.streams import Streams
+from aerokit.sim.channel import Streams
 
 
 def test_nothing_is_streamed_at_first() -> None:

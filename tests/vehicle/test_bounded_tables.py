@@ -18,8 +18,7 @@ from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.round_trip import RoundTrip
 from aerokit.runtime.bus import Bus
-from aerokit.sim.channel import Channel
-from aerokit.sim.hearing import MOST_PEERS
+from aerokit.sim.channel import MOST_PEERS, Channel
 from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler
 from aerokit.vehicle.state.telemetry import MOST_MODE_NAMES
 

@@ -20,7 +20,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
-from aerokit.sim.components.storage import GREY_JPEG
+from aerokit.sim.components.captures import GREY_JPEG
 from aerokit.vehicle.camera.lens import AutoFocus
 
 pytestmark = pytest.mark.anyio

@@ -12,7 +12,7 @@ from PIL import Image
 
 from aerokit import Position
 from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
-from aerokit.sim.components.storage import GREY_JPEG
+from aerokit.sim.components.captures import GREY_JPEG
 from aerokit.vehicle.camera import geotag
 from aerokit.vehicle.camera.capture import Capture
 from aerokit.vehicle.camera.geotag import captures_csv, geotag_file, geotagged, write_captures

@@ -43,8 +43,7 @@ def simulated_fleet(
     The name of a .tlog file gives the one vehicle of that recording, to which nothing else applies.
     """
     from aerokit.errors import InvalidArgument
-    from aerokit.sim.local_frame import GlobalPoint, LocalFrame
-    from aerokit.sim.place import HOME
+    from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
 
     if name.endswith(".tlog"):
         return [_recorded(name, count)]

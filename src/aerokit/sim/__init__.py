@@ -17,9 +17,9 @@ from __future__ import annotations
 from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
 from aerokit.sim.components import SimulatedCamera, SimulatedComponent, SimulatedGimbal
 from aerokit.sim.faults import CommandFault, Faults
+from aerokit.sim.local_frame import HOME
 from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Wind
-from aerokit.sim.place import HOME
 from aerokit.sim.px4 import SimulatedPx4, SimulatedPx4Plane
 from aerokit.sim.recorded import RecordedVehicle
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 from aerokit.errors import InvalidArgument
 
-__all__ = ["GlobalPoint", "LocalFrame", "true_place"]
+__all__ = ["HOME", "GlobalPoint", "LocalFrame", "true_place"]
+
 
 _METRES_PER_DEGREE_E7 = (
     0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere, the same rounding
@@ -54,3 +55,7 @@ def true_place(vehicle: Any) -> GlobalPoint:
         raise InvalidArgument(f"{type(vehicle).__name__} has no true place")
     place: GlobalPoint = frame.to_global(motion.north, motion.east, motion.down)
     return place
+
+
+HOME = (-35.363261, 149.165230, 584.09)
+"""The model airfield near Canberra that SITL and the examples of the field begin at: degrees, metres above the sea."""

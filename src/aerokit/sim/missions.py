@@ -8,20 +8,28 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Protocol
 
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType
+from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
+from aerokit.missions.pack import NO_CLEAR, pack_items, read_header, unpack_items
+from aerokit.sim.file_tree import EINVAL, ENFILE, ENOENT, FileFault, Mount, OpenFile
 
 __all__ = [
     "INVALID_INDEX",
     "AnyItem",
     "AnyRequest",
+    "MissionMount",
     "MissionStore",
     "float32",
     "item_from",
     "item_message_float",
 ]
+
 
 INVALID_INDEX = 0xFFFF
 """No item, where a message wants a number."""
@@ -100,3 +108,91 @@ def item_message_float(
         item.z,
         mission_type,
     )
+
+
+_FILES = {
+    "mission.dat": MavMissionType.MISSION,
+    "fence.dat": MavMissionType.FENCE,
+    "rally.dat": MavMissionType.RALLY,
+}
+_EMPTY = MissionItem(0, 0, autocontinue=False)
+"""What is where nothing was written."""
+_PLACEHOLDER_SIZE = 1 << 20
+
+
+class MissionMount(Mount):
+    """Mounted as ``@MISSION``; one upload at a time. An open tells one mebibyte, whatever there is."""
+
+    def __init__(self, store: MissionStore) -> None:
+        self._store = store
+        self._writer: _Writer | None = None
+
+    def size(self, path: str) -> int:
+        """A placeholder."""
+        _type_of(path)
+        return _PLACEHOLDER_SIZE
+
+    def open(self, path: str, *, writing: bool) -> OpenFile:
+        """Read what the vehicle has, or write what it shall have."""
+        type_ = _type_of(path)
+        if not writing:
+            return _Reader(_packed(self._store.items(type_), type_))
+        if self._writer is not None and not self._writer.is_closed:
+            raise FileFault(ENFILE)
+        self._writer = _Writer(self._store, type_)
+        return self._writer
+
+
+class _Reader(OpenFile):
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+
+    def read(self, offset: int, size: int) -> bytes:
+        return self._content[offset : offset + size]
+
+
+class _Writer(OpenFile):
+    """A file that is not whole, or that the vehicle does not like, has no effect, and nobody is told."""
+
+    def __init__(self, store: MissionStore, type_: int) -> None:
+        self.is_closed = False
+        self._store = store
+        self._type = type_
+        self._content = bytearray()
+
+    def read(self, offset: int, size: int) -> bytes:
+        raise FileFault(EINVAL)
+
+    def write(self, offset: int, data: bytes) -> None:
+        content = self._content
+        if offset == 0:
+            with suppress(RemoteProtocolError):
+                header = read_header(data)
+                if header.items < INVALID_INDEX:
+                    content.extend(bytes(max(0, header.length - len(content))))
+        content.extend(bytes(max(0, offset + len(data) - len(content))))
+        content[offset : offset + len(data)] = data
+
+    def close(self) -> None:
+        self.is_closed = True
+        try:
+            header = read_header(bytes(self._content))
+            items = unpack_items(bytes(self._content[: header.length]))
+        except (RemoteProtocolError, InvalidArgument):
+            raise FileFault(EINVAL) from None
+        if len(self._content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
+            raise FileFault(EINVAL)
+        clear = not header.options & NO_CLEAR
+        result = self._store.replace(self._type, items, start=header.first, clear=clear)
+        if result != MavMissionResult.ACCEPTED:
+            raise FileFault(EINVAL)
+
+
+def _packed(items: list[MissionItem], type_: int) -> bytes:
+    return pack_items([item.replace(x=int(item.x), y=int(item.y)) for item in items], type_)
+
+
+def _type_of(path: str) -> int:
+    if path not in _FILES:
+        raise FileFault(ENOENT)
+    return _FILES[path]

@@ -12,7 +12,39 @@ import math
 import random
 from dataclasses import dataclass
 
-__all__ = ["GRAVITY_M_S2", "Motion", "MotionLimits", "Wind", "approach_speed", "wrap_pi"]
+__all__ = [
+    "GRAVITY_M_S2",
+    "Motion",
+    "MotionLimits",
+    "Wind",
+    "approach_speed",
+    "euler_from_quaternion",
+    "quaternion_from_euler",
+    "wrap_pi",
+]
+
+
+def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Of a rotation about yaw, then pitch, then roll."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Roll, pitch, yaw of a unit quaternion."""
+    return (
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+
 
 GRAVITY_M_S2 = 9.80665
 _DRAG_PER_S = 0.33  # deceleration per airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s

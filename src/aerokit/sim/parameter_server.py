@@ -1,20 +1,26 @@
-"""Parameters over messages: what the servers of all autopilots have in common.
-
-https://mavlink.io/en/services/parameter.html
-"""
+"""Servers of parameters: what every make does, and how ArduPilot and PX4 do it."""
 
 from __future__ import annotations
 
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink.enums import MavParamError, MavParamType, MavSeverity
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamSet, ParamValue
+from aerokit.parameters import Parameter, ParameterTable, ParameterType
+from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
+from aerokit.parameters.px4_hash import HASH_NAME, px4_hash
+from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.parameters import Parameters
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["ParameterServer"]
+__all__ = ["ArduPilotParameterServer", "ParameterServer", "Px4ParameterServer", "rounded"]
 
 
 class ParameterServer:
@@ -100,3 +106,181 @@ class ParameterServer:
         """What remains of a value under the limits among the faults."""
         low, high = self._vehicle.faults.parameter_limits.get(name, (value, value))
         return max(low, min(high, value)) if value == value else value
+
+
+_QUEUE_DEPTH = 20
+_READ_PERIOD_S = 0.001
+_BOTH_WAYS = 0.01
+
+
+class ArduPilotParameterServer(ParameterServer):
+    """The development version of 4.7 says nothing to an unknown name or a value that is no number; with ``errors``
+    it sends PARAM_ERROR, as the released one does, and confirms to who has asked besides telling everybody.
+
+    Reads wait in a queue of twenty, one is done each millisecond; what does not fit is lost. A list begins with
+    the banner.
+    """
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        parameters: Parameters,
+        *,
+        list_rate_hz: float = 2000.0,
+        errors: bool = False,
+        send_banner: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
+        self.errors = errors
+        self._send_banner = send_banner
+        self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()
+        self._is_reading = False
+
+    def restart(self) -> None:
+        """Forget everything, as a reboot does."""
+        super().restart()
+        self._reads.clear()
+        self._is_reading = False
+
+    def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
+        self._send_banner()
+        self.start_list(channel)
+
+    def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
+        if len(self._reads) >= _QUEUE_DEPTH:
+            return
+        self._reads.append((request, channel))
+        if not self._is_reading:
+            self._is_reading = True
+            self._vehicle.call_later(0.0, self._read_next)
+
+    def _read_next(self) -> None:
+        self._is_reading = bool(self._reads)
+        if not self._reads:
+            return
+        self._vehicle.call_later(_READ_PERIOD_S, self._read_next)
+        request, channel = self._reads.popleft()
+        names, index = self._parameters.names, request.param_index
+        name = request.param_id if index == -1 else names[index] if 0 <= index < len(names) else ""
+        if name in self._parameters:
+            self.send(name, index & 0xFFFF, channel)
+        elif self.errors:
+            self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
+
+    def _on_set(self, request: ParamSet, channel: Channel) -> None:
+        name, faults = request.param_id, self._vehicle.faults
+        if name not in self._parameters:
+            self._refuse(request, MavParamError.DOES_NOT_EXIST, channel)
+        elif not math.isfinite(request.param_value):
+            self._refuse(request, MavParamError.VALUE_OUT_OF_RANGE, channel)
+        elif name in faults.read_only_parameters:
+            self._vehicle.send_text(MavSeverity.WARNING, f"Param write denied ({name})")
+            self._refuse(request, MavParamError.PERMISSION_DENIED, channel)
+            self.send(name, UNKNOWN_INDEX, channel)
+        else:
+            value = self.clamped(name, request.param_value)
+            self._parameters[name] = rounded(value, self._parameters.type(name))
+            if self.errors:
+                self.send(name, UNKNOWN_INDEX, channel)
+            self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
+
+    def _refuse(self, request: ParamSet, code: int, channel: Channel) -> None:
+        if self.errors:
+            self.send_error(sender_of(request), request.param_id, -1, code, channel)
+
+
+def rounded(value: float, type_: int) -> float:
+    """What ArduPilot makes of a float for a whole number: a hundredth is added away from zero, the rest cut off."""
+    if type_ == MavParamType.REAL32:
+        return value
+    shifted = value + math.copysign(_BOTH_WAYS, value)
+    return float(math.trunc(struct.unpack("<f", struct.pack("<f", shifted))[0]))
+
+
+_SECOND_ECHO_S = 0.02
+_GARBAGE = 24400
+"""What was seen in the field of a PARAM_ERROR that is not used."""
+
+
+class Px4ParameterServer(ParameterServer):
+    """With ``errors`` as main sends them (PARAM_ERROR); without, as v1.16, which says nothing.
+
+    No value is checked: whatever the four bytes are is stored. Each PARAM_SET is confirmed to who has asked, and a
+    change is told to everybody a moment later. Setting _HASH_CHECK stops a list; a request for one that runs begins
+    it anew without the hash.
+    """
+
+    burst = 10
+
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        parameters: Parameters,
+        *,
+        list_rate_hz: float = 1000.0,
+        errors: bool = True,
+    ) -> None:
+        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
+        self.errors = errors
+
+    def value_message(self, name: str, index: int) -> ParamValue:
+        """The PARAM_VALUE of a parameter: the four bytes of its value, whatever they would be as a float."""
+        parameter = self._parameters.row(name).as_parameter(index)
+        return value_message(parameter, len(self._parameters), bytewise=True)
+
+    def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
+        if request.target_system == 0:
+            return
+        if channel not in self._lists:
+            self._send_hash(channel)
+        self.start_list(channel)
+
+    def _send_hash(self, channel: Channel) -> None:
+        rows = [self._parameters.row(name) for name in self._parameters.names]
+        volatile = {row.name for row in rows if row.is_volatile}
+        number = px4_hash(ParameterTable(row.as_parameter() for row in rows), volatile)
+        parameter = Parameter(HASH_NAME, number, ParameterType.UINT32)
+        self._vehicle.send(value_message(parameter, len(rows), bytewise=True), channel)
+
+    def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
+        names, index, sender = self._parameters.names, request.param_index, sender_of(request)
+        if index >= 0:
+            if index < len(names):
+                self.send(names[index], index, channel)
+            else:
+                self._refuse(sender, "", index, MavParamError.DOES_NOT_EXIST, channel)
+        elif request.param_id == HASH_NAME:
+            self._send_hash(channel)
+        elif request.param_id in self._parameters:
+            self.send(request.param_id, self._parameters.index(request.param_id), channel)
+        else:
+            self._refuse(sender, request.param_id, _GARBAGE, MavParamError.DOES_NOT_EXIST, channel)
+
+    def _on_set(self, request: ParamSet, channel: Channel) -> None:
+        name, parameters = request.param_id, self._parameters
+        if name == HASH_NAME:
+            self.stop_list(channel)
+        code = self._objection(name, request.param_type)
+        if code is not None:
+            self._refuse(sender_of(request), name, _GARBAGE, code, channel)
+            return
+        value = value_of(request, bytewise=True)
+        before = parameters[name]
+        if name not in self._vehicle.faults.read_only_parameters:
+            parameters[name] = self.clamped(name, value)
+        self.send(name, parameters.index(name), channel)
+        if parameters[name] != before and value == value:
+            self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
+
+    def _objection(self, name: str, type_: int) -> int | None:
+        if name == HASH_NAME:
+            return MavParamError.READ_ONLY
+        if name not in self._parameters:
+            return MavParamError.DOES_NOT_EXIST
+        if type_ not in (MavParamType.INT32, MavParamType.REAL32):
+            return MavParamError.TYPE_UNSUPPORTED
+        return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
+
+    def _refuse(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
+        if self.errors:
+            self.send_error(to, name, index, code, channel)

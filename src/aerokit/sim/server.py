@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import BusyError, InvalidArgument, LinkLost
 from aerokit.links import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
-from aerokit.sim.channel import datagrams
-from aerokit.sim.hearing import SharedHearing
+from aerokit.sim.channel import SharedHearing, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from aerokit.autopilots import autopilot_for
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.position import Position
-from aerokit.sim.ardupilot.fence_zones import Polygon
+from aerokit.sim.ardupilot.fence import PolygonZone
 from aerokit.sim.local_frame import true_place
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ class Track(Sequence[TrackPoint]):
         assert len(polygon) >= 3, f"a polygon has three places or more, not {len(polygon)}"
         _ = self.end
         plane = _plane(self.home)
-        border = Polygon([plane(corner) for corner in polygon])
+        border = PolygonZone([plane(corner) for corner in polygon])
         outside = [point for point in self if border.outside_m(plane(point)) > 0]
         self._note(not outside, Failure(outside[0] if outside else self.end, polygon=polygon))
         assert not outside, (

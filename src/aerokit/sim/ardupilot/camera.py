@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
 from aerokit.sim.commands import whole
-from aerokit.sim.rotations import quaternion_from_euler
+from aerokit.sim.motion import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

@@ -14,9 +14,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire
-from aerokit.sim.ardupilot.fence_list import FenceList
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
-from aerokit.sim.ardupilot.mission_lists import CommandList, ItemList, RallyList
+from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.ardupilot.telemetry_state import mission_current
 from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float
 from aerokit.sim.vehicle import sender_of

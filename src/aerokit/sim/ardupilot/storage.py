@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
-from aerokit.sim.ardupilot.parameter_server import ArduPilotParameterServer, rounded
 from aerokit.sim.file_tree import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
-from aerokit.sim.mission_files import MissionMount
-from aerokit.sim.parameter_pack_file import ParameterPackMount
+from aerokit.sim.missions import MissionMount
+from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
+from aerokit.sim.parameters import ParameterPackMount
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle

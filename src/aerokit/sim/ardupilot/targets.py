@@ -13,7 +13,7 @@ from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
-from aerokit.sim.rotations import euler_from_quaternion
+from aerokit.sim.motion import euler_from_quaternion
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.navigation import Ned

@@ -2,28 +2,311 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink import messages as m
-from aerokit.sim.ardupilot import servo_outputs as outputs
-from aerokit.sim.ardupilot import telemetry_extra as extra
+from aerokit.mavlink.enums import GpsFixType, HlFailureFlag, MavAutopilot, PlaneMode
 from aerokit.sim.ardupilot.calibration import CALIBRATION_BUILDERS
 from aerokit.sim.ardupilot.camera import CAMERA_BUILDERS
 from aerokit.sim.ardupilot.fence import fence_status
-from aerokit.sim.ardupilot.gimbal_status import GIMBAL_BUILDERS
-from aerokit.sim.ardupilot.telemetry_attitude import ATTITUDE_BUILDERS
-from aerokit.sim.ardupilot.telemetry_position import POSITION_BUILDERS
+from aerokit.sim.ardupilot.gimbal import GIMBAL_BUILDERS
+from aerokit.sim.ardupilot.telemetry_motion import ATTITUDE_BUILDERS, POSITION_BUILDERS
 from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
+from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.parameter_tables import Kind
+    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
+    from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
+    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
-__all__ = ["BUILDERS", "Builders"]
+__all__ = ["BUILDERS", "DISPLAY_VALUES"]
 
-Builders = Mapping[int, "Callable[[Any], Message | None]"]
-"""Message id → function that makes such a message of the vehicle's present state, or None."""
+
+_MIDDLE = 1500
+_STICK_RANGE = 500
+_SURFACE_RANGE = 400
+"""A surface or thruster goes from 1100 to 1900."""
+_ROVER_DEADZONE = 30
+_OUTPUTS = 16
+_FULL_ROLL_RATE = 1.5
+_FULL_PITCH_RATE = 0.5
+_PITCH, _ROLL, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
+
+
+def copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
+    """Four motors, all alike."""
+    pwm = vehicle.motors.pwm
+    return _message(vehicle, pwm, pwm, pwm, pwm)
+
+
+def plane_outputs(plane: SimulatedPlane) -> m.ServoOutputRaw:
+    """Aileron, elevator, throttle, rudder; in MANUAL the sticks, disarmed too, the throttle only when armed."""
+    wing, throttle = plane.wing, 1000
+    if plane.motors.is_armed:
+        throttle += round(1000 * plane.motors.throttle)
+    if plane.mode.number == PlaneMode.MANUAL:
+        aileron, elevator, rudder = (_surface(_stick(plane.rc[index])) for index in (0, 1, 3))
+        throttle = max(1000, min(2000, plane.rc[2])) if plane.motors.is_armed else 1000
+    else:
+        aileron = _surface(wing.roll_rate / _FULL_ROLL_RATE)
+        elevator = _surface(-wing.pitch_rate / _FULL_PITCH_RATE)
+        rudder = _surface(wing.roll_rate / _FULL_ROLL_RATE / 2.0)
+    return _message(plane, aileron, elevator, throttle, rudder)
+
+
+def rover_outputs(rover: SimulatedRover) -> m.ServoOutputRaw:
+    """Steering is output 1, also disarmed, the motor output 3."""
+    if rover.mode.has_manual_throttle:
+        steering = _MIDDLE + _beyond_deadzone(rover.rc[0])
+    else:
+        steering = _MIDDLE + round(_STICK_RANGE * rover.motion.yaw_rate / rover.motion.wheels.turn_rate_rad_s)
+    throttle = _MIDDLE + round(_STICK_RANGE * rover.motors.throttle)
+    return _message(rover, steering, 0, throttle)
+
+
+def sub_outputs(sub: SimulatedSub) -> m.ServoOutputRaw:
+    """Four thrusters aslant on the level, two upright, and the camera's two axes on 8 and 10."""
+    one = two = three = four = left = right = _MIDDLE
+    if sub.motors.is_armed:
+        yaw, forward, lateral, roll = (_stick(sub.rc[index]) for index in (_YAW, _FORWARD, _LATERAL, _ROLL))
+        up = 1.0 - 2.0 * sub.motors.throttle
+        one, two = _surface(yaw - forward + lateral), _surface(-yaw - forward - lateral)
+        three, four = _surface(-yaw + forward + lateral), _surface(yaw + forward - lateral)
+        left, right = _surface(up + roll), _surface(up - roll)
+    return _message(sub, one, two, three, four, left, right, 0, _MIDDLE, 0, _MIDDLE)
+
+
+def _message(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
+    outputs = [*pulses, *(0,) * (_OUTPUTS - len(pulses))]
+    for number, pulse in vehicle.accessories.servos.items():
+        if 1 <= number <= _OUTPUTS:
+            outputs[number - 1] = pulse
+    return m.ServoOutputRaw(vehicle.time_boot_us & 0xFFFFFFFF, 0, *outputs)
+
+
+def _stick(pwm: int) -> float:
+    return (pwm - _MIDDLE) / _STICK_RANGE
+
+
+def _surface(share: float) -> int:
+    return _MIDDLE + round(_SURFACE_RANGE * max(-1.0, min(1.0, share)))
+
+
+def _beyond_deadzone(pwm: int) -> int:
+    """A rover's stick: nothing near the middle, all of the range outside."""
+    away = abs(pwm - _MIDDLE) - _ROVER_DEADZONE
+    if away <= 0:
+        return 0
+    size = min(_STICK_RANGE, int(away * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
+    return size if pwm > _MIDDLE else -size
+
+
+Builders = Mapping[int, Callable[[Any], "Message | None"]]
+
+_NOTHING_REACHED = 0xFFFF
+_NO_TEMPERATURE = 32767
+_AIR_DENSITY = 1.225
+_GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
+_ALWAYS_FAILING: dict[Kind, int] = {
+    "copter": HlFailureFlag.DIFFERENTIAL_PRESSURE,
+    "plane": HlFailureFlag.TERRAIN,
+    "rover": HlFailureFlag.DIFFERENTIAL_PRESSURE | HlFailureFlag.TERRAIN,
+    "sub": HlFailureFlag.DIFFERENTIAL_PRESSURE | HlFailureFlag.TERRAIN,
+}
+"""What HIGH_LATENCY2 says of sensors that are not there."""
+
+
+def _hwstatus(_: ArduPilotVehicle) -> m.Hwstatus:
+    return m.Hwstatus(5000, 0)
+
+
+def _reached(_: ArduPilotVehicle) -> m.MissionItemReached:
+    return m.MissionItemReached(_NOTHING_REACHED)
+
+
+def _relays(vehicle: ArduPilotVehicle) -> m.RelayStatus:
+    accessories = vehicle.accessories
+    return m.RelayStatus(vehicle.time_boot_ms, accessories.relays, (1 << accessories.relay_count) - 1)
+
+
+def _flight(vehicle: ArduPilotVehicle) -> m.FlightInformation:
+    return m.FlightInformation(vehicle.time_boot_ms, 0, 0, 0)
+
+
+def _quaternion(vehicle: ArduPilotVehicle) -> tuple[float, float, float, float]:
+    motion = vehicle.motion
+    return quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+
+
+def _for_gimbal(vehicle: ArduPilotVehicle) -> m.AutopilotStateForGimbalDevice:
+    motion, flags = vehicle.motion, vehicle.navigation.flags
+    return m.AutopilotStateForGimbalDevice(
+        vehicle.system_id,
+        0,
+        vehicle.time_boot_us,
+        _quaternion(vehicle),
+        0,
+        motion.velocity_north,
+        motion.velocity_east,
+        motion.velocity_down,
+        0,
+        0.0,
+        0 if flags is None else flags,
+        0,
+        motion.yaw_rate,
+    )
+
+
+def _sim_state(vehicle: ArduPilotVehicle) -> m.SimState:
+    motion = vehicle.motion
+    place = vehicle.navigation.frame.to_global(motion.north, motion.east, motion.down)
+    return m.SimState(
+        *_quaternion(vehicle),
+        motion.roll,
+        motion.pitch,
+        motion.yaw,
+        0.0,
+        0.0,
+        -GRAVITY_M_S2,
+        motion.roll_rate,
+        motion.pitch_rate,
+        motion.yaw_rate,
+        float(place.latitude_e7),
+        float(place.longitude_e7),
+        place.altitude_m,
+        0.0,
+        0.0,
+        motion.velocity_north,
+        motion.velocity_east,
+        motion.velocity_down,
+        place.latitude_e7,
+        place.longitude_e7,
+    )
+
+
+def _failures(vehicle: ArduPilotVehicle) -> int:
+    lost = HlFailureFlag.GPS if vehicle.navigation.fix_type < GpsFixType.TYPE_3D_FIX else 0
+    return _ALWAYS_FAILING[vehicle.KIND] | lost
+
+
+def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
+    motion, place = vehicle.motion, vehicle.navigation.position
+    flies = vehicle.KIND in ("copter", "plane")
+    altitude = 0 if place is None else max(-32768, min(32767, int(place.altitude_m)))
+    return m.HighLatency2(
+        timestamp=vehicle.time_boot_ms,
+        type=vehicle.MAV_TYPE,
+        autopilot=MavAutopilot.ARDUPILOTMEGA,
+        custom_mode=vehicle.mode.number,
+        latitude=0 if place is None else place.latitude_e7,
+        longitude=0 if place is None else place.longitude_e7,
+        altitude=altitude,
+        target_altitude=altitude if flies else 0,
+        heading=int(math.degrees(motion.yaw) % 360.0 / 2.0),
+        target_heading=0,
+        target_distance=0,
+        throttle=round(abs(vehicle.motors.throttle) * 100),
+        airspeed=min(255, round(motion.airspeed_m_s * 5.0)) if flies else 0,
+        airspeed_sp=0,
+        groundspeed=min(255, round(motion.ground_speed_m_s * 5.0)),
+        windspeed=0,
+        wind_heading=0,
+        eph=0,
+        epv=0,
+        temperature_air=-128,
+        climb_rate=max(-128, min(127, round(-motion.velocity_down * 10.0))),
+        battery=int(vehicle.battery.percent),
+        wp_num=vehicle.mission.nav_index,
+        failure_flags=_failures(vehicle),
+        custom0=(vehicle.base_mode ^ 0x80) - 0x80,
+        custom1=0,
+        custom2=0,
+    )
+
+
+EXTRA_BUILDERS: Builders = {
+    m.Hwstatus.ID: _hwstatus,
+    m.MissionItemReached.ID: _reached,
+    m.RelayStatus.ID: _relays,
+    m.FlightInformation.ID: _flight,
+    m.AutopilotStateForGimbalDevice.ID: _for_gimbal,
+    m.SimState.ID: _sim_state,
+    m.HighLatency2.ID: _high_latency,
+}
+"""Message id → what every kind sends when it is asked for it."""
+
+
+def airspeed(plane: SimulatedPlane) -> m.Airspeed:
+    """Of the pitot tube."""
+    speed = plane.motion.airspeed_m_s
+    return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
+
+
+def angles_of_flow(plane: SimulatedPlane) -> m.AoaSsa:
+    """Angle of attack and side slip in degrees; zeros on the ground."""
+    motion = plane.motion
+    slope = math.atan2(-motion.velocity_down, max(motion.airspeed_m_s, 1.0))
+    attack = 0.0 if plane.is_landed else math.degrees(motion.pitch - slope)
+    return m.AoaSsa(plane.time_boot_us, attack, 0.0)
+
+
+def terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
+    """It has no terrain at all: the whole block around it is missing."""
+    place = vehicle.navigation.position
+    if place is None:
+        return None
+    south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
+    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
+
+
+DISPLAY_VALUES: dict[str, float] = {
+    "CamTilt": 0.5,
+    "CamPan": 0.5,
+    "TetherTrn": 0.0,
+    "Lights1": 0.5,
+    "Lights2": 0.5,
+    "PilotGain": 0.5,
+    "InputHold": 0.0,
+    "RollPitch": 0.0,
+    "RFTarget": -0.01,
+}
+"""What ArduSub tells a pilot's display in each round of EXTENDED_STATUS."""
+
+
+def display_value(sub: SimulatedSub) -> m.NamedValueFloat:
+    """The next of `DISPLAY_VALUES`."""
+    name = next(sub.display_names)
+    return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
+
+
+def outside_pressure(sub: SimulatedSub) -> m.ScaledPressure3:
+    """The third barometer, a thermometer only."""
+    return m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0)
+
+
+def scaled_channels(rover: ArduPilotVehicle) -> m.RcChannelsScaled:
+    """All zeros, whatever the sticks do."""
+    return m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255)
+
+
+def rover_hud(rover: SimulatedRover) -> m.VfrHud:
+    """Without airspeed and climb; the throttle is positive also backwards."""
+    motion, place = rover.motion, rover.navigation.position
+    heading = int(math.degrees(motion.yaw) % 360.0)
+    throttle = round(abs(rover.motors.throttle) * 100)
+    altitude = 0.0 if place is None else place.altitude_m
+    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
+
+
+def no_landed_state(_: ArduPilotVehicle) -> m.ExtendedSysState:
+    """Neither on the ground nor in the air, as far as it tells."""
+    return m.ExtendedSysState(0, 0)
+
 
 _ALL = {
     **STATE_BUILDERS,
@@ -31,7 +314,7 @@ _ALL = {
     **POSITION_BUILDERS,
     **GIMBAL_BUILDERS,
     **CAMERA_BUILDERS,
-    **extra.EXTRA_BUILDERS,
+    **EXTRA_BUILDERS,
     m.FenceStatus.ID: fence_status,
     **CALIBRATION_BUILDERS,
 }
@@ -46,29 +329,29 @@ def _without(*message_ids: int) -> dict[int, Any]:
 BUILDERS: dict[Kind, Builders] = {
     "copter": {
         **_ALL,
-        m.ServoOutputRaw.ID: outputs.copter_outputs,
-        m.TerrainRequest.ID: extra.terrain_request,
+        m.ServoOutputRaw.ID: copter_outputs,
+        m.TerrainRequest.ID: terrain_request,
     },
     "plane": {
         **_without(*_COPTER_TARGETS),
-        m.ServoOutputRaw.ID: outputs.plane_outputs,
-        m.TerrainRequest.ID: extra.terrain_request,
-        m.Airspeed.ID: extra.airspeed,
-        m.AoaSsa.ID: extra.angles_of_flow,
+        m.ServoOutputRaw.ID: plane_outputs,
+        m.TerrainRequest.ID: terrain_request,
+        m.Airspeed.ID: airspeed,
+        m.AoaSsa.ID: angles_of_flow,
     },
     "rover": {
         **_without(*_FLYING, *_COPTER_TARGETS),
-        m.ServoOutputRaw.ID: outputs.rover_outputs,
-        m.RcChannelsScaled.ID: extra.scaled_channels,
-        m.VfrHud.ID: extra.rover_hud,
-        m.ExtendedSysState.ID: extra.no_landed_state,
+        m.ServoOutputRaw.ID: rover_outputs,
+        m.RcChannelsScaled.ID: scaled_channels,
+        m.VfrHud.ID: rover_hud,
+        m.ExtendedSysState.ID: no_landed_state,
     },
     "sub": {
         **_without(m.Wind.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
-        m.ServoOutputRaw.ID: outputs.sub_outputs,
-        m.NamedValueFloat.ID: extra.display_value,
-        m.ScaledPressure3.ID: extra.outside_pressure,
-        m.ExtendedSysState.ID: extra.no_landed_state,
+        m.ServoOutputRaw.ID: sub_outputs,
+        m.NamedValueFloat.ID: display_value,
+        m.ScaledPressure3.ID: outside_pressure,
+        m.ExtendedSysState.ID: no_landed_state,
     },
 }
 """Kind → builders; what is not there is not sent."""

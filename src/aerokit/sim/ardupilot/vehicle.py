@@ -9,42 +9,37 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavModeFlag, MavResult, MavSeverity
-from aerokit.sim.ardupilot.accessories import Accessories
 from aerokit.sim.ardupilot.arming import Arming
-from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES
 from aerokit.sim.ardupilot.buzzer import hear_tunes
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
 from aerokit.sim.ardupilot.gimbal import Gimbal
-from aerokit.sim.ardupilot.manual_control import Joystick
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.navigation import Navigation
+from aerokit.sim.ardupilot.navigation import BOOT_TEXTS, BOOT_TIMELINES, Navigation
+from aerokit.sim.ardupilot.outputs import Accessories, Motors
 from aerokit.sim.ardupilot.parameter_tables import Kind, parameters_of
-from aerokit.sim.ardupilot.radio import Radio
+from aerokit.sim.ardupilot.radio import Joystick, Radio
 from aerokit.sim.ardupilot.requests import Requests
-from aerokit.sim.ardupilot.signing import ArduPilotSigning
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.ardupilot.telemetry import BUILDERS
-from aerokit.sim.ardupilot.telemetry_position import global_origin, home_position
+from aerokit.sim.ardupilot.telemetry_motion import global_origin, home_position
 from aerokit.sim.ardupilot.telemetry_state import heartbeat
 from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.place import HOME
+from aerokit.sim.signing import ArduPilotSigning
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import SigningKey
-    from aerokit.sim.ardupilot.boot import BootTimeline
     from aerokit.sim.ardupilot.ftp import ArduPilotFtp
     from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.navigation import BootTimeline, Ned
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import CommandHandler
     from aerokit.sim.file_tree import FileTree

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, ClassVar
 
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, MavType
 from aerokit.parameters import parse_definition
-from aerokit.sim.components.camera_commands import camera_commands
+from aerokit.sim.components.camera_commands import (
+    DEFINITION_PATH,
+    CameraParameters,
+    camera_commands,
+    own_definition,
+)
 from aerokit.sim.components.camera_messages import camera_builders
-from aerokit.sim.components.camera_parameters import DEFINITION_PATH, CameraParameters, own_definition
-from aerokit.sim.components.captures import Captures
-from aerokit.sim.components.component import Builder, SimulatedComponent
-from aerokit.sim.components.files import serve_files
-from aerokit.sim.components.lens import Lens
-from aerokit.sim.components.pose import pose_of
-from aerokit.sim.components.storage import GREY_JPEG, MemoryCard
-from aerokit.sim.components.tracking import Tracking
+from aerokit.sim.components.captures import GREY_JPEG, Captures, MemoryCard
+from aerokit.sim.components.component import Builder, SimulatedComponent, pose_of, serve_files
+from aerokit.sim.components.lens import Lens, Tracking
 from aerokit.sim.file_tree import FileTree
 
 if TYPE_CHECKING:

@@ -3,21 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
 from aerokit.sim.commands import CommandServer, whole
 from aerokit.sim.faults import Faults
+from aerokit.sim.local_frame import true_place
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import Command, CommandHandler
+    from aerokit.sim.file_tree import FileTree
+    from aerokit.sim.ftp import FtpServer
+    from aerokit.sim.local_frame import GlobalPoint
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["Builder", "SimulatedComponent"]
+__all__ = ["Builder", "Pose", "SimulatedComponent", "pose_of", "serve_files"]
+
+
+class Pose(NamedTuple):
+    """Angles in radians."""
+
+    place: GlobalPoint
+    height_m: float
+    """Above home."""
+    roll: float
+    pitch: float
+    yaw: float
+
+
+def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
+    """None of a vehicle that is nowhere, such as a recording."""
+    try:
+        place = true_place(vehicle)
+    except InvalidArgument:
+        return None
+    motion = vehicle.motion  # type: ignore[attr-defined]
+    height = getattr(vehicle, "altitude_m", -motion.down)
+    return Pose(place, height, motion.roll, motion.pitch, motion.yaw)
+
+
+def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
+    """Have a component serve these files by MAVFTP under its own address, as PX4 does; call it in ``listen()``.
+
+    The tree may change at any time: `FileTree.put` makes a file and its folders. Sessions end when the power goes,
+    files stay. ``faults.no_ftp`` of the component makes it deaf.
+    """
+    from aerokit.sim.px4.ftp import Px4Ftp  # what it takes to import is for those who serve files
+
+    server = Px4Ftp(component, files)
+    component.vehicle.when_powered_on(server.restart)
+    return server
+
 
 _HEARTBEAT_S = 1.0
 _MAVLINK_VERSION = 3

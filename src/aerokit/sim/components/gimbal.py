@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavType
-from aerokit.sim.components.component import Builder, SimulatedComponent
-from aerokit.sim.components.gimbal_commands import gimbal_commands, hear_gimbal_orders
-from aerokit.sim.components.gimbal_messages import gimbal_builders, gimbal_manager_status
-from aerokit.sim.components.pose import pose_of
+from aerokit.sim.components.component import Builder, SimulatedComponent, pose_of
+from aerokit.sim.components.gimbal_commands import (
+    gimbal_builders,
+    gimbal_commands,
+    gimbal_manager_status,
+    hear_gimbal_orders,
+)
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import CommandHandler

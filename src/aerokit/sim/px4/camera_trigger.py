@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.commands import whole
-from aerokit.sim.components.pose import pose_of
-from aerokit.sim.rotations import quaternion_from_euler
+from aerokit.sim.components.component import pose_of
+from aerokit.sim.motion import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command, CommandHandler

@@ -15,8 +15,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.sim.commands import whole
+from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.px4.modes import RTL
-from aerokit.sim.rotations import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:

@@ -7,20 +7,311 @@ conversation, too: items can only be asked for one after the other. https://mavl
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavMissionResult, MavMissionType
-from aerokit.sim.missions import AnyItem, AnyRequest
+from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.missions.wire import to_wire
+from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.px4.mission_items import checksum, given_back, stored
-from aerokit.sim.px4.mission_link import MissionLink
+from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
+    from aerokit.mavlink.message import Message
     from aerokit.missions import MissionItem
     from aerokit.sim.channel import Channel
     from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["MissionServer"]
+__all__ = ["MissionLink", "MissionServer"]
+
+
+_ASK_AGAIN_S, _GIVE_UP_S = 0.26, 5.0
+_R = MavMissionResult
+_NOBODY = (0, 0)
+
+
+class State(Enum):
+    """What goes on."""
+
+    IDLE = "idle"
+    SENDING = "sending a list"
+    GETTING = "getting a list"
+
+
+class MissionLink:
+    """Texts and results are those of the firmware; each ``on_…`` hears one message."""
+
+    def __init__(self, px4: SimulatedPx4, server: MissionServer, channel: Channel) -> None:
+        self._px4, self._server, self._channel = px4, server, channel
+        self._state = State.IDLE
+        self._partner = _NOBODY
+        self._type = 0
+        self._seq = self._count = 0
+        self._items: list[MissionItem] = []
+        self._id = 0
+        self._current = -1
+        self._sent_at = self._received_at = 0.0
+        self._speaks_int = not px4.version.startswith("1.16")
+        self._watch_number = 0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no transfer goes on here."""
+        return self._state is State.IDLE
+
+    # ---------------------------------------------------------------------------------------- sending
+
+    def _complain(self, text: str) -> None:
+        self._px4.send_text(MavSeverity.CRITICAL, text)
+
+    def _acknowledge(self, to: tuple[int, int], result: int, opaque_id: int = 0) -> None:
+        self._px4.send(m.MissionAck(*to, result, self._type, opaque_id), self._channel)
+
+    def _send_count(self) -> None:
+        self._sent_at = self._px4.now
+        count = m.MissionCount(*self._partner, self._count, self._type, self._server.id(self._type))
+        self._px4.send(count, self._channel)
+
+    def _ask(self) -> None:
+        self._sent_at = self._px4.now
+        kind = m.MissionRequestInt if self._speaks_int else m.MissionRequest
+        self._px4.send(kind(*self._partner, self._seq, self._type), self._channel)
+
+    def send_changed(self, seq: int) -> None:
+        """Send an item of the mission that the vehicle changed by itself."""
+        if self._state is State.IDLE and self._partner != _NOBODY:
+            self._type = 0
+            self._send_item(seq)
+
+    def _send_item(self, seq: int) -> None:
+        item = self._server.item(self._type, seq)
+        assert item is not None
+        self._sent_at = self._px4.now
+        current = int(self._px4.mission.current == seq)
+        given = given_back(item, as_int=self._speaks_int)
+        system, component = self._partner
+        if self._speaks_int:
+            message: Message = to_wire(
+                given,
+                seq,
+                target_system=system,
+                target_component=component,
+                mission_type=self._type,
+                current=bool(current),
+            )
+        else:
+            scale = 1e-7 if item.frame != MavFrame.MISSION else 1.0
+            place = (item.x * scale, item.y * scale)
+            message = item_message_float(given, place, seq, self._partner, self._type, current)
+        self._px4.send(message, self._channel)
+
+    # ------------------------------------------------------------------------------------------- time
+
+    def _begin(self, state: State, message: Message, mission_type: int, count: int) -> None:
+        self._state, self._partner, self._type = state, sender_of(message), mission_type
+        self._seq, self._count = 0, count
+        self._watch_number += 1
+        self._watch(self._watch_number)
+
+    def _end_upload(self) -> None:
+        self._state = State.IDLE
+        self._server.uploading = None
+
+    def _watch(self, number: int) -> None:
+        due = self._received_at + _GIVE_UP_S
+        if self._repeats:
+            due = min(due, max(self._px4.now, self._sent_at) + _ASK_AGAIN_S)
+        self._px4.call_at(due, lambda: self._check(number))
+
+    @property
+    def _repeats(self) -> bool:
+        return self._state is State.GETTING or self._seq == 0
+
+    def _check(self, number: int) -> None:
+        if number != self._watch_number or self._state is State.IDLE:
+            return
+        now = self._px4.now
+        if now >= self._received_at + _GIVE_UP_S:
+            self._complain("Mission sync timeout")
+            self._end_upload()
+            return
+        if self._repeats and now >= self._sent_at + _ASK_AGAIN_S:
+            if self._state is State.GETTING:
+                self._ask()
+            else:
+                self._send_count()
+        self._watch(number)
+
+    # --------------------------------------------------------------------------------------- download
+
+    def on_request_list(self, request: m.MissionRequestList) -> None:
+        """Somebody wants a list: begin, or begin again.
+
+        When everything was sent, only the last acknowledgement is missing. The firmware takes an upload for that, too,
+        when as many items have come as it had before: the upload is over then, but blocks all others, until a
+        download is given up.
+        """
+        if self._seq == self._server.count(self._type):
+            self._state = State.IDLE
+        same = self._partner == sender_of(request) and self._type == request.mission_type
+        if not (self._state is State.IDLE or (self._state is State.SENDING and same)):
+            self._px4.info("Mission download request ignored, already active")
+            return
+        self._received_at = self._px4.now
+        count = self._server.count(request.mission_type)
+        self._begin(State.SENDING, request, request.mission_type, count)
+        self._send_count()
+
+    def on_request(self, request: AnyRequest) -> None:
+        """The next item, or the one before once more; anything else ends the download."""
+        self._speaks_int = isinstance(request, m.MissionRequestInt)
+        if sender_of(request) != self._partner:
+            self._complain("WPM: REJ. CMD: partner id mismatch")
+            return
+        if self._state is State.GETTING:
+            self._complain("WPM: REJ. CMD: Busy")
+        if self._state is not State.SENDING or request.mission_type != self._type:
+            return
+        self._received_at = self._px4.now
+        if request.seq == self._seq and self._seq < self._count:
+            self._seq += 1
+        elif request.seq != self._seq - 1:
+            self._refuse_request()
+            return
+        if request.seq < self._server.count(self._type):
+            self._send_item(request.seq)
+        else:
+            self._refuse_request()
+
+    def _refuse_request(self) -> None:
+        self._state = State.IDLE
+        self._acknowledge(self._partner, _R.ERROR)
+        self._complain("WPM: REJ. CMD: Req. WP was unexpected")
+
+    def on_ack(self, ack: m.MissionAck) -> None:
+        """The end of a download; during an upload a cancellation, or a wish for the other form of item."""
+        if sender_of(ack) != self._partner:
+            self._complain("REJ. WP CMD: partner id mismatch")
+        elif self._state is State.SENDING and ack.mission_type == self._type:
+            self._received_at = self._px4.now
+            self._state = State.IDLE
+        elif self._state is State.GETTING and ack.type == _R.UNSUPPORTED:
+            self._speaks_int = not self._speaks_int
+            self._ask()
+        elif self._state is State.GETTING and ack.type == _R.OPERATION_CANCELLED:
+            self._end_upload()
+
+    # ----------------------------------------------------------------------------------------- upload
+
+    def on_count(self, count: m.MissionCount) -> None:
+        """Somebody has a new list."""
+        sender = sender_of(count)
+        if self._state is State.SENDING:
+            self._complain("WPM: IGN MISSION_COUNT: Busy")
+            self._acknowledge(sender, _R.ERROR)
+            return
+        self._received_at = self._px4.now
+        if self._state is State.IDLE:
+            if not self._accept(count):
+                return
+        elif sender != self._partner:
+            self._acknowledge(sender, _R.ERROR)
+            return
+        elif self._seq > 0:
+            self._complain("WPM: REJ. CMD: Busy")
+            self._acknowledge(self._partner, _R.ERROR)
+            return
+        self._ask()
+
+    def _accept(self, count: m.MissionCount) -> bool:
+        """Whether items are to be asked for."""
+        sender, server = sender_of(count), self._server
+        if server.uploading is not None:
+            self._acknowledge(sender, _R.ERROR)
+            return False
+        self._partner, self._type = sender, count.mission_type
+        self._px4.mission.forget_reached()
+        if count.count > server.capacity(self._type):
+            self._acknowledge(sender, _R.NO_SPACE)
+        elif count.count == 0:
+            server.store(self._type, [], 0, 0)
+            self._acknowledge(sender, _R.ACCEPTED)
+        else:
+            self._items, self._id, self._current = [], 0, -1
+            server.uploading = self
+            self._begin(State.GETTING, count, self._type, count.count)
+            return True
+        return False
+
+    def on_item(self, message: AnyItem) -> None:
+        """An item of an upload; one that is not expected is passed over."""
+        is_int = isinstance(message, m.MissionItemInt)
+        self._speaks_int = is_int
+        if sender_of(message) != self._partner:
+            self._complain("REJ. MIS ITEM: partner id mismatch")
+        elif message.mission_type != self._type:
+            self._acknowledge(self._partner, _R.ERROR)
+        elif self._state is State.GETTING:
+            self._received_at = self._px4.now
+            if message.seq == self._seq:
+                self._take(message, is_int=is_int)
+        elif self._state is State.IDLE and self._seq == message.seq + 1:
+            self._acknowledge(self._partner, _R.ACCEPTED, self._id)  # our last one was lost
+        else:
+            why = "No transfer" if self._state is State.IDLE else "Busy"
+            self._complain(f"IGN MISSION_ITEM: {why}")
+            self._acknowledge(self._partner, _R.ERROR)
+
+    def _take(self, message: AnyItem, *, is_int: bool) -> None:
+        item = item_from(message)
+        place = item if is_int else item.replace(x=float(item.x), y=float(item.y))
+        whole = (
+            item if is_int or item.frame == MavFrame.MISSION else item.replace(x=_e7(item.x), y=_e7(item.y))
+        )
+        kept = stored(whole, self._type, is_int=is_int)
+        if isinstance(kept, int):
+            if kept != _R.ERROR:
+                self._complain("IGN MISSION_ITEM: Invalid item")
+            self._acknowledge(self._partner, kept)
+            self._end_upload()
+            return
+        self._id = checksum([place], self._id)
+        self._items.append(kept)
+        if message.current:
+            self._current = message.seq
+        self._seq += 1
+        if self._seq < self._count:
+            self._ask()
+            return
+        self._server.store(self._type, self._items, self._id, self._current)
+        self._end_upload()
+        self._acknowledge(self._partner, _R.ACCEPTED, self._id)
+
+    # ---------------------------------------------------------------------------------------- at once
+
+    def on_clear_all(self, request: m.MissionClearAll) -> None:
+        """Only while nothing else goes on; else there is no answer but a text."""
+        if self._state is not State.IDLE:
+            self._complain("WPM: IGN CLEAR CMD: Busy")
+            return
+        self._type = request.mission_type
+        self._server.clear(self._type)
+        self._acknowledge(sender_of(request), _R.ACCEPTED)
+
+    def on_set_current(self, request: m.MissionSetCurrent) -> None:
+        """The item to be flown next."""
+        if self._state is not State.IDLE:
+            self._complain("WPM: IGN WP CURR CMD: Busy")
+        elif request.seq >= len(self._server.commands):
+            self._complain("WPM: WP CURR CMD: Not in list")
+        else:
+            self._px4.mission.set_current(request.seq)
+
+
+def _e7(degrees: float) -> int:
+    return round(degrees * 1e7) if abs(degrees) < 200 else 0
+
 
 _CAPACITIES: dict[int, int] = {
     MavMissionType.MISSION: 10_000,

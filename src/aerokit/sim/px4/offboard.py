@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.motion import euler_from_quaternion
 from aerokit.sim.px4.flight import velocity_towards
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
-from aerokit.sim.rotations import euler_from_quaternion
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel

@@ -1,23 +1,272 @@
-"""`SimulatedPx4Plane`: a PX4 fixed wing."""
+"""`SimulatedPx4Plane`: a PX4 fixed wing, how it flies in each of its modes, and its missions."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink.enums import MavType
+from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.sim.fixed_wing import FixedWing, WingLimits
 from aerokit.sim.motion import Wind
-from aerokit.sim.px4.modes import HOLD
-from aerokit.sim.px4.plane_flight import PlaneFlight
-from aerokit.sim.px4.plane_mission import PlaneMission
+from aerokit.sim.px4.flight import Flight
+from aerokit.sim.px4.mission import Mission
+from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, STICK_MODES, TAKEOFF, Px4Mode
 from aerokit.sim.px4.vehicle import SimulatedPx4
 
 if TYPE_CHECKING:
+    from aerokit.missions import MissionItem
     from aerokit.sim.motion import Motion
-    from aerokit.sim.px4.flight import Flight
-    from aerokit.sim.px4.mission import Mission
+    from aerokit.sim.px4.offboard import Ned
 
-__all__ = ["SimulatedPx4Plane"]
+__all__ = ["PlaneFlight", "PlaneMission", "SimulatedPx4Plane"]
+
+
+_FLARE_M = 3.0
+_AHEAD_S = 2.5
+_FLARE_SINK_M_S = 0.5
+_HEIGHT_REACHED_M = 10.0
+
+
+class PlaneFlight(Flight):
+    """The navigator of an aeroplane. ``target`` is the middle of a circle, or the end of a straight line."""
+
+    def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
+        super().__init__(plane)
+        self._motion = motion
+        self.radius_m: float = 0.0
+        """Of the circle; negative is anticlockwise."""
+        self.course: float = 0.0
+        """The climb-out's direction, in radians."""
+        self._plane = plane
+
+    @property
+    def cruise_speed_m_s(self) -> float:
+        """FW_AIRSPD_TRIM."""
+        return self._plane.parameters["FW_AIRSPD_TRIM"]
+
+    @property
+    def top_speed_m_s(self) -> float:
+        """FW_AIRSPD_MAX."""
+        return self._plane.parameters["FW_AIRSPD_MAX"]
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether it is on its take-off run."""
+        return (
+            self.lifts_off
+            and self._plane.now - self._plane.arming.since >= self._plane.parameters["RWTO_RAMP_TIME"]
+        )
+
+    def enter(self, mode: Px4Mode) -> None:
+        """A mode begins."""
+        self.radius_m = self._plane.parameters["NAV_LOITER_RAD"]
+        self.course = self._motion.yaw
+        super().enter(mode)
+
+    def update(self) -> None:
+        """Tell the motion what to do until the next tick."""
+        plane = self._plane
+        mode, mission = plane.mode, plane.mission
+        self.lifts_off: bool = mode == TAKEOFF or (mode == MISSION and mission.wants_up)
+        if plane.is_landed and not self.is_rolling:
+            return
+        if plane.is_landed and not self._motion.is_on_ground:
+            plane.leave_ground()
+        if mode == TAKEOFF:
+            self._take_off()
+        elif mode == LAND:
+            self.circle_down()
+        elif mode == RTL:
+            self._return()
+        elif mode == MISSION:
+            mission.update()
+        elif mode == OFFBOARD and math.isfinite(sum(plane.offboard.position)):
+            self.target = plane.offboard.position
+            self.circle()
+        elif mode in STICK_MODES and plane.sticks.are_fresh:
+            self._follow_sticks()
+        else:
+            self.circle()
+
+    def _follow_sticks(self) -> None:
+        """Bank, climb and airspeed by the sticks, in every mode that is flown by hand; forward is down."""
+        sticks, values = self._plane.sticks, self._plane.parameters
+        climb = -sticks.pitch * values["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
+        slowest, fastest = values["FW_AIRSPD_MIN"], values["FW_AIRSPD_MAX"]
+        speed = slowest + (sticks.throttle + 1.0) / 2 * (fastest - slowest)
+        self._motion.bank_and_climb(speed, math.radians(values["FW_R_LIM"]) * sticks.roll, climb)
+        self.stay_here()
+
+    def go(self) -> None:
+        """Circle around the target."""
+        self.circle()
+
+    def circle(self) -> None:
+        """Around the target, at its height."""
+        self._motion.circle(*self.target, radius=self.radius_m, airspeed=self.speed_m_s)
+
+    def fly_straight(self) -> None:
+        """Towards the target, and over it."""
+        self._motion.fly_to(*self.target, airspeed=self.speed_m_s)
+
+    def climb_out(self) -> None:
+        """Straight on, upwards."""
+        climb = self._plane.parameters["FW_T_CLMB_MAX"]
+        self._motion.head(self.course, self.speed_m_s, climb)
+
+    def _take_off(self) -> None:
+        """The middle of the circle is where the height was reached."""
+        self.climb_out()
+        if self._motion.down > self.target[2]:
+            return
+        place = (self._motion.north, self._motion.east, self.target[2])
+        self._plane.switch_to_hold()
+        self.target = place
+
+    def circle_down(self) -> None:
+        """Sink in circles, wings level at last."""
+        sink = self._plane.parameters["FW_T_SINK_MIN"]
+        self.target = (*self.target[:2], self._motion.down + sink * _AHEAD_S)
+        self._touch_down(self.circle)
+
+    def descend(self) -> None:
+        """Along the glide path (FW_LND_ANG) to the target on the ground."""
+        self._touch_down(self._glide)
+
+    def _touch_down(self, approach: Callable[[], None]) -> None:
+        motion = self._motion
+        height = motion.ground_down - motion.down
+        if motion.is_on_ground:
+            motion.roll_out()
+        elif height < _FLARE_M:
+            motion.head(motion.yaw, self._plane.parameters["FW_AIRSPD_MIN"], -_FLARE_SINK_M_S)
+        else:
+            approach()
+
+    def _glide(self) -> None:
+        motion = self._motion
+        away = math.hypot(self.target[0] - motion.north, self.target[1] - motion.east)
+        height = away * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
+        climb = min(0.0, motion.climb_to(motion.ground_down - height))
+        course = math.atan2(self.target[1] - motion.east, self.target[0] - motion.north)
+        motion.head(course, self._plane.parameters["FW_AIRSPD_MIN"] * 1.3, climb)
+
+    # ---------------------------------------------------------------------------------------- return
+
+    def _return(self) -> None:
+        """Climb where it is, fly home, circle down to RTL_DESCEND_ALT; land only if RTL_LAND_DELAY is not negative."""
+        motion, plane = self._motion, self._plane
+        if self._phase == "land":
+            self.circle_down()
+            return
+        self.circle()
+        if abs(motion.down - self.target[2]) > _HEIGHT_REACHED_M or not self._is_near():
+            return
+        if self._phase == "climb":
+            self._phase, self.target = "return", (*self.destination[:2], self.target[2])
+        elif self._phase == "return":
+            descend = plane.parameters["RTL_DESCEND_ALT"]
+            self.radius_m = plane.parameters["RTL_LOITER_RAD"]
+            self._phase = "loiter"
+            self.target: Ned = (*self.destination[:2], max(self.target[2], self.destination[2] - descend))
+        elif self._phase == "loiter":
+            self._phase = "done" if plane.parameters["RTL_LAND_DELAY"] < 0 else "land"
+            done = self._phase == "done"
+            plane.info("RTL: completed, loitering" if done else "RTL: land at destination")
+
+    def _is_near(self) -> bool:
+        away = math.hypot(self.target[0] - self._motion.north, self.target[1] - self._motion.east)
+        return away <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
+
+
+_C = MavCmd
+_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
+_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
+_CIRCLES = (_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_LOITER_TO_ALT)
+_TURN_S = 2.0
+
+
+class PlaneMission(Mission):
+    """The mission mode of an aeroplane."""
+
+    def __init__(self, plane: SimulatedPx4Plane) -> None:
+        super().__init__(plane)
+        self._plane = plane
+
+    def _climb(self, down: float | None) -> None:
+        super()._climb(down)
+        self._plane.flight.course = self._plane.motion.yaw
+
+    def _aim(self, item: MissionItem) -> None:
+        super()._aim(item)
+        flight = self._plane.flight
+        radius = {_C.NAV_LOITER_UNLIM: item.param3, _C.NAV_LOITER_TIME: item.param3}.get(
+            MavCmd(item.command), item.param2 if item.command == _C.NAV_LOITER_TO_ALT else 0.0
+        )
+        default = self._plane.parameters["NAV_LOITER_RAD"]
+        flight.radius_m = radius if radius and math.isfinite(radius) else default
+        if item.command in _LANDINGS:
+            self._phase = "land"
+
+    def update(self) -> None:
+        """One tick: steer, and look whether the item is reached."""
+        item, flight = self._item, self._plane.flight
+        if item is None or self.is_finished:
+            flight.circle()
+        elif self._phase == "land":
+            flight.descend()
+        elif self._phase == "climb":
+            flight.climb_out()
+            if self._plane.motion.down <= flight.target[2]:
+                self._leave_climb(item)
+        else:
+            self._go(item)
+
+    def _leave_climb(self, item: MissionItem) -> None:
+        if item.command in _TAKE_OFFS:
+            self._pass(item)
+        else:
+            self._phase = "go"
+            self._plane.flight.target = self._place(item)
+
+    def _go(self, item: MissionItem) -> None:
+        flight = self._plane.flight
+        if item.command in _CIRCLES or item.command == _C.NAV_DELAY:
+            flight.circle()
+        else:
+            flight.fly_straight()
+        if not self._is_there(item):
+            return
+        if math.isnan(self._arrived_at):
+            self._arrived_at = self._plane.now
+        if self._is_done(item):
+            self._pass(item)
+
+    def _pass(self, item: MissionItem) -> None:
+        self._reach()
+        if item.autocontinue and self._advance():
+            self._begin_item()
+
+    def _is_there(self, item: MissionItem) -> bool:
+        if item.command == _C.NAV_DELAY:
+            return True
+        plane, motion = self._plane, self._plane.motion
+        north, east, down = plane.flight.target
+        radius = max(plane.parameters["NAV_ACC_RAD"], item.param2 if item.command == _C.NAV_WAYPOINT else 0.0)
+        radius = max(radius, _TURN_S * motion.airspeed_m_s)
+        if item.command in _CIRCLES:
+            radius += abs(plane.flight.radius_m)
+        near = math.hypot(north - motion.north, east - motion.east) <= radius
+        return near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
+
+    def _hold(self) -> None:
+        """What the commander does when a mission has ended in the air."""
+        target = self._plane.flight.target
+        super()._hold()
+        if self._plane.mode == HOLD:
+            self._plane.flight.target = target
+
 
 _AMPERES_AT_FULL = 20.0
 

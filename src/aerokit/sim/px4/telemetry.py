@@ -19,6 +19,7 @@ from aerokit.mavlink.enums import (
     MavSysStatusSensor,
 )
 from aerokit.sim.missions import INVALID_INDEX
+from aerokit.sim.motion import quaternion_from_euler
 from aerokit.sim.px4.modes import (
     ACRO,
     ALTITUDE,
@@ -44,9 +45,7 @@ from aerokit.sim.px4.modes import (
     VTOL_TAKEOFF,
     custom_mode,
 )
-from aerokit.sim.px4.telemetry_identity import IDENTITY_BUILDERS
-from aerokit.sim.px4.telemetry_sensors import SENSOR_BUILDERS
-from aerokit.sim.rotations import quaternion_from_euler
+from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

@@ -12,18 +12,16 @@ from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
 from aerokit.sim.commands import Command
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
-from aerokit.sim.place import HOME
-from aerokit.sim.px4.arming import Arming
-from aerokit.sim.px4.calibration import Calibration
+from aerokit.sim.px4.arming import Arming, Calibration
 from aerokit.sim.px4.camera_trigger import CameraTrigger
 from aerokit.sim.px4.commands import px4_commands, refusal_by_place, set_mode
-from aerokit.sim.px4.events import Events
 from aerokit.sim.px4.failsafes import Failsafes
 from aerokit.sim.px4.flight import Flight
 from aerokit.sim.px4.gimbal import GIMBAL_BUILDERS, BuiltWithGimbal, Gimbal
 from aerokit.sim.px4.link_rates import LinkRates
+from aerokit.sim.px4.manual import Sticks
 from aerokit.sim.px4.mission import Mission
 from aerokit.sim.px4.mission_server import MissionServer
 from aerokit.sim.px4.modes import (
@@ -42,11 +40,10 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.offboard import Offboard
 from aerokit.sim.px4.parameters import px4_parameters
-from aerokit.sim.px4.signing import Px4Signing
-from aerokit.sim.px4.sticks import Sticks
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, global_origin
-from aerokit.sim.px4.texts import TextLinks, on_the_wire
+from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
+from aerokit.sim.signing import Px4Signing
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:

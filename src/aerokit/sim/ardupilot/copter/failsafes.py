@@ -1,17 +1,79 @@
-"""ArduCopter's failsafes: radio, ground station, battery and estimator, and motors that idle for too long."""
+"""What an ArduCopter checks before arming, and does by itself: radio, ground station, battery, estimator, fence."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink.enums import CopterMode, MavSeverity
+from aerokit.mavlink.enums import CopterMode, FenceMitigate, MavSeverity
+from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
+from aerokit.sim.ardupilot.mode import VehicleMode
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
 
-__all__ = ["CopterFailsafes"]
+__all__ = ["CopterArming", "CopterFailsafes", "CopterFence"]
+
+
+_STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
+
+
+class CopterArming(Arming):
+    """A position is needed only in the modes that fly by it, and a throttle that is low or in the middle."""
+
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        super().__init__(copter)
+        self._copter = copter
+
+    def ahrs_reasons(self) -> Sequence[str]:
+        """Comes after GPS, which says it first."""
+        return ()
+
+    def position_reasons(self) -> Sequence[str]:
+        """GPS and estimator; then even what a forced arming insists on."""
+        if self._copter.mode.needs_position and (reasons := self.gps_reasons()):
+            return reasons
+        return super().ahrs_reasons() or self.mandatory_reasons()
+
+    def own_reasons(self) -> list[str]:
+        """Ground station, and a battery that was low before."""
+        failsafes = self._copter.failsafes
+        reasons = ["GCS failsafe on"] if failsafes.ground_station else []
+        return [*reasons, "Battery failsafe"] if failsafes.battery_is_low else reasons
+
+    def mandatory_reasons(self) -> list[str]:
+        """What the mode needs of the estimator."""
+        copter, nav = self._copter, self._copter.navigation
+        reasons = []
+        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.estimator):
+            reasons.append("Need Position Estimate")
+        if not copter.mode.has_manual_throttle and not nav.has_altitude:
+            reasons.append("Need Alt Estimate")
+        return reasons
+
+    def arm(self, *, force: bool = False) -> bool:
+        """The way back begins here."""
+        done = super().arm(force=force)
+        if done:
+            self._copter.path.begin()
+        return done
+
+    def final_reasons(self) -> list[str]:
+        """Mode and throttle."""
+        mode = self._copter.mode
+        if not mode.can_arm:
+            return [f"{mode.name} mode not armable"]
+        high = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
+        if not mode.arms_with_raised_throttle and self._copter.rc[2] > high:
+            return ["Throttle too high"]
+        return []
+
 
 _NONE, _LAND, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _TERMINATE, _AUTO, _BRAKE = range(8)
 _BY_LINK_PARAMETER = {
@@ -246,3 +308,52 @@ class CopterFailsafes(Failsafes):
                 self.say(text)
             if self._copter.set_mode(mode):
                 return
+
+
+_GIVE_UP_M = 100.0
+_ACTIONS: dict[int, tuple[int, ...]] = {
+    1: (CopterMode.RTL, CopterMode.LAND),
+    2: (CopterMode.LAND,),
+    3: (CopterMode.SMART_RTL, CopterMode.RTL, CopterMode.LAND),
+    4: (CopterMode.BRAKE, CopterMode.LAND),
+    5: (CopterMode.SMART_RTL, CopterMode.LAND),
+}
+
+
+class CopterFence(Fence):
+    """FENCE_ACTION: nothing (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4); LAND if that fails or far out."""
+
+    PERIOD_S: ClassVar[float] = 0.1
+    WATCHES_DISARMED: ClassVar[bool] = True
+    MITIGATION: ClassVar[int] = FenceMitigate.NONE
+
+    def act(self, new: int) -> None:
+        """On the ground the motors stop; in the air FENCE_ACTION follows."""
+        vehicle = self._vehicle
+        action = int(vehicle.parameters["FENCE_ACTION"])
+        if vehicle.is_landed:
+            if action != REPORT_ONLY:
+                vehicle.arming.disarm()
+            return
+        self.tell("breached", new)
+        if action == REPORT_ONLY:
+            return
+        modes = (CopterMode.LAND,) if self.beyond_m(new) > _GIVE_UP_M else _ACTIONS.get(action, _ACTIONS[1])
+        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
+
+    def cleared(self) -> None:
+        """It says so in the air."""
+        if not self._vehicle.is_landed:
+            self._vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
+
+    def refusal(self, mode: VehicleMode) -> tuple[int, str] | None:
+        """Only in the air."""
+        if not self.forbids_modes() or not self._vehicle.is_armed or self._vehicle.is_landed:
+            return None
+        return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
+
+    def mode_changed(self) -> None:
+        """Ten seconds for the pilot, unless the fence only reports."""
+        super().mode_changed()
+        if self._vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
+            self.recover_by_hand()

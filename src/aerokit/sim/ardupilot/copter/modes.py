@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["AltHold", "Brake", "Circle", "Loiter", "Mode", "PosHold", "Stabilize", "TakeOff"]
 
+
 _MID_STICK, _STICK_RANGE, _THROTTLE_DEADZONE = 1500, 500, 100
 _FULL_STICK_LEAN_RAD = math.radians(30.0)
 _FULL_STICK_TURN_RAD_S = math.radians(200.0)

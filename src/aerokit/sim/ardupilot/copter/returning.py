@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import CopterMode
 from aerokit.sim.ardupilot.copter.modes import Mode
-from aerokit.sim.ardupilot.rally import best_return_place
+from aerokit.sim.ardupilot.navigation import best_return_place
 
 if TYPE_CHECKING:
     from typing import ClassVar

@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.copter.guided import Guided
-from aerokit.sim.rotations import euler_from_quaternion
+from aerokit.sim.motion import euler_from_quaternion
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter

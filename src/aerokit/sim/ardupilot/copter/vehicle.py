@@ -5,15 +5,23 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink.enums import MavModeFlag, MavType
-from aerokit.sim.ardupilot.copter.arming import CopterArming
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavCmd,
+    MavDoRepositionFlags,
+    MavFrame,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    MotorTestThrottleType,
+    SpeedType,
+)
+from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.copter.auto import Auto
-from aerokit.sim.ardupilot.copter.commands import copter_commands
-from aerokit.sim.ardupilot.copter.failsafes import CopterFailsafes
-from aerokit.sim.ardupilot.copter.fence import CopterFence
+from aerokit.sim.ardupilot.copter.failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.copter.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
-from aerokit.sim.ardupilot.copter.motor_test import MotorTest
 from aerokit.sim.ardupilot.copter.other_modes import (
     Acro,
     AutoRtl,
@@ -34,6 +42,7 @@ from aerokit.sim.ardupilot.copter.setpoints import Setpoints
 from aerokit.sim.ardupilot.copter.yaw import AutoYaw
 from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.commands import Command, CommandHandler, whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,9 +54,164 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.commands import CommandHandler
 
-__all__ = ["SimulatedCopter"]
+__all__ = ["MotorTest", "SimulatedCopter", "copter_commands"]
+
+
+_MAX_S = 600.0
+_PAUSE_SHARE = 0.5
+"""Between two motors, of the time for each."""
+_MIN_PWM, _MAX_PWM = 800, 2200
+
+
+class MotorTest:
+    """Only on the ground; HEARTBEAT says "armed" while a motor turns, and afterwards the vehicle is disarmed."""
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+        self.is_running: bool = False
+        self._number = 0
+
+    def command(self, command: Command) -> int:
+        """Begin, or go on with other motors; how it ends is told by a text."""
+        if not self.is_running and (reason := self._refusal()):
+            self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {reason}")
+            return MavResult.FAILED
+        if not self.is_running:
+            self._copter.info("starting motor test")
+        self.is_running = True
+        self._number += 1
+        self._copter.call_later(self._duration_s(command), lambda number=self._number: self._stop(number))  # type: ignore[misc]
+        return MavResult.ACCEPTED
+
+    def _refusal(self) -> str:
+        if not self._copter.is_initialised:
+            return "Board initialising"
+        return "" if self._copter.is_landed else "vehicle not landed"
+
+    def _duration_s(self, command: Command) -> float:
+        """A throttle that is none ends it at once."""
+        kind, throttle = command.param2, command.param3
+        is_valid = kind == MotorTestThrottleType.THROTTLE_PILOT or (
+            throttle <= 100.0
+            if kind in (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
+            else kind == MotorTestThrottleType.THROTTLE_PWM and _MIN_PWM <= throttle <= _MAX_PWM
+        )
+        each, motors = max(0.0, min(command.param4, _MAX_S)), max(1, whole(command.x))
+        return each * (motors + (motors - 1) * _PAUSE_SHARE) if is_valid else 0.0
+
+    def _stop(self, number: int) -> None:
+        if number == self._number:
+            self.is_running = False
+            self._copter.info("finished motor test")
+            self._copter.motors.set_armed(False, self._copter.now)
+
+
+def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler."""
+    flight = _Flight(copter)
+    return {
+        **common_commands(copter),
+        MavCmd.NAV_TAKEOFF: flight.take_off,
+        MavCmd.NAV_VTOL_TAKEOFF: flight.take_off,
+        MavCmd.NAV_LAND: lambda _: copter.change_to(CopterMode.LAND),
+        MavCmd.NAV_VTOL_LAND: lambda _: copter.change_to(CopterMode.LAND),
+        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: copter.change_to(CopterMode.RTL),
+        MavCmd.NAV_LOITER_UNLIM: lambda _: copter.change_to(CopterMode.LOITER),
+        MavCmd.MISSION_START: flight.start_mission,
+        MavCmd.DO_REPOSITION: flight.reposition,
+        MavCmd.DO_CHANGE_SPEED: flight.change_speed,
+        MavCmd.CONDITION_YAW: flight.turn,
+        MavCmd.DO_PAUSE_CONTINUE: flight.pause_or_continue,
+        MavCmd.DO_MOTOR_TEST: lambda command: copter.motor_test.command(command),
+    }
+
+
+class _Flight:
+    """Commands that move the vehicle."""
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+
+    def take_off(self, command: Command) -> int:
+        copter = self._copter
+        if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:
+            return MavResult.DENIED
+        upwards = command.z > copter.navigation.altitude_above_home
+        if not (copter.motors.is_armed and copter.is_landed and upwards):
+            return MavResult.FAILED
+        done = copter.mode.take_off(command.z, must_navigate=command.param3 == 0.0)
+        return MavResult.ACCEPTED if done else MavResult.FAILED
+
+    def start_mission(self, command: Command) -> int:
+        """From the present place in the mission; on the ground this is what lets a take-off begin."""
+        if command.param1 or command.param2:
+            return MavResult.DENIED
+        result = self._copter.change_to(CopterMode.AUTO)
+        if result == MavResult.ACCEPTED:
+            self._copter.auto.may_lift_off = self._copter.is_armed
+            if not self._copter.mission.is_running:
+                self._copter.mission.start_or_resume()
+        return result
+
+    def reposition(self, command: Command) -> int:
+        """Only as COMMAND_INT: ArduPilot knows no frame for it in COMMAND_LONG."""
+        copter = self._copter
+        if command.is_long:
+            return MavResult.UNSUPPORTED
+        may_change_mode = whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE
+        if copter.mode is not copter.guided and not may_change_mode:
+            return MavResult.DENIED
+        point = copter.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        if copter.mode is not copter.guided and not copter.set_mode(CopterMode.GUIDED):
+            return MavResult.FAILED
+        if not copter.fence.contains(point):
+            return MavResult.FAILED
+        copter.guided.go_to(point)
+        copter.yaw.default()
+        return MavResult.ACCEPTED
+
+    def change_speed(self, command: Command) -> int:
+        mode, speed = self._copter.mode, command.param2
+        if not speed > 0:
+            return MavResult.DENIED
+        if not mode.can_change_speed:
+            return MavResult.FAILED
+        if command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
+            mode.speed = speed  # type: ignore[attr-defined]
+            return MavResult.ACCEPTED
+        if not isinstance(mode, Guided | Auto):
+            return MavResult.FAILED
+        if command.param1 == SpeedType.CLIMB_SPEED:
+            mode.climb = speed
+        elif command.param1 == SpeedType.DESCENT_SPEED:
+            mode.descent = speed
+        else:
+            return MavResult.FAILED
+        return MavResult.ACCEPTED
+
+    def turn(self, command: Command) -> int:
+        angle, rate, direction, relative = command.param1, command.param2, command.param3, command.param4
+        if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
+            return MavResult.FAILED
+        heading = math.radians(angle)
+        if relative:
+            heading = self._copter.motion.yaw + math.copysign(heading, direction or 1.0)
+        self._copter.yaw.fixed(heading, math.radians(rate), int(direction) if not relative else 0)
+        return MavResult.ACCEPTED
+
+    def pause_or_continue(self, command: Command) -> int:
+        copter = self._copter
+        if command.param1 not in (0.0, 1.0):
+            return MavResult.DENIED
+        pause = command.param1 == 0.0
+        if copter.mode.pause() if pause else copter.mode.resume():
+            return MavResult.ACCEPTED
+        copter.info("Failed to pause" if pause else "Failed to resume")
+        return MavResult.FAILED
+
 
 _LAND_DETECTOR_S = 1.0
 _BASE = int(

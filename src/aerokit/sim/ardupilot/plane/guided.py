@@ -12,7 +12,7 @@ from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, MavS
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode
 from aerokit.sim.commands import whole
-from aerokit.sim.rotations import euler_from_quaternion
+from aerokit.sim.motion import euler_from_quaternion
 
 if TYPE_CHECKING:
     from typing import ClassVar

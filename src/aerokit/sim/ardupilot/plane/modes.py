@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavModeFlag, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.plane.landing import Landing
-from aerokit.sim.ardupilot.rally import best_return_place
 
 if TYPE_CHECKING:
     from typing import ClassVar

@@ -5,14 +5,22 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from aerokit.mavlink.enums import MavModeFlag, MavSeverity, MavType, PlaneMode
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.plane.arming import PlaneArming
+from aerokit.mavlink.enums import (
+    MavCmd,
+    MavDoRepositionFlags,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    PlaneMode,
+    SpeedType,
+)
+from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.commands import common_commands
+from aerokit.sim.ardupilot.outputs import Motors
 from aerokit.sim.ardupilot.plane.auto import Auto
-from aerokit.sim.ardupilot.plane.commands import plane_commands
-from aerokit.sim.ardupilot.plane.failsafes import PlaneFailsafes
-from aerokit.sim.ardupilot.plane.fence import PlaneFence
-from aerokit.sim.ardupilot.plane.guided import Guided, PlaneSetpoints
+from aerokit.sim.ardupilot.plane.failsafes import PlaneFailsafes, PlaneFence
+from aerokit.sim.ardupilot.plane.guided import Guided, PlaneSetpoints, guided_commands
 from aerokit.sim.ardupilot.plane.modes import (
     Autoland,
     Circle,
@@ -21,34 +29,129 @@ from aerokit.sim.ardupilot.plane.modes import (
     FlyByWireB,
     Loiter,
     Manual,
+    NavigatingMode,
     PlaneModeBase,
     Rtl,
     Stabilize,
     TakeOff,
 )
-from aerokit.sim.ardupilot.plane.other_modes import (
-    Acro,
-    Autotune,
-    AvoidAdsb,
-    Initialising,
-    Thermal,
-    Training,
-)
+from aerokit.sim.ardupilot.plane.other_modes import Acro, Autotune, AvoidAdsb, Initialising, Thermal, Training
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.commands import whole
 from aerokit.sim.fixed_wing import FixedWing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.sim.ardupilot.arming import Arming
     from aerokit.sim.ardupilot.failsafes import Failsafes
     from aerokit.sim.ardupilot.fence import Fence
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.commands import CommandHandler
+    from aerokit.sim.commands import Command, CommandHandler
     from aerokit.sim.motion import Motion, Wind
 
-__all__ = ["SimulatedPlane"]
+__all__ = ["PlaneArming", "SimulatedPlane", "plane_commands"]
+
+
+_SHORT_DISABLED = 3
+_SMALLEST_ANGLE_DEG, _SLOWEST_M_S = 3.0, 5
+
+
+class PlaneArming(Arming):
+    """GPS in every mode, limits that make sense, and a mode that starts on the ground."""
+
+    def __init__(self, plane: SimulatedPlane) -> None:
+        super().__init__(plane)
+        self._plane = plane
+
+    def own_reasons(self) -> list[str]:
+        """Failsafes, limits and mode."""
+        mode = self._plane.mode
+        return self._bad_limits() + ([] if mode.can_arm else [f"{mode.name} mode not armable"])
+
+    def _bad_limits(self) -> list[str]:
+        parameters = self._plane.parameters
+        roll, up, down = (
+            parameters[name] for name in ("ROLL_LIMIT_DEG", "PTCH_LIM_MAX_DEG", "PTCH_LIM_MIN_DEG")
+        )
+        slowest = int(parameters["AIRSPEED_MIN"])
+        too_short = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
+        checks = (
+            (
+                too_short and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED,
+                "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT",
+            ),
+            (roll < _SMALLEST_ANGLE_DEG, f"ROLL_LIMIT_DEG too small ({roll:.1f})"),
+            (up < _SMALLEST_ANGLE_DEG, f"PTCH_LIM_MAX_DEG too small ({up:.1f})"),
+            (down > -_SMALLEST_ANGLE_DEG, f"PTCH_LIM_MIN_DEG too large ({down:.1f})"),
+            (slowest < _SLOWEST_M_S, f"AIRSPEED_MIN too low ({slowest} < {_SLOWEST_M_S})"),
+        )
+        return [text for failed, text in checks if failed]
+
+
+def plane_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler. NAV_TAKEOFF is for aeroplanes with lifting rotors; there is no command to land."""
+    flight = _Flight(plane)
+    return {
+        **common_commands(plane),
+        MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
+        MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: plane.change_to(PlaneMode.RTL),
+        MavCmd.NAV_LOITER_UNLIM: lambda _: plane.change_to(PlaneMode.LOITER),
+        MavCmd.MISSION_START: flight.start_mission,
+        MavCmd.DO_REPOSITION: flight.reposition,
+        MavCmd.DO_CHANGE_SPEED: flight.change_speed,
+        **guided_commands(plane),
+        MavCmd.DO_FLIGHTTERMINATION: flight.terminate,
+    }
+
+
+class _Flight:
+    """Commands that move the aeroplane."""
+
+    def __init__(self, plane: SimulatedPlane) -> None:
+        self._plane = plane
+
+    def terminate(self, command: Command) -> int:
+        """Only with the advanced failsafe, which is not simulated."""
+        if command.param1 > 0.5:
+            self._plane.failsafes.refuse_termination()
+        return MavResult.FAILED
+
+    def start_mission(self, command: Command) -> int:
+        if command.param1 or command.param2:
+            return MavResult.DENIED
+        return self._plane.change_to(PlaneMode.AUTO)
+
+    def reposition(self, command: Command) -> int:
+        """Only as COMMAND_INT; param 3 is the radius of the circle, param 4 not 0 is anticlockwise."""
+        plane = self._plane
+        if command.is_long:
+            return MavResult.UNSUPPORTED
+        point = plane.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        if plane.mode is not plane.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+            return MavResult.FAILED
+        if not plane.set_mode(PlaneMode.GUIDED):
+            return MavResult.FAILED
+        plane.guided.go_to(point)
+        if command.param3 > 0:
+            anticlockwise = command.param4 == command.param4 and command.param4 != 0
+            plane.guided.radius = -command.param3 if anticlockwise else command.param3
+        return MavResult.ACCEPTED
+
+    def change_speed(self, command: Command) -> int:
+        """Airspeed between AIRSPEED_MIN and AIRSPEED_MAX, in GUIDED and AUTO."""
+        mode, plane = self._plane.mode, self._plane
+        if not isinstance(mode, NavigatingMode) or not mode.can_change_speed:
+            return MavResult.FAILED
+        if command.param1 == SpeedType.AIRSPEED and plane.can_fly_at(command.param2):
+            mode.speed = command.param2
+            return MavResult.ACCEPTED
+        if command.param1 == SpeedType.GROUNDSPEED:
+            return MavResult.ACCEPTED  # sets the lowest speed over the ground, which is not simulated
+        return MavResult.FAILED
+
 
 _FULL_AMPERES = 25.0
 _STANDS_S = 1.0

@@ -1,17 +1,70 @@
-"""ArduRover's failsafes: radio, ground station, battery, estimator, and a vehicle that is stuck."""
+"""What an ArduRover checks before arming, and does by itself: radio, ground station, battery, estimator, fence."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.mavlink.enums import MavSeverity, RoverMode
+from aerokit.mavlink.enums import FenceMitigate, MavSeverity, RoverMode
+from aerokit.sim.ardupilot.arming import Arming, Check
 from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
 
-__all__ = ["RoverFailsafes", "modes_of_action"]
+__all__ = ["RoverArming", "RoverFailsafes", "RoverFence", "modes_of_action"]
+
+
+_NEEDS_LOCATION = 1
+
+
+class RoverArming(Arming):
+    """A position only in the modes that drive by it, or always with ARMING_NEED_LOC."""
+
+    def __init__(self, rover: SimulatedRover) -> None:
+        super().__init__(rover)
+        self._rover = rover
+
+    def ahrs_reasons(self) -> Sequence[str]:
+        """Comes after GPS, and only where a position is needed."""
+        return ()
+
+    def position_reasons(self) -> Sequence[str]:
+        """GPS, then estimator and its position."""
+        rover = self._rover
+        if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
+            return ()
+        if reasons := super().position_reasons() or super().ahrs_reasons():
+            return reasons
+        if rover.failsafes.estimator:
+            return ("EKF failsafe",)
+        return () if rover.navigation.has_position else ("Need Position Estimate",)
+
+    def own_reasons(self) -> list[str]:
+        """Speed and mode."""
+        reasons = []
+        if self.is_checked(Check.PARAMETERS) and not self._rover.parameters["WP_SPEED"] > 0:
+            reasons.append("WP_SPEED too low")
+        return reasons + ([] if self._rover.mode.can_arm else ["Mode not armable"])
+
+    def arm(self, *, force: bool = False) -> bool:
+        """The way back begins here."""
+        done = super().arm(force=force)
+        if done:
+            self._rover.path.begin()
+        return done
+
+    def disarm(self, *, force: bool = True) -> bool:
+        """At any time; where it is disarmed is home, unless somebody has set it."""
+        rover, was_armed = self._rover, self._rover.is_armed
+        if not super().disarm(force=True):
+            return False
+        if was_armed and rover.navigation.home is not None and not rover.navigation.home_is_locked:
+            rover.navigation.set_home((rover.motion.north, rover.motion.east, rover.motion.down), lock=False)
+        return True
+
 
 _NONE, _RTL, _HOLD, _SMART_RTL, _SMART_RTL_OR_HOLD, _TERMINATE, _LOITER_OR_HOLD = range(7)
 """FS_ACTION, FENCE_ACTION and the actions of the battery."""
@@ -163,3 +216,32 @@ class RoverFailsafes(Failsafes):
             rover.set_mode(RoverMode.HOLD)
             if action == _HOLD_AND_DISARM:
                 rover.arming.disarm()
+
+
+_GIVE_UP_M = 100.0
+
+
+class RoverFence(Fence):
+    """FENCE_ACTION is that of FS_ACTION; HOLD when it is far out. There is no height and no text."""
+
+    PERIOD_S: ClassVar[float] = 0.1
+    WATCHES_DISARMED: ClassVar[bool] = True
+    MITIGATION: ClassVar[int] = FenceMitigate.NONE
+
+    def act(self, new: int) -> None:
+        """Change the mode, or stop the motors."""
+        vehicle = self._vehicle
+        action = int(vehicle.parameters["FENCE_ACTION"])
+        if action == REPORT_ONLY:
+            return
+        if self.beyond_m(new) > _GIVE_UP_M:
+            vehicle.set_mode(RoverMode.HOLD)
+        elif action == _TERMINATE:
+            vehicle.arming.disarm()
+        else:
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes_of_action(action))
+
+    def mode_changed(self) -> None:
+        """Ten seconds for the pilot."""
+        super().mode_changed()
+        self.recover_by_hand()

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
-from aerokit.sim.ardupilot.level_auto import LevelAuto
+from aerokit.sim.ardupilot.level import LevelAuto
 from aerokit.sim.ardupilot.mode import VehicleMode
-from aerokit.sim.ardupilot.rally import best_return_place
+from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.targets import Target
 
 if TYPE_CHECKING:

@@ -7,12 +7,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, RoverMode
-from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
-from aerokit.sim.ardupilot.manual_control import LevelJoystick
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.rover.arming import RoverArming
-from aerokit.sim.ardupilot.rover.failsafes import RoverFailsafes
-from aerokit.sim.ardupilot.rover.fence import RoverFence
+from aerokit.sim.ardupilot.level import LevelVehicle
+from aerokit.sim.ardupilot.outputs import Motors
+from aerokit.sim.ardupilot.radio import LevelJoystick
+from aerokit.sim.ardupilot.rover.failsafes import RoverArming, RoverFailsafes, RoverFence
 from aerokit.sim.ardupilot.rover.modes import ROVER_MODES, RoverAuto, RoverGuided
 from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ardupilot.targets import RoverTargets

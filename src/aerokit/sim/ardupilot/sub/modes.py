@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import SubMode
-from aerokit.sim.ardupilot.level_auto import LevelAuto
+from aerokit.sim.ardupilot.level import LevelAuto
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.motion import wrap_pi

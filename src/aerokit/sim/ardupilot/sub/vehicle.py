@@ -8,15 +8,14 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SpeedType, SubMode
-from aerokit.sim.ardupilot.level_vehicle import LevelVehicle
-from aerokit.sim.ardupilot.manual_control import SubJoystick
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.sub.arming import SubArming
-from aerokit.sim.ardupilot.sub.failsafes import SubFailsafes
+from aerokit.sim.ardupilot.level import LevelVehicle
+from aerokit.sim.ardupilot.outputs import Motors
+from aerokit.sim.ardupilot.radio import SubJoystick
+from aerokit.sim.ardupilot.sub.failsafes import SubArming, SubFailsafes
 from aerokit.sim.ardupilot.sub.modes import SUB_MODES, SubAuto, SubGuided
 from aerokit.sim.ardupilot.targets import SubTargets
-from aerokit.sim.ardupilot.telemetry_extra import DISPLAY_VALUES
-from aerokit.sim.underwater_motion import UnderwaterMotion
+from aerokit.sim.ardupilot.telemetry import DISPLAY_VALUES
+from aerokit.sim.ground_motion import UnderwaterMotion
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.arming import Arming
