@@ -20,7 +20,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
 from aerokit.sim.ardupilot.copter.guided import Guided, Submode
-from aerokit.sim.ardupilot.telemetry import BUILDERS
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 CLASSES: dict[str, type[ArduPilotVehicle]] = {
@@ -160,7 +160,7 @@ def test_nothing_that_it_can_say_is_out_of_range(kind: str) -> None:
     vehicle, client = booted(kind)
     arm(client)
     client.run(1.0)
-    for message_id in BUILDERS[vehicle.KIND]:
+    for message_id in BUILDERS_OF_KIND[vehicle.KIND]:
         client.command(MavCmd.REQUEST_MESSAGE, message_id)
         client.run(0.05)
     assert client.last(m.HighLatency2).custom0 == vehicle.base_mode - 256

@@ -144,13 +144,3 @@ def test_a_calibration_of_the_compasses_keeps_it_from_arming(end: tuple[int, int
     assert client.command(command, param) == ACCEPTED
     client.run(seconds)
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == ACCEPTED
-
-
-# ---------------------------------------------------------------------------------------- buzzer
-
-
-def test_tunes_are_remembered_as_far_as_they_are_played() -> None:
-    copter, client = ready_copter()
-    client.send(m.PlayTune(1, 1, "AAAA", ""))
-    client.send(m.PlayTune(0, 0, "abcdefghij" * 3, "abcdefghij" * 20))
-    assert copter.tunes == ["AAAA", ("abcdefghij" * 10)[:99]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
@@ -19,11 +18,10 @@ from aerokit.mavlink.messages import CommandLong
 from aerokit.sim.commands import Progress, whole
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.commands import Command, CommandHandler
 
-__all__ = ["CALIBRATION_BUILDERS", "AccelerometerCalibration", "Calibrations", "CompassCalibration"]
+__all__ = ["AccelerometerCalibration", "Calibrations", "CompassCalibration"]
 
 
 _SAMPLE_S, _AGAIN_S = 1.3, 1.0
@@ -37,7 +35,7 @@ class AccelerometerCalibration:
     until a reboot.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.is_held_wrong = False
         """Then it fails after the second position."""
@@ -106,7 +104,7 @@ class CompassCalibration:
     it at 0 % until it is cancelled. While it runs the vehicle cannot be armed.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
         self._mask = 0
@@ -230,7 +228,7 @@ class Calibrations:
     ``compasses`` and ``accelerometers`` are the two that somebody has to turn the vehicle for.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.compasses: CompassCalibration = CompassCalibration(vehicle)
         self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
@@ -282,10 +280,3 @@ class Calibrations:
             return Progress((), _ACCELEROMETERS_S)
         is_forced = _FORCED in (command.x, command.param2)
         return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED
-
-
-CALIBRATION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
-    m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),
-    m.MagCalReport.ID: lambda vehicle: vehicle.calibrations.compasses.report(),
-}
-"""Message id → what to send now, or None."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
@@ -12,12 +11,11 @@ from aerokit.sim.commands import whole
 from aerokit.sim.motion import quaternion_from_euler
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
     from aerokit.missions import MissionItem
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-    from aerokit.sim.commands import Command, CommandHandler
+    from aerokit.sim.ardupilot.host import Host
+    from aerokit.sim.commands import Command
 
-__all__ = ["CAMERA_BUILDERS", "Camera", "camera_commands"]
+__all__ = ["Camera"]
 
 _PERIOD_S, _SHUTTER_S = 0.02, 0.1
 _UNKNOWN_PLACE = 2**31 - 1
@@ -35,7 +33,7 @@ class Camera:
     image_count: int
     remaining: int
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.image_count = 0
         """Pictures since power on."""
@@ -67,7 +65,7 @@ class Camera:
         motion = self._vehicle.motion
         self.image_count += 1
         self._taken_at, self._taken_where = self._vehicle.now, (motion.north, motion.east)
-        self.feedback = _feedback(self._vehicle)
+        self.feedback = self._take_feedback()
         self._vehicle.send(self.feedback)
         return True
 
@@ -176,123 +174,90 @@ class Camera:
         by_itself = kind not in (SetFocusType.CONTINUOUS, SetFocusType.RANGE)
         return MavResult.UNSUPPORTED if by_itself else MavResult.ACCEPTED
 
+    # --------------------------------------------------------------------------------- what it tells
 
-def camera_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler. Such a camera takes no video and has one lens."""
-    return {
-        MavCmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
-        MavCmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
-        MavCmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.control(command),
-        MavCmd.DO_DIGICAM_CONFIGURE: lambda _: MavResult.ACCEPTED,
-        MavCmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
-        MavCmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
-        MavCmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
-        MavCmd.SET_CAMERA_SOURCE: lambda _: MavResult.DENIED,
-        MavCmd.VIDEO_START_CAPTURE: lambda _: MavResult.FAILED,
-        MavCmd.VIDEO_STOP_CAPTURE: lambda _: MavResult.FAILED,
-    }
+    def _take_feedback(self) -> m.CameraFeedback:
+        motion, nav = self._vehicle.motion, self._vehicle.navigation
+        place = self._vehicle.frame.to_global(motion.north, motion.east, motion.down)
+        return m.CameraFeedback(
+            time_usec=round(self._vehicle.unix_time * 1e6),
+            target_system=0,
+            cam_idx=0,
+            img_idx=self.image_count,
+            lat=place.latitude_e7,
+            lng=place.longitude_e7,
+            alt_msl=place.altitude_m,
+            alt_rel=nav.altitude_above_home,
+            roll=math.degrees(motion.roll),
+            pitch=math.degrees(motion.pitch),
+            yaw=math.degrees(motion.yaw) % 360.0,
+            foc_len=0.0,
+            flags=CameraFeedbackFlags.PHOTO,
+            completed_captures=0,
+        )
 
+    def last_feedback(self) -> m.CameraFeedback | None:
+        return self.feedback if self.is_fitted else None
 
-def _feedback(vehicle: ArduPilotVehicle) -> m.CameraFeedback:
-    motion, nav = vehicle.motion, vehicle.navigation
-    place = vehicle.frame.to_global(motion.north, motion.east, motion.down)
-    return m.CameraFeedback(
-        time_usec=round(vehicle.unix_time * 1e6),
-        target_system=0,
-        cam_idx=0,
-        img_idx=vehicle.camera.image_count,
-        lat=place.latitude_e7,
-        lng=place.longitude_e7,
-        alt_msl=place.altitude_m,
-        alt_rel=nav.altitude_above_home,
-        roll=math.degrees(motion.roll),
-        pitch=math.degrees(motion.pitch),
-        yaw=math.degrees(motion.yaw) % 360.0,
-        foc_len=0.0,
-        flags=CameraFeedbackFlags.PHOTO,
-        completed_captures=0,
-    )
+    def information(self) -> m.CameraInformation | None:
+        if not self.is_fitted:
+            return None
+        return m.CameraInformation(
+            time_boot_ms=self._vehicle.time_boot_ms,
+            vendor_name=bytes(32),
+            model_name=bytes(32),
+            firmware_version=0,
+            focal_length=0.0,
+            sensor_size_h=0.0,
+            sensor_size_v=0.0,
+            resolution_h=0,
+            resolution_v=0,
+            lens_id=0,
+            flags=0,
+            cam_definition_version=0,
+            cam_definition_uri="",
+            gimbal_device_id=1 if self._vehicle.gimbal.is_fitted else 0,
+        )
 
+    def settings(self) -> m.CameraSettings | None:
+        if not self.is_fitted:
+            return None
+        return m.CameraSettings(self._vehicle.time_boot_ms, 0, math.nan, math.nan)
 
-def _last_feedback(vehicle: ArduPilotVehicle) -> m.CameraFeedback | None:
-    return vehicle.camera.feedback if vehicle.camera.is_fitted else None
+    def capture_status(self) -> m.CameraCaptureStatus | None:
+        if not self.is_fitted:
+            return None
+        return m.CameraCaptureStatus(
+            time_boot_ms=self._vehicle.time_boot_ms,
+            image_status=_INTERVAL_SET if self.remaining > 0 else _IDLE,
+            video_status=0,
+            image_interval=self.interval_s,
+            recording_time_ms=0,
+            available_capacity=math.nan,
+            image_count=self.image_count,
+        )
 
+    def video_stream(self) -> m.VideoStreamInformation | None:
+        """One that is none."""
+        if not self.is_fitted:
+            return None
+        return m.VideoStreamInformation(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, "", "")
 
-def _information(vehicle: ArduPilotVehicle) -> m.CameraInformation | None:
-    if not vehicle.camera.is_fitted:
-        return None
-    return m.CameraInformation(
-        time_boot_ms=vehicle.time_boot_ms,
-        vendor_name=bytes(32),
-        model_name=bytes(32),
-        firmware_version=0,
-        focal_length=0.0,
-        sensor_size_h=0.0,
-        sensor_size_v=0.0,
-        resolution_h=0,
-        resolution_v=0,
-        lens_id=0,
-        flags=0,
-        cam_definition_version=0,
-        cam_definition_uri="",
-        gimbal_device_id=1 if vehicle.gimbal.is_fitted else 0,
-    )
-
-
-def _settings(vehicle: ArduPilotVehicle) -> m.CameraSettings | None:
-    if not vehicle.camera.is_fitted:
-        return None
-    return m.CameraSettings(vehicle.time_boot_ms, 0, math.nan, math.nan)
-
-
-def _capture_status(vehicle: ArduPilotVehicle) -> m.CameraCaptureStatus | None:
-    camera = vehicle.camera
-    if not camera.is_fitted:
-        return None
-    return m.CameraCaptureStatus(
-        time_boot_ms=vehicle.time_boot_ms,
-        image_status=_INTERVAL_SET if camera.remaining > 0 else _IDLE,
-        video_status=0,
-        image_interval=camera.interval_s,
-        recording_time_ms=0,
-        available_capacity=math.nan,
-        image_count=camera.image_count,
-    )
-
-
-def _video_stream(vehicle: ArduPilotVehicle) -> m.VideoStreamInformation | None:
-    """One that is none."""
-    if not vehicle.camera.is_fitted:
-        return None
-    return m.VideoStreamInformation(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, "", "")
-
-
-def _field_of_view(vehicle: ArduPilotVehicle) -> m.CameraFovStatus | None:
-    """Where the camera is when the vehicle knows, and how it lies; nobody knows what it sees."""
-    if not vehicle.camera.is_fitted:
-        return None
-    motion = vehicle.motion
-    place = vehicle.navigation.position if vehicle.navigation.has_position else None
-    return m.CameraFovStatus(
-        time_boot_ms=vehicle.time_boot_ms,
-        lat_camera=_UNKNOWN_PLACE if place is None else place.latitude_e7,
-        lon_camera=_UNKNOWN_PLACE if place is None else place.longitude_e7,
-        alt_camera=_UNKNOWN_PLACE if place is None else round(place.altitude_m * 1000),
-        lat_image=_UNKNOWN_PLACE,
-        lon_image=_UNKNOWN_PLACE,
-        alt_image=_UNKNOWN_PLACE,
-        q=quaternion_from_euler(motion.roll, motion.pitch, motion.yaw),
-        hfov=math.nan,
-        vfov=math.nan,
-    )
-
-
-CAMERA_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
-    m.CameraInformation.ID: _information,
-    m.CameraSettings.ID: _settings,
-    m.CameraCaptureStatus.ID: _capture_status,
-    m.CameraFeedback.ID: _last_feedback,
-    m.VideoStreamInformation.ID: _video_stream,
-    m.CameraFovStatus.ID: _field_of_view,
-}
-"""Message id → what to send now, or None."""
+    def field_of_view(self) -> m.CameraFovStatus | None:
+        """Where the camera is when the vehicle knows, and how it lies; nobody knows what it sees."""
+        if not self.is_fitted:
+            return None
+        motion = self._vehicle.motion
+        place = self._vehicle.navigation.position if self._vehicle.navigation.has_position else None
+        return m.CameraFovStatus(
+            time_boot_ms=self._vehicle.time_boot_ms,
+            lat_camera=_UNKNOWN_PLACE if place is None else place.latitude_e7,
+            lon_camera=_UNKNOWN_PLACE if place is None else place.longitude_e7,
+            alt_camera=_UNKNOWN_PLACE if place is None else round(place.altitude_m * 1000),
+            lat_image=_UNKNOWN_PLACE,
+            lon_image=_UNKNOWN_PLACE,
+            alt_image=_UNKNOWN_PLACE,
+            q=quaternion_from_euler(motion.roll, motion.pitch, motion.yaw),
+            hfov=math.nan,
+            vfov=math.nan,
+        )

@@ -5,16 +5,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
-from aerokit.mavlink.messages import AutopilotVersion, MissionCurrent, SetGpsGlobalOrigin
-from aerokit.sim.ardupilot.camera import camera_commands
-from aerokit.sim.ardupilot.payload_commands import GimbalCommands, RegionOfInterest, equipment_commands
-from aerokit.sim.ardupilot.telemetry_motion import global_origin
+from aerokit.mavlink.messages import AutopilotVersion, GpsGlobalOrigin, MissionCurrent, SetGpsGlobalOrigin
+from aerokit.sim.ardupilot.payload_commands import (
+    GimbalCommands,
+    RegionOfInterest,
+    camera_commands,
+    equipment_commands,
+)
 from aerokit.sim.commands import Command, CommandHandler, whole
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["HomeAndOrigin", "common_commands"]
 
@@ -186,6 +189,6 @@ class HomeAndOrigin:
         point = vehicle.point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
         if point is None or place == (0, 0) or not vehicle.navigation.set_origin(point):
             return
-        origin = global_origin(vehicle)
+        origin = vehicle.build(GpsGlobalOrigin.ID)
         if origin is not None:
             vehicle.send(origin, channel)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from aerokit.mavlink.enums import MavSeverity
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
 
 __all__ = ["BatteryFailsafe", "Failsafes"]
 
@@ -26,9 +26,7 @@ class BatteryFailsafe:
     than what has been done already is not done.
     """
 
-    def __init__(
-        self, vehicle: ArduPilotVehicle, priorities: Sequence[int], act: Callable[[int], None]
-    ) -> None:
+    def __init__(self, vehicle: Host, priorities: Sequence[int], act: Callable[[int], None]) -> None:
         self._vehicle = vehicle
         self._priorities = tuple(priorities)
         self._act = act
@@ -104,7 +102,7 @@ class Failsafes:
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = ()
     """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, the gravest first."""
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.battery: BatteryFailsafe = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
         self.ground_station = False

@@ -20,13 +20,12 @@ from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.commands import Command
-    from aerokit.sim.local_frame import LocalFrame
+    from aerokit.sim.local_frame import LocalFrame, Ned
 
-__all__ = ["CIRCLE", "MAX_ALT", "MIN_ALT", "POLYGON", "REPORT_ONLY", "Fence", "Zones", "fence_status"]
+__all__ = ["CIRCLE", "MAX_ALT", "MIN_ALT", "POLYGON", "REPORT_ONLY", "Fence", "Zones"]
 
 
 _IN, _OUT = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION
@@ -149,7 +148,7 @@ class Fence:
     MITIGATION: ClassVar[int] = FenceMitigate.UNKNOWN
     """What FENCE_STATUS says of slowing down before the fence; UNKNOWN by a kind that cannot."""
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.enabled: int = 0
         """Kinds in force, whether or not they are configured."""
@@ -327,7 +326,7 @@ class Fence:
             self.breach_time_ms = vehicle.time_boot_ms
             if vehicle.now - self._told_at > _STATUS_PERIOD_S:
                 self._told_at = vehicle.now
-                if (status := fence_status(vehicle)) is not None:
+                if (status := self.status()) is not None:
                     vehicle.send(status)
 
     def _clear(self, kinds: int) -> None:
@@ -419,26 +418,24 @@ class Fence:
             return "FENCE_ALT_MAX < FENCE_ALT_MIN"
         return "FENCE_MARGIN too big" if high - low <= 2.0 * margin else None
 
+    def status(self) -> m.FenceStatus | None:
+        """FENCE_STATUS; nothing while the fence is off."""
+        if not self.enabled:
+            return None
+        breach = FenceBreach.NONE
+        if self.breached & (CIRCLE | POLYGON):
+            breach = FenceBreach.BOUNDARY
+        elif self.breached & MAX_ALT:
+            breach = FenceBreach.MAXALT
+        elif self.breached & MIN_ALT:
+            breach = FenceBreach.MINALT
+        return m.FenceStatus(
+            int(self.breached != 0), self.breach_count, breach, self.breach_time_ms, self.MITIGATION
+        )
+
 
 def names(kinds: int) -> str:
     """The kinds as the firmware joins them: Max Alt, Circle and Polygon fences."""
     words = [name for kind, name in _NAMES.items() if kinds & kind]
     text = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
     return f"{text} fence" + "s" * (len(words) > 1)
-
-
-def fence_status(vehicle: ArduPilotVehicle) -> m.FenceStatus | None:
-    """FENCE_STATUS; nothing while the fence is off."""
-    fence = vehicle.fence
-    if not fence.enabled:
-        return None
-    breach = FenceBreach.NONE
-    if fence.breached & (CIRCLE | POLYGON):
-        breach = FenceBreach.BOUNDARY
-    elif fence.breached & MAX_ALT:
-        breach = FenceBreach.MAXALT
-    elif fence.breached & MIN_ALT:
-        breach = FenceBreach.MINALT
-    return m.FenceStatus(
-        int(fence.breached != 0), fence.breach_count, breach, fence.breach_time_ms, fence.MITIGATION
-    )

@@ -7,7 +7,6 @@ horizon, yaw is from the vehicle's nose or from north. With MNT1_TYPE 0 there is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -26,12 +25,11 @@ from aerokit.sim.motion import quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.channel import Channel
+    from aerokit.sim.local_frame import Ned
 
-__all__ = ["GIMBAL_BUILDERS", "Gimbal", "Target", "gimbal_manager_status"]
+__all__ = ["Gimbal", "Target"]
 
 
 _DEVICE_ID = 1
@@ -44,73 +42,6 @@ _CAPABILITIES = (
     | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_FOLLOW | _Can.HAS_YAW_LOCK
 )  # fmt: skip
 _FROM_NORTH = frozenset({MavMountMode.GPS_POINT, MavMountMode.SYSID_TARGET, MavMountMode.HOME_LOCATION})
-
-
-def _attitude_status(vehicle: ArduPilotVehicle) -> m.GimbalDeviceAttitudeStatus | None:
-    gimbal = vehicle.gimbal
-    if not gimbal.is_fitted:
-        return None
-    roll, pitch, yaw = map(math.radians, gimbal.angles)
-    return m.GimbalDeviceAttitudeStatus(
-        0,
-        0,
-        vehicle.time_boot_ms,
-        _device_flags(gimbal),
-        quaternion_from_euler(roll, pitch, yaw),
-        math.nan,
-        math.nan,
-        math.nan,
-        0,
-        math.nan,
-        math.nan,
-        _DEVICE_ID,
-    )
-
-
-def _device_flags(gimbal: Gimbal) -> int:
-    """Yaw is told from the nose whatever it is locked to."""
-    flags = (
-        GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
-    )
-    if gimbal.mode == MavMountMode.RETRACT:
-        flags |= GimbalDeviceFlags.RETRACT
-    elif gimbal.mode == MavMountMode.NEUTRAL:
-        flags |= GimbalDeviceFlags.NEUTRAL
-    elif gimbal.mode in _FROM_NORTH or gimbal.target.is_from_north:
-        flags |= GimbalDeviceFlags.YAW_LOCK
-    return flags
-
-
-def _manager_information(vehicle: ArduPilotVehicle) -> m.GimbalManagerInformation | None:
-    gimbal = vehicle.gimbal
-    if not gimbal.is_fitted:
-        return None
-    limits = (
-        math.radians(gimbal.setting(f"MNT1_{axis}_{end}"))
-        for axis in ("ROLL", "PITCH", "YAW")
-        for end in ("MIN", "MAX")
-    )
-    return m.GimbalManagerInformation(vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
-
-
-def gimbal_manager_status(vehicle: ArduPilotVehicle) -> m.GimbalManagerStatus | None:
-    """GIMBAL_MANAGER_STATUS: who is in control."""
-    gimbal = vehicle.gimbal
-    if not gimbal.is_fitted:
-        return None
-    flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
-    if gimbal.is_yaw_locked:
-        flags |= GimbalManagerFlags.YAW_LOCK
-    system, component = gimbal.in_control
-    return m.GimbalManagerStatus(vehicle.time_boot_ms, flags, _DEVICE_ID, system, component, 0, 0)
-
-
-GIMBAL_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
-    m.GimbalDeviceAttitudeStatus.ID: _attitude_status,
-    m.GimbalManagerInformation.ID: _manager_information,
-    m.GimbalManagerStatus.ID: gimbal_manager_status,
-}
-"""Message id → what to send now, or None."""
 
 
 DEFAULTS = {
@@ -142,7 +73,7 @@ class Target:
 class Gimbal:
     """Mode, target and who is in control; :attr:`angles` is where it points now."""
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))
         """MAV_MOUNT_MODE."""
@@ -286,7 +217,7 @@ class Gimbal:
         return True
 
     def _tell_control(self) -> None:
-        status = gimbal_manager_status(self._vehicle)
+        status = self.manager_status()
         if status is not None:
             self._vehicle.send(status)
 
@@ -314,3 +245,58 @@ class Gimbal:
     def warn(self) -> None:
         """Of angles that are none, in hundredths of degrees for example."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
+
+    # --------------------------------------------------------------------------------- what it tells
+
+    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
+        if not self.is_fitted:
+            return None
+        roll, pitch, yaw = map(math.radians, self.angles)
+        return m.GimbalDeviceAttitudeStatus(
+            0,
+            0,
+            self._vehicle.time_boot_ms,
+            _device_flags(self),
+            quaternion_from_euler(roll, pitch, yaw),
+            math.nan,
+            math.nan,
+            math.nan,
+            0,
+            math.nan,
+            math.nan,
+            _DEVICE_ID,
+        )
+
+    def manager_information(self) -> m.GimbalManagerInformation | None:
+        if not self.is_fitted:
+            return None
+        limits = (
+            math.radians(self.setting(f"MNT1_{axis}_{end}"))
+            for axis in ("ROLL", "PITCH", "YAW")
+            for end in ("MIN", "MAX")
+        )
+        return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
+
+    def manager_status(self) -> m.GimbalManagerStatus | None:
+        """GIMBAL_MANAGER_STATUS: who is in control."""
+        if not self.is_fitted:
+            return None
+        flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
+        if self.is_yaw_locked:
+            flags |= GimbalManagerFlags.YAW_LOCK
+        system, component = self.in_control
+        return m.GimbalManagerStatus(self._vehicle.time_boot_ms, flags, _DEVICE_ID, system, component, 0, 0)
+
+
+def _device_flags(gimbal: Gimbal) -> int:
+    """Yaw is told from the nose whatever it is locked to."""
+    flags = (
+        GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
+    )
+    if gimbal.mode == MavMountMode.RETRACT:
+        flags |= GimbalDeviceFlags.RETRACT
+    elif gimbal.mode == MavMountMode.NEUTRAL:
+        flags |= GimbalDeviceFlags.NEUTRAL
+    elif gimbal.mode in _FROM_NORTH or gimbal.target.is_from_north:
+        flags |= GimbalDeviceFlags.YAW_LOCK
+    return flags

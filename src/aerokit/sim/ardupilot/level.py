@@ -14,8 +14,8 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.commands import Command, CommandHandler
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["LevelAuto", "LevelVehicle"]
 

@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Protocol
 
 from aerokit.mavlink.enums import MavCmd, MissionState
+from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_items import COMMAND_NAMES
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
 
 __all__ = ["MissionFlyer", "MissionRun", "is_navigation"]
 
@@ -82,7 +83,7 @@ def is_navigation(item: MissionItem) -> bool:
 class MissionRun:
     """The position in the mission. An index counts home, so 1 is the first command and 0 means none."""
 
-    def __init__(self, vehicle: ArduPilotVehicle, flyer: MissionFlyer) -> None:
+    def __init__(self, vehicle: Host, flyer: MissionFlyer) -> None:
         self._vehicle, self._flyer = vehicle, flyer
         self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
@@ -121,6 +122,11 @@ class MissionRun:
     def count(self) -> int:
         """Commands without home."""
         return max(0, self._list.count - 1)
+
+    def message(self, seq: int | None = None) -> MissionCurrent:
+        """MISSION_CURRENT; ``seq`` says another number than that of the command that is flown."""
+        seq = self.nav_index if seq is None else seq
+        return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
         """Whether it can begin on the ground."""

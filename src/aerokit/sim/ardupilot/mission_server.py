@@ -16,13 +16,12 @@ from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
-from aerokit.sim.ardupilot.telemetry_state import mission_current
 from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.channel import Channel
 
 __all__ = ["MissionServer"]
@@ -52,7 +51,7 @@ class _Upload:
 class MissionServer:
     """Mission, fence and rally points: kept here, sent and received here."""
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.commands: CommandList = CommandList(
             _COMMANDS_IN_MEMORY, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
@@ -120,7 +119,7 @@ class MissionServer:
         home = self._vehicle.navigation.home
         if home is None:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
-        place = self._vehicle.navigation.frame.to_global(*home)
+        place = self._vehicle.frame.to_global(*home)
         altitude = float32(round(place.altitude_m * 100) * float32(0.01))
         return MissionItem(
             MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL, x=place.latitude_e7, y=place.longitude_e7, z=altitude
@@ -353,7 +352,7 @@ class MissionServer:
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         """Answered with the number that was asked for, also when another one is flown."""
         if self._vehicle.mission.set_current(request.seq):
-            self._vehicle.send(mission_current(self._vehicle, request.seq), channel)
+            self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
     def _clear(self, items: ItemList) -> bool:
         done = items.clear()

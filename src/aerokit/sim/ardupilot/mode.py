@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["AutoMode", "VehicleMode"]
 

@@ -4,135 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import EkfStatusFlags as Ekf
-from aerokit.mavlink.enums import GpsFixType, MavMissionType, MavSeverity
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
+from aerokit.mavlink.enums import GpsFixType, MavMissionType
+from aerokit.sim.local_frame import GlobalPoint, LocalFrame, Ned
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
 
-__all__ = ["BOOT_TEXTS", "BOOT_TIMELINES", "BootTimeline", "Navigation", "best_return_place"]
-
-
-@dataclass(frozen=True)
-class BootTimeline:
-    """The defaults are what ArduCopter 4.7-dev was seen to need in simulation; ``scaled`` squeezes them."""
-
-    heartbeat: float = 0.92
-    ready: float = 2.36
-    """Initialised: streams start, missions are taken, the state leaves BOOT half a second later."""
-    estimator_active: float = 4.36
-    tilt_aligned: float = 5.70
-    yaw_aligned: float = 5.80
-    gps_detected: float = 9.73
-    gps_fix: float = 9.94
-    origin_set: float = 19.93
-    healthy: float = 22.40
-    """The attitude reference counts as healthy; a second later the vehicle can be armed without GPS modes."""
-    position_good: float = 41.55
-    """The estimator uses GPS: modes that need a position work from here."""
-    factor: float = 1.0
-    """How much faster or slower than the real one it is."""
-    estimator_leads_early: bool = True
-    """Whether the estimator is the reference from its start, and not only when it uses GPS."""
-
-    def scaled(self, seconds: float) -> BootTimeline:
-        """The same boot, over after ``seconds``; 0 is ready at once."""
-        factor = seconds / self.position_good
-        times = {
-            field.name: getattr(self, field.name) * factor for field in fields(self) if field.type == "float"
-        }
-        return replace(self, **times)
-
-
-BOOT_TIMELINES: dict[Kind, BootTimeline] = {
-    "copter": BootTimeline(),
-    "plane": BootTimeline(
-        ready=2.04,
-        estimator_active=9.94,
-        tilt_aligned=12.08,
-        yaw_aligned=12.12,
-        gps_detected=8.74,
-        gps_fix=8.94,
-        origin_set=19.12,
-        healthy=21.40,
-        position_good=20.15,
-        estimator_leads_early=False,
-    ),
-    "rover": BootTimeline(
-        ready=3.05,
-        estimator_active=4.00,
-        tilt_aligned=5.05,
-        yaw_aligned=5.90,
-        gps_detected=9.05,
-        gps_fix=9.90,
-        origin_set=19.05,
-        healthy=22.90,
-        position_good=42.05,
-        estimator_leads_early=False,
-    ),
-    "sub": BootTimeline(
-        ready=1.80,
-        estimator_active=3.70,
-        tilt_aligned=5.30,
-        yaw_aligned=5.33,
-        gps_detected=9.00,
-        gps_fix=9.10,
-        origin_set=19.20,
-        healthy=21.80,
-        position_good=41.00,
-    ),
-}
-"""What each kind was seen to need, with the parameters that its simulation starts with."""
-
-_INFO, _DEBUG = MavSeverity.INFO, MavSeverity.DEBUG
-_BAROMETERS = tuple((1.83, _INFO, f"Barometer {number} calibration complete") for number in (1, 2))
-_STICKS = "RCInput: decoding UDP (Pulses)"
-
-
-def _both(seconds: float, text: str) -> tuple[tuple[float, int, str], ...]:
-    return tuple((seconds, _INFO, f"EKF2 IMU{core} {text}") for core in (0, 1))
-
-
-BOOT_TEXTS: dict[Kind, tuple[tuple[float, int, str], ...]] = {
-    "copter": (
-        (0.10, _DEBUG, _STICKS),
-        (0.12, _INFO, "Calibrating barometer"),
-        *_BAROMETERS,
-        (2.37, _INFO, "RC7: SaveWaypoint LOW"),
-    ),
-    "plane": (
-        (0.10, _INFO, "Ground start"),
-        (0.10, MavSeverity.ALERT, "Skipping INS calibration"),
-        (0.12, _INFO, "Calibrating barometer"),
-        (0.92, _DEBUG, _STICKS),
-        *_BAROMETERS,
-        (1.84, _INFO, "Airspeed 1 calibration started"),
-        (2.05, MavSeverity.WARNING, "Throttle failsafe off"),
-        (3.40, _INFO, "Airspeed 1 calibrated"),
-        *_both(9.19, "MAG0 initial yaw alignment complete"),
-        *_both(14.43, "tilt alignment complete"),
-        *_both(19.11, "origin set"),
-        *_both(45.18, "is using GPS"),
-    ),
-    "rover": (
-        (0.12, _INFO, "Calibrating barometer"),
-        *_BAROMETERS,
-        (1.84, _INFO, "Beginning INS calibration. Do not move vehicle"),
-        (1.84, _DEBUG, "INS: alloc 6144 bytes for ISB (free=524288)"),
-        (3.06, _DEBUG, _STICKS),
-    ),
-    "sub": (
-        (0.12, _INFO, "Calibrating barometer"),
-        *((1.50, severity, text) for _, severity, text in _BAROMETERS),
-        (1.81, _DEBUG, _STICKS),
-    ),
-}
-"""Second, severity, text: what is said beside that which comes with an event of the timeline."""
+__all__ = ["Navigation", "best_return_place"]
 
 
 # plain numbers: the operators of flags are slow, and these are looked at all the time
@@ -154,8 +35,6 @@ _DEAD_RECKONING = int(Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS)
 _GIVE_UP_S, _STOP_AIDING_S = 7.0, 15.0
 _CHECK_S = 0.1
 
-Ned = tuple[float, float, float]
-
 
 class Navigation:
     """Grows with the boot, suffers under ``faults.gps_lost`` and SIM_GPS1_ENABLE 0.
@@ -165,7 +44,7 @@ class Navigation:
     ``home`` are points of it, None until they are known.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle, frame: LocalFrame) -> None:
+    def __init__(self, vehicle: Host, frame: LocalFrame) -> None:
         self._vehicle = vehicle
         self.frame = frame
         self.flags: int | None = None
@@ -340,9 +219,7 @@ class Navigation:
                 self._use_gps()
 
 
-def best_return_place(
-    vehicle: ArduPilotVehicle, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True
-) -> Ned:
+def best_return_place(vehicle: Host, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
     """The nearest rally point that is allowed, with its own height; home when there is none or it is to be preferred.
 
     Rally points farther than RALLY_LIMIT_KM are none (0 means that there is no limit). With RALLY_INCL_HOME home is one
@@ -362,7 +239,7 @@ def best_return_place(
     return nearest
 
 
-def _rally_points(vehicle: ArduPilotVehicle) -> list[Ned]:
+def _rally_points(vehicle: Host) -> list[Ned]:
     points = (
         vehicle.point(int(item.x), int(item.y), item.z, item.frame)
         for item in vehicle.missions.items(MavMissionType.RALLY)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMountMode, MavResult, MavSeverity
-from aerokit.sim.ardupilot.outputs import Accessories
+from aerokit.sim.ardupilot.accessories import Accessories
 from aerokit.sim.commands import whole
 from aerokit.sim.motion import euler_from_quaternion
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import Command, CommandHandler
 
-__all__ = ["GimbalCommands", "RegionOfInterest", "equipment_commands"]
+__all__ = ["GimbalCommands", "RegionOfInterest", "camera_commands", "equipment_commands"]
 
 
 _JUST_A_MODE = frozenset(
@@ -270,3 +270,19 @@ class _Equipment:
             self._vehicle.info("Stopped autotune")
         self._tunes = wanted
         return MavResult.ACCEPTED
+
+
+def camera_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler. Such a camera takes no video and has one lens."""
+    return {
+        MavCmd.IMAGE_START_CAPTURE: lambda command: vehicle.camera.start_capture(command),
+        MavCmd.IMAGE_STOP_CAPTURE: lambda command: vehicle.camera.stop_capture(command),
+        MavCmd.DO_DIGICAM_CONTROL: lambda command: vehicle.camera.control(command),
+        MavCmd.DO_DIGICAM_CONFIGURE: lambda _: MavResult.ACCEPTED,
+        MavCmd.DO_SET_CAM_TRIGG_DIST: lambda command: vehicle.camera.set_trigger_distance(command),
+        MavCmd.SET_CAMERA_ZOOM: lambda command: vehicle.camera.zoom(command),
+        MavCmd.SET_CAMERA_FOCUS: lambda command: vehicle.camera.focus(command),
+        MavCmd.SET_CAMERA_SOURCE: lambda _: MavResult.DENIED,
+        MavCmd.VIDEO_START_CAPTURE: lambda _: MavResult.FAILED,
+        MavCmd.VIDEO_STOP_CAPTURE: lambda _: MavResult.FAILED,
+    }

@@ -11,7 +11,7 @@ from aerokit.mavlink.messages import ManualControl
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.channel import Channel
 
 __all__ = ["Joystick", "LevelJoystick", "Radio", "SubJoystick"]
@@ -31,7 +31,7 @@ class Radio:
     Setting an item moves a stick or switch of the transmitter, of which there are eight.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self._sticks: list[int] = list(_AT_REST)
         self._overrides: dict[int, tuple[int, float]] = {}
@@ -123,7 +123,7 @@ class Joystick:
     value is given back to the radio. It holds as long as RC_CHANNELS_OVERRIDE does.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         vehicle.on(ManualControl, self._on_message)
 

@@ -16,13 +16,11 @@ from aerokit.mavlink.messages import (
     RequestDataStream,
     TerrainRequest,
 )
-from aerokit.parameters.encoding import UNKNOWN_INDEX
-from aerokit.sim.ardupilot.telemetry import DISPLAY_VALUES
 from aerokit.sim.commands import whole
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import Command
 
@@ -131,6 +129,20 @@ _LARGEST_IN_MESSAGE_INTERVAL = 1 << 16
 _TERRAIN_REQUEST_S = 2.0
 
 
+DISPLAY_VALUES: dict[str, float] = {
+    "CamTilt": 0.5,
+    "CamPan": 0.5,
+    "TetherTrn": 0.0,
+    "Lights1": 0.5,
+    "Lights2": 0.5,
+    "PilotGain": 0.5,
+    "InputHold": 0.0,
+    "RollPitch": 0.0,
+    "RFTarget": -0.01,
+}
+"""What ArduSub tells a pilot's display in each round of EXTENDED_STATUS."""
+
+
 class Requests:
     """SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE and REQUEST_DATA_STREAM.
 
@@ -138,7 +150,7 @@ class Requests:
     changes them. Only a plane saves and announces that, the others forget it in a reboot.
     """
 
-    def __init__(self, vehicle: ArduPilotVehicle, *, stream_groups: bool = True) -> None:
+    def __init__(self, vehicle: Host, *, stream_groups: bool = True) -> None:
         self._vehicle = vehicle
         self._known = KNOWN_MESSAGES[vehicle.KIND]
         self._groups = STREAM_GROUPS[vehicle.KIND]
@@ -249,7 +261,7 @@ class Requests:
             self._saved[name] = (self._saved.get(name, (parameters[name], rate))[0], rate)
         parameters[name] = rate
         if vehicle.KIND == "plane":
-            vehicle.storage.parameters.send(name, UNKNOWN_INDEX, None)
+            vehicle.announce_parameter(name)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
         interval = max(1.0 / rate, _SHORTEST_S) if rate > 0 else 0.0

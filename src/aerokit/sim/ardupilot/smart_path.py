@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import MavSeverity
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["SmartPath", "prune", "simplify"]
 

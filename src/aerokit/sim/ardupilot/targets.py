@@ -16,9 +16,9 @@ from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalI
 from aerokit.sim.motion import euler_from_quaternion
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.channel import Channel
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["RoverTargets", "SubTargets", "Target", "TargetMode", "Targets"]
 

@@ -8,10 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GpsFixType, HlFailureFlag, MavAutopilot, PlaneMode
-from aerokit.sim.ardupilot.calibration import CALIBRATION_BUILDERS
-from aerokit.sim.ardupilot.camera import CAMERA_BUILDERS
-from aerokit.sim.ardupilot.fence import fence_status
-from aerokit.sim.ardupilot.gimbal import GIMBAL_BUILDERS
+from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
 from aerokit.sim.ardupilot.telemetry_motion import ATTITUDE_BUILDERS, POSITION_BUILDERS
 from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
@@ -19,12 +16,12 @@ from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
-    from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
-    from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
+    from aerokit.sim.ardupilot.plane.host import PlaneHost
+    from aerokit.sim.ardupilot.rover.host import RoverHost
+    from aerokit.sim.ardupilot.sub.host import SubHost
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
-__all__ = ["BUILDERS", "DISPLAY_VALUES"]
+__all__ = ["BUILDERS_OF_KIND", "Builders"]
 
 
 _MIDDLE = 1500
@@ -44,7 +41,7 @@ def copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
     return _message(vehicle, pwm, pwm, pwm, pwm)
 
 
-def plane_outputs(plane: SimulatedPlane) -> m.ServoOutputRaw:
+def plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
     """Aileron, elevator, throttle, rudder; in MANUAL the sticks, disarmed too, the throttle only when armed."""
     wing, throttle = plane.wing, 1000
     if plane.motors.is_armed:
@@ -59,7 +56,7 @@ def plane_outputs(plane: SimulatedPlane) -> m.ServoOutputRaw:
     return _message(plane, aileron, elevator, throttle, rudder)
 
 
-def rover_outputs(rover: SimulatedRover) -> m.ServoOutputRaw:
+def rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
     """Steering is output 1, also disarmed, the motor output 3."""
     if rover.mode.has_manual_throttle:
         steering = _MIDDLE + _beyond_deadzone(rover.rc[0])
@@ -69,7 +66,7 @@ def rover_outputs(rover: SimulatedRover) -> m.ServoOutputRaw:
     return _message(rover, steering, 0, throttle)
 
 
-def sub_outputs(sub: SimulatedSub) -> m.ServoOutputRaw:
+def sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
     """Four thrusters aslant on the level, two upright, and the camera's two axes on 8 and 10."""
     one = two = three = four = left = right = _MIDDLE
     if sub.motors.is_armed:
@@ -241,13 +238,13 @@ EXTRA_BUILDERS: Builders = {
 """Message id → what every kind sends when it is asked for it."""
 
 
-def airspeed(plane: SimulatedPlane) -> m.Airspeed:
+def airspeed(plane: PlaneHost) -> m.Airspeed:
     """Of the pitot tube."""
     speed = plane.motion.airspeed_m_s
     return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
 
 
-def angles_of_flow(plane: SimulatedPlane) -> m.AoaSsa:
+def angles_of_flow(plane: PlaneHost) -> m.AoaSsa:
     """Angle of attack and side slip in degrees; zeros on the ground."""
     motion = plane.motion
     slope = math.atan2(-motion.velocity_down, max(motion.airspeed_m_s, 1.0))
@@ -264,27 +261,13 @@ def terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
     return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
 
 
-DISPLAY_VALUES: dict[str, float] = {
-    "CamTilt": 0.5,
-    "CamPan": 0.5,
-    "TetherTrn": 0.0,
-    "Lights1": 0.5,
-    "Lights2": 0.5,
-    "PilotGain": 0.5,
-    "InputHold": 0.0,
-    "RollPitch": 0.0,
-    "RFTarget": -0.01,
-}
-"""What ArduSub tells a pilot's display in each round of EXTENDED_STATUS."""
-
-
-def display_value(sub: SimulatedSub) -> m.NamedValueFloat:
+def display_value(sub: SubHost) -> m.NamedValueFloat:
     """The next of `DISPLAY_VALUES`."""
     name = next(sub.display_names)
     return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
 
 
-def outside_pressure(sub: SimulatedSub) -> m.ScaledPressure3:
+def outside_pressure(sub: SubHost) -> m.ScaledPressure3:
     """The third barometer, a thermometer only."""
     return m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0)
 
@@ -294,7 +277,7 @@ def scaled_channels(rover: ArduPilotVehicle) -> m.RcChannelsScaled:
     return m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255)
 
 
-def rover_hud(rover: SimulatedRover) -> m.VfrHud:
+def rover_hud(rover: RoverHost) -> m.VfrHud:
     """Without airspeed and climb; the throttle is positive also backwards."""
     motion, place = rover.motion, rover.navigation.position
     heading = int(math.degrees(motion.yaw) % 360.0)
@@ -308,15 +291,23 @@ def no_landed_state(_: ArduPilotVehicle) -> m.ExtendedSysState:
     return m.ExtendedSysState(0, 0)
 
 
-_ALL = {
+_ALL: Builders = {
     **STATE_BUILDERS,
     **ATTITUDE_BUILDERS,
     **POSITION_BUILDERS,
-    **GIMBAL_BUILDERS,
-    **CAMERA_BUILDERS,
+    m.GimbalDeviceAttitudeStatus.ID: lambda vehicle: vehicle.gimbal.attitude_status(),
+    m.GimbalManagerInformation.ID: lambda vehicle: vehicle.gimbal.manager_information(),
+    m.GimbalManagerStatus.ID: lambda vehicle: vehicle.gimbal.manager_status(),
+    m.CameraInformation.ID: lambda vehicle: vehicle.camera.information(),
+    m.CameraSettings.ID: lambda vehicle: vehicle.camera.settings(),
+    m.CameraCaptureStatus.ID: lambda vehicle: vehicle.camera.capture_status(),
+    m.CameraFeedback.ID: lambda vehicle: vehicle.camera.last_feedback(),
+    m.VideoStreamInformation.ID: lambda vehicle: vehicle.camera.video_stream(),
+    m.CameraFovStatus.ID: lambda vehicle: vehicle.camera.field_of_view(),
     **EXTRA_BUILDERS,
-    m.FenceStatus.ID: fence_status,
-    **CALIBRATION_BUILDERS,
+    m.FenceStatus.ID: lambda vehicle: vehicle.fence.status(),
+    m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),
+    m.MagCalReport.ID: lambda vehicle: vehicle.calibrations.compasses.report(),
 }
 _FLYING = (m.Wind.ID, m.TerrainReport.ID, m.EscTelemetry1To4.ID)
 _COPTER_TARGETS = (m.AttitudeTarget.ID, m.PositionTargetLocalNed.ID)
@@ -326,7 +317,7 @@ def _without(*message_ids: int) -> dict[int, Any]:
     return {number: builder for number, builder in _ALL.items() if number not in message_ids}
 
 
-BUILDERS: dict[Kind, Builders] = {
+BUILDERS_OF_KIND: dict[Kind, Builders] = {
     "copter": {
         **_ALL,
         m.ServoOutputRaw.ID: copter_outputs,

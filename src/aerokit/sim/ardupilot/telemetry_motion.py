@@ -14,8 +14,8 @@ from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["ATTITUDE_BUILDERS", "POSITION_BUILDERS", "global_origin", "home_position"]
 

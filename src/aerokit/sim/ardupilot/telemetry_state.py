@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
-__all__ = ["STATE_BUILDERS", "heartbeat", "mission_current", "sensor_status"]
+__all__ = ["STATE_BUILDERS", "heartbeat", "sensor_status"]
 
 
 _FENCE = int(Sensor.MAV_SYS_STATUS_GEOFENCE)  # integers: arithmetic on flags takes ten times as long
@@ -262,13 +262,6 @@ def _system_time(vehicle: ArduPilotVehicle) -> m.SystemTime:
     return m.SystemTime(unix, vehicle.time_boot_ms)
 
 
-def mission_current(vehicle: ArduPilotVehicle, seq: int | None = None) -> m.MissionCurrent:
-    """MISSION_CURRENT; ``seq`` says another number than that of the command that is flown."""
-    run = vehicle.mission
-    seq = run.nav_index if seq is None else seq
-    return m.MissionCurrent(seq, run.count, run.state, int(vehicle.mode.needs_mission))
-
-
 def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
     fields = [vehicle.time_boot_ms, len(vehicle.rc), *vehicle.rc.channels, _RSSI]
     return m.RcChannels(*fields)
@@ -322,7 +315,7 @@ STATE_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.PowerStatus.ID: _power_status,
     m.Meminfo.ID: _meminfo,
     m.SystemTime.ID: _system_time,
-    m.MissionCurrent.ID: mission_current,
+    m.MissionCurrent.ID: lambda vehicle: vehicle.mission.message(),
     m.RcChannels.ID: _rc_channels,
     m.RcChannelsRaw.ID: _rc_channels_raw,
     m.Vibration.ID: _vibration,

@@ -3,46 +3,44 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFrame, MavModeFlag, MavResult, MavSeverity
-from aerokit.sim.ardupilot.arming import Arming
-from aerokit.sim.ardupilot.buzzer import hear_tunes
+from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
+from aerokit.parameters.encoding import UNKNOWN_INDEX
+from aerokit.sim.ardupilot.accessories import Accessories
+from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
 from aerokit.sim.ardupilot.gimbal import Gimbal
+from aerokit.sim.ardupilot.host import ArmingPart, Host
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
-from aerokit.sim.ardupilot.navigation import BOOT_TEXTS, BOOT_TIMELINES, Navigation
-from aerokit.sim.ardupilot.outputs import Accessories, Motors
-from aerokit.sim.ardupilot.parameter_tables import Kind, parameters_of
+from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.navigation import Navigation
+from aerokit.sim.ardupilot.parameter_tables import parameters_of
 from aerokit.sim.ardupilot.radio import Joystick, Radio
 from aerokit.sim.ardupilot.requests import Requests
-from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, Storage
-from aerokit.sim.ardupilot.telemetry import BUILDERS
-from aerokit.sim.ardupilot.telemetry_motion import global_origin, home_position
-from aerokit.sim.ardupilot.telemetry_state import heartbeat
-from aerokit.sim.autopilot import SimulatedAutopilot
+from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, Storage
 from aerokit.sim.battery import Battery
 from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
 from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.signing import ArduPilotSigning
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import SigningKey
+    from aerokit.sim.ardupilot.boot import BootTimeline
     from aerokit.sim.ardupilot.ftp import ArduPilotFtp
     from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
-    from aerokit.sim.ardupilot.navigation import BootTimeline, Ned
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import CommandHandler
     from aerokit.sim.file_tree import FileTree
+    from aerokit.sim.local_frame import Ned
     from aerokit.sim.logs import SimulatedLog
     from aerokit.sim.parameters import Parameters
 
@@ -51,13 +49,10 @@ __all__ = ["ArduPilotVehicle"]
 _REBOOT_SILENCE_S = 1.5
 _TIMESYNC_S = 10.0
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
-_RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
-_TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
-_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 ModeT = TypeVar("ModeT", bound="VehicleMode")
 
 
-class ArduPilotVehicle(SimulatedAutopilot):
+class ArduPilotVehicle(Host):
     """A subclass says what sets its kind apart: the class attributes, the ``make_…`` methods, commands, motion.
 
     - ``home``: where it is switched on: latitude, longitude (degrees), altitude AMSL (m);
@@ -76,17 +71,12 @@ class ArduPilotVehicle(SimulatedAutopilot):
     - ``signing_key``: see `ArduPilotSigning`
     """
 
-    KIND: ClassVar[Kind]
-    """Which table of parameters."""
-    FIRMWARE: ClassVar[str]
-    """As the banner has it."""
-    FRAME: ClassVar[str | None] = None
-    """What the banner says of the frame."""
     MAV_TYPE: ClassVar[int]
-    GIT_HASH: ClassVar[bytes] = b"5ae20c17"
+    BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]]
+    """Message id → what to send now, or None."""
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
     """Classes of the modes, in the order in which they are listed."""
-    ARMING: ClassVar[type[Arming]] = Arming
+    ARMING: ClassVar[Callable[[Any], ArmingPart]]
     """Its arming checks."""
     FAILSAFES: ClassVar[type[Failsafes]]
     """What it does by itself."""
@@ -144,12 +134,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.rangefinder_reach_m = rangefinder_reach_m
         self.rc: Radio = Radio(self)
         """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
-        self.tunes: list[str] = hear_tunes(self)
-        """What PLAY_TUNE had it play."""
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
-        self._frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        self.frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.missions: MissionServer = MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
@@ -166,8 +154,8 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.has_left_boot: bool = False
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: Motors = self.make_motors()
-        self.navigation: Navigation = Navigation(self, self._frame)
-        self.arming: Arming = self.ARMING(self)
+        self.navigation: Navigation = Navigation(self, self.frame)
+        self.arming = type(self).ARMING(self)
         self.accessories: Accessories = Accessories(self)
         self.failsafes: Failsafes = self.FAILSAFES(self)
         self.fence: Fence = self.FENCE(self)
@@ -236,11 +224,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
         return f"Mode change to {mode.name} failed: {reason}"
 
     @property
-    def guided(self) -> VehicleMode:
-        """Its mode for targets of a program."""
-        raise NotImplementedError
-
-    @property
     def auto(self) -> AutoMode:
         """Its mode for missions."""
         raise NotImplementedError
@@ -265,21 +248,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
     def ftp(self) -> ArduPilotFtp:
         """The server of the files."""
         return self.storage.ftp
-
-    @property
-    def frame(self) -> LocalFrame:
-        """The world: metres north and east of where it was switched on."""
-        return self._frame
-
-    @property
-    def is_armed(self) -> bool:
-        """Whether the motors are armed."""
-        return self.motors.is_armed
-
-    @property
-    def altitude_m(self) -> float:
-        """Metres above home."""
-        return self.navigation.altitude_above_home
 
     def is_for_me(self, message: Message) -> bool:
         """Also what is for a component of this system that is not there (MAVLink_routing.cpp)."""
@@ -323,13 +291,6 @@ class ArduPilotVehicle(SimulatedAutopilot):
         channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
         channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_S, max(self.now, self.booted_at + _TIMESYNC_S))
         self.requests.start_channel(channel, max(self.now, ready))
-
-    def send_banner(self) -> None:
-        """Firmware, hash and frame as texts."""
-        self.info(f"{self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})")
-        self.info(self.uid.hex()[:32])
-        if self.FRAME is not None:
-            self.info(self.FRAME)
 
     def restart(self) -> None:
         """Reboot now: silence, then the whole boot again; stream rates and estimates are forgotten."""
@@ -378,8 +339,13 @@ class ArduPilotVehicle(SimulatedAutopilot):
         self.mode.leave()
         self.mode = mode
         self.fence.mode_changed()
-        self.call_later(0.0, lambda: self.send(heartbeat(self)))
+        self.call_later(0.0, self._send_heartbeat)
         return True
+
+    def _send_heartbeat(self) -> None:
+        heartbeat = self.build(m.Heartbeat.ID)
+        assert heartbeat is not None
+        self.send(heartbeat)
 
     def set_mode_from(self, base_mode: int, custom_mode: int) -> int:
         """DO_SET_MODE and SET_MODE: only custom modes; the MAV_RESULT. SET_MODE does not tell it."""
@@ -397,6 +363,10 @@ class ArduPilotVehicle(SimulatedAutopilot):
         assert isinstance(mode, kind)
         return mode
 
+    def announce_parameter(self, name: str) -> None:
+        """Tell a parameter to everybody."""
+        self.storage.parameters.send(name, UNKNOWN_INDEX, None)
+
     def available_modes(self) -> list[m.AvailableModes]:
         """AVAILABLE_MODES, as ArduPilot numbers and names them."""
         modes = list(self._modes.values())
@@ -405,33 +375,11 @@ class ArduPilotVehicle(SimulatedAutopilot):
             for index, mode in enumerate(modes, start=1)
         ]
 
-    def point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
-        """A place on the globe in the world's frame; None when it is none, or the frame is unknown."""
-        valid = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
-        if not valid or not math.isfinite(altitude):
-            return None
-        north, east = self._frame.to_local(latitude_e7, longitude_e7)
-        if frame in _RELATIVE:
-            home = self.navigation.home
-            return (north, east, (self.motion.ground_down if home is None else home[2]) - altitude)
-        if frame in _TERRAIN:
-            return (north, east, self.motion.ground_down - altitude)
-        if frame in _ABSOLUTE:
-            return (north, east, self._frame.origin.altitude_m - altitude)
-        self.info(f"Unknown mavlink coordinate frame {frame}")
-        return None
-
-    def send_home(self, channel: Channel | None = None) -> None:
-        """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""
-        for message in (global_origin(self), home_position(self)):
-            if message is not None:
-                self.send(message, channel)
-
     # --------------------------------------------------------------------------------------- flying
 
     def build(self, message_id: int) -> Message | None:
         """What is to be streamed now."""
-        builder = BUILDERS[self.KIND].get(message_id)
+        builder = self.BUILDERS.get(message_id)
         if builder is not None:
             return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None
         if message_id == m.Timesync.ID:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavMissionType, MavSeverity, MavType
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
 from aerokit.sim.px4.texts import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 
@@ -30,8 +31,6 @@ _C = MavCmd
 _POLYGONS = {_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
 _CIRCLES = {_C.NAV_FENCE_CIRCLE_INCLUSION: True, _C.NAV_FENCE_CIRCLE_EXCLUSION: False}
 _NO_ACTION, _WARNING = 0, 1
-
-Ned = tuple[float, float, float]
 
 
 class Fence:

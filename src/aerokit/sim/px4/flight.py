@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import approach_speed
 from aerokit.sim.px4.manual import ManualFlight
 from aerokit.sim.px4.modes import (
@@ -80,7 +81,6 @@ class Orbit:
         )
 
 
-Ned = tuple[float, float, float]
 _NEAREST, _RALLY_FIRST = (0, 3), 1
 _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 

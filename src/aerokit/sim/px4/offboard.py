@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
 from aerokit.sim.px4.flight import velocity_towards
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Offboard"]
 
-Ned = tuple[float, float, float]
 _NAN3: Ned = (math.nan, math.nan, math.nan)
 _POSITION = (Mask.X_IGNORE, Mask.Y_IGNORE, Mask.Z_IGNORE)
 _VELOCITY = (Mask.VX_IGNORE, Mask.VY_IGNORE, Mask.VZ_IGNORE)

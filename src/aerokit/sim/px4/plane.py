@@ -16,8 +16,8 @@ from aerokit.sim.px4.vehicle import SimulatedPx4
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
+    from aerokit.sim.local_frame import Ned
     from aerokit.sim.motion import Motion
-    from aerokit.sim.px4.offboard import Ned
 
 __all__ = ["PlaneFlight", "PlaneMission", "SimulatedPx4Plane"]
 

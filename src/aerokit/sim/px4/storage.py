@@ -1,4 +1,4 @@
-"""What a simulated PX4 keeps in files, and how it gives it away."""
+"""What a simulated PX4 keeps: files, logs, parameters, the key for signing; and how it gives them away."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from aerokit.errors import RemoteProtocolError
+from aerokit.mavlink.enums import MavSeverity
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat
+from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp_message import DATA_SIZE
 from aerokit.sim.file_tree import EINVAL, FileFault, FileTree, OpenFile
@@ -13,6 +17,7 @@ from aerokit.sim.logs import Px4LogServer, SimulatedLog
 from aerokit.sim.parameter_server import Px4ParameterServer
 from aerokit.sim.parameters import ParameterPackMount
 from aerokit.sim.px4.ftp import Px4Ftp
+from aerokit.sim.signing import VehicleSigning
 
 if TYPE_CHECKING:
     from aerokit.sim.parameters import Parameters
@@ -169,3 +174,42 @@ class Storage:
 
 def _log_path(number: int) -> str:
     return f"{LOG_FOLDER}/2026-11-21/{10 + number:02}_00_00.ulg"
+
+
+_UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
+
+
+class Px4Signing(VehicleSigning):
+    """It tells when a key is taken, and lets heartbeats in without a signature; 1.16 knows no signing.
+
+    The time stamp is stored when a key is taken, and not again.
+    """
+
+    def __init__(self, vehicle: SimulatedPx4, key: SigningKey | None, timestamp: int) -> None:
+        super().__init__(vehicle, key, timestamp)
+        self._px4 = vehicle
+
+    def is_for(self, link_id: int) -> bool:
+        """Since 1.17."""
+        return not self._px4.version.startswith("1.16")
+
+    def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
+        """Heartbeats and the traffic around, on every port."""
+        return _may_be_unsigned
+
+    def may_change(self) -> bool:
+        """Not while armed."""
+        if not self.is_for(0):
+            return False
+        if self._px4.is_armed:
+            self._px4.send_text(MavSeverity.CRITICAL, "MAVLink signing: rejected while armed")
+            return False
+        return True
+
+    def changed(self) -> None:
+        """Say so."""
+        self._px4.info("MAVLink signing disabled" if self.key is None else "MAVLink signing key accepted")
+
+
+def _may_be_unsigned(frame: Frame) -> bool:
+    return frame.message_id in _UNSIGNED

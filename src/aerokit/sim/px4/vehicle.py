@@ -40,10 +40,9 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.offboard import Offboard
 from aerokit.sim.px4.parameters import px4_parameters
-from aerokit.sim.px4.storage import DEFAULT_LOGS, Storage
+from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage
 from aerokit.sim.px4.telemetry import BUILDERS, global_origin
 from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
-from aerokit.sim.signing import Px4Signing
 from aerokit.sim.vehicle import Component, sender_of
 
 if TYPE_CHECKING:

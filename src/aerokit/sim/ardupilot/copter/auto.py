@@ -21,8 +21,8 @@ from aerokit.sim.motion import wrap_pi
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.copter.host import CopterHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Auto"]
 
@@ -56,7 +56,7 @@ class Auto(Mode):
     arms_with_raised_throttle = True
     can_change_speed = True
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self.speed: float = 0.0
         self.climb: float = 0.0

@@ -9,8 +9,8 @@ from aerokit.sim.ardupilot.copter.modes import TakeOff
 from aerokit.sim.ardupilot.copter.returning import Rtl, sink
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.copter.host import CopterHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Circle", "Climb", "Descent", "Leg", "Limits", "Return", "Stay", "Way"]
 
@@ -48,7 +48,7 @@ class Stay:
 
     is_complete = False
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         self._copter = copter
 
     def update(self, dt: float) -> None:
@@ -60,7 +60,7 @@ class Stay:
 class Way:
     """Straight to a place. With ``stops`` the place itself counts, else WPNAV_RADIUS around it."""
 
-    def __init__(self, copter: SimulatedCopter, limits: Limits, destination: Ned, *, stops: bool) -> None:
+    def __init__(self, copter: CopterHost, limits: Limits, destination: Ned, *, stops: bool) -> None:
         self._copter, self._limits = copter, limits
         self.destination = destination
         self._radius = _STOPPED_M if stops else copter.parameters["WPNAV_RADIUS"] / 100.0
@@ -83,7 +83,7 @@ class Circle:
     """To the edge of a circle, and around as often as wanted; a negative radius turns to the left."""
 
     def __init__(
-        self, copter: SimulatedCopter, limits: Limits, centre: Ned, *, turns: float, radius: float
+        self, copter: CopterHost, limits: Limits, centre: Ned, *, turns: float, radius: float
     ) -> None:
         self._copter, self._turns = copter, turns
         self._centre = centre
@@ -144,7 +144,7 @@ class Circle:
 class Climb:
     """A take-off; on the ground it waits for MISSION_START, a raised throttle or AUTO_OPTIONS."""
 
-    def __init__(self, copter: SimulatedCopter, limits: Limits, altitude_m: float) -> None:
+    def __init__(self, copter: CopterHost, limits: Limits, altitude_m: float) -> None:
         self._copter, self._limits = copter, limits
         self._take_off = TakeOff(copter, altitude_m)
 
@@ -175,7 +175,7 @@ class Return(Rtl):
 class Descent:
     """Straight down, with the speeds of LAND; complete when it is down and the motors idle."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         self._copter = copter
 
     @property

@@ -13,7 +13,7 @@ from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
 from aerokit.sim.ardupilot.mode import VehicleMode
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
+    from aerokit.sim.ardupilot.copter.host import CopterHost
 
 __all__ = ["CopterArming", "CopterFailsafes", "CopterFence"]
 
@@ -27,7 +27,7 @@ class CopterArming(Arming):
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self._copter = copter
 
@@ -118,7 +118,7 @@ class CopterFailsafes(Failsafes):
         _TERMINATE, _LAND, _RTL, _SMART_RTL_OR_LAND, _SMART_RTL, _NONE,
     )  # fmt: skip
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self._copter = copter
         self._radio_good_at = math.nan

@@ -12,8 +12,8 @@ from aerokit.sim.ardupilot.copter.modes import Mode, TakeOff
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.copter.host import CopterHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Guided", "Submode"]
 
@@ -43,7 +43,7 @@ class Guided(Mode):
     arms_with_raised_throttle = True
     can_change_speed = True
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self.submode: Submode = Submode.VELOCITY
         self.speed: float = 0.0

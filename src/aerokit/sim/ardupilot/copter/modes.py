@@ -16,8 +16,8 @@ from aerokit.sim.ardupilot.mode import VehicleMode
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.copter.host import CopterHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["AltHold", "Brake", "Circle", "Loiter", "Mode", "PosHold", "Stabilize", "TakeOff"]
 
@@ -32,7 +32,7 @@ _STABILIZE_CLIMB_M_S = 6.0
 class Mode(VehicleMode):
     """A mode of a copter."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         self.copter = copter
 
     def stay(self) -> None:
@@ -44,7 +44,7 @@ class Mode(VehicleMode):
 class TakeOff:
     """A climb straight up that waits for the motors; shared by the modes that take off by command."""
 
-    def __init__(self, copter: SimulatedCopter, altitude_m: float) -> None:
+    def __init__(self, copter: CopterHost, altitude_m: float) -> None:
         self._copter = copter
         home = copter.navigation.home
         ground = copter.motion.ground_down if home is None else home[2]
@@ -67,7 +67,7 @@ class TakeOff:
 class PilotedMode(Mode):
     """Modes that the sticks fly; the sticks stay where RC_CHANNELS_OVERRIDE or the test put them."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self._take_off: TakeOff | None = None
 

@@ -12,8 +12,8 @@ from aerokit.sim.ardupilot.navigation import best_return_place
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.copter.host import CopterHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Land", "Rtl", "SmartRtl", "sink"]
 
@@ -41,7 +41,7 @@ class Land(Mode):
         descend(self.copter)
 
 
-def descend(copter: SimulatedCopter) -> None:
+def descend(copter: CopterHost) -> None:
     """One step of a landing."""
     if not copter.is_landed:
         sink(copter)
@@ -51,7 +51,7 @@ def descend(copter: SimulatedCopter) -> None:
         copter.arming.disarm()
 
 
-def sink(copter: SimulatedCopter) -> None:
+def sink(copter: CopterHost) -> None:
     """Straight down, slowly at last."""
     parameters = copter.parameters
     copter.motors.wanted = True
@@ -69,7 +69,7 @@ class Rtl(Mode):
     can_arm = False
     can_change_speed = True
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self._phase = "climb"
         self._altitude_down = 0.0
@@ -153,7 +153,7 @@ class SmartRtl(Mode):
     can_arm = False
     returns_on_path = True
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
         self._way: list[Ned] = []
 

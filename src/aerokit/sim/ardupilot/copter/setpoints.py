@@ -17,9 +17,9 @@ from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.motion import euler_from_quaternion
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.ardupilot.copter.host import CopterHost
     from aerokit.sim.channel import Channel
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Setpoints"]
 
@@ -41,21 +41,25 @@ PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
 class Setpoints:
     """Turns the messages into what `Guided` understands."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: CopterHost) -> None:
         self._copter = copter
         copter.on(SetPositionTargetLocalNed, self._on_local)
         copter.on(SetPositionTargetGlobalInt, self._on_global)
         copter.on(SetAttitudeTarget, self._on_attitude)
 
     @property
+    def _guided(self) -> Guided:
+        return self._copter.mode_of(Guided)
+
+    @property
     def _is_guided(self) -> bool:
-        return self._copter.mode is self._copter.guided
+        return self._copter.mode is self._guided
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
         if not self._is_guided:
             return
         if target.coordinate_frame not in _LOCAL:
-            self._copter.guided.enter(force=False)
+            self._guided.enter(force=False)
             return
         self._apply(target, self._local_point(target), rotate=target.coordinate_frame in _BODY)
 
@@ -64,12 +68,12 @@ class Setpoints:
             return
         point = self._copter.point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         if point is None and not target.type_mask & _POSITION:
-            self._copter.guided.enter(force=False)
+            self._guided.enter(force=False)
             return
         self._apply(target, (0.0, 0.0, 0.0) if point is None else point, rotate=False)
 
     def _apply(self, target: PositionTarget, point: Ned, *, rotate: bool) -> None:
-        guided, mask = self._copter.guided, target.type_mask
+        guided, mask = self._guided, target.type_mask
         velocity, acceleration = (target.vx, target.vy, target.vz), (target.afx, target.afy, target.afz)
         no_position, no_velocity = bool(mask & _POSITION), bool(mask & _VELOCITY)
         no_acceleration = bool(mask & _ACCELERATION)

@@ -21,6 +21,7 @@ from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.copter.auto import Auto
 from aerokit.sim.ardupilot.copter.failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter.guided import Guided
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
 from aerokit.sim.ardupilot.copter.other_modes import (
     Acro,
@@ -39,9 +40,7 @@ from aerokit.sim.ardupilot.copter.other_modes import (
 )
 from aerokit.sim.ardupilot.copter.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.copter.setpoints import Setpoints
-from aerokit.sim.ardupilot.copter.yaw import AutoYaw
-from aerokit.sim.ardupilot.smart_path import SmartPath
-from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.failsafes import Failsafes
     from aerokit.sim.ardupilot.fence import Fence
     from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
 
 __all__ = ["MotorTest", "SimulatedCopter", "copter_commands"]
@@ -224,7 +222,7 @@ _GUIDED_MODES = frozenset((
 ))  # fmt: skip
 
 
-class SimulatedCopter(ArduPilotVehicle):
+class SimulatedCopter(CopterHost):
     """Speaks and behaves as ArduCopter does where a client can see it; flies as `Motion` does.
 
     Its arguments are those of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three
@@ -238,6 +236,7 @@ class SimulatedCopter(ArduPilotVehicle):
     FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
     MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
     CAPABILITIES: ClassVar[int] = 0xFBEF
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = (
         AutoRtl, Auto, Acro, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, Drift, Flip, Autotune, PosHold,
         Brake, Throw, AvoidAdsb, GuidedNoGps, SmartRtl, FlowHold, Follow, ZigZag, SystemId, Turtle,
@@ -255,19 +254,10 @@ class SimulatedCopter(ArduPilotVehicle):
         Setpoints(self)
 
     def reset_controllers(self) -> None:
-        """Where it points its nose, the land detector, and the way back of SMART_RTL."""
-        self.yaw: AutoYaw = AutoYaw(self)
+        """The land detector and motor tests, too."""
+        super().reset_controllers()
         self._still_since = math.nan
-        self.path: SmartPath = SmartPath(self, only_armed=True)
         self.motor_test: MotorTest = MotorTest(self)
-
-    def _become_ready(self) -> None:
-        super()._become_ready()
-        self.path.start()
-
-    def look_at(self, place: Ned | None) -> None:
-        """See `AutoYaw.region_of_interest`."""
-        self.yaw.region_of_interest(place)
 
     @property
     def guided(self) -> Guided:

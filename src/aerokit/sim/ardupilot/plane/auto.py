@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavSeverity, PlaneMode
 from aerokit.mavlink.messages import MissionItemReached
-from aerokit.sim.ardupilot.plane.landing import Landing
+from aerokit.sim.ardupilot.plane.host import Landing
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode, climb_out
 from aerokit.sim.motion import wrap_pi
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from typing import ClassVar
 
     from aerokit.missions import MissionItem
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.plane.host import PlaneHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Auto"]
 
@@ -39,7 +39,7 @@ class Auto(NavigatingMode):
     needs_mission = True
     can_change_speed = True
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self.may_lift_off = True
         self.is_paused = False

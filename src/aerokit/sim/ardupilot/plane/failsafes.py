@@ -12,8 +12,8 @@ from aerokit.sim.ardupilot.navigation import best_return_place
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.plane.host import PlaneHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["PlaneFailsafes", "PlaneFence"]
 
@@ -44,7 +44,7 @@ class PlaneFailsafes(Failsafes):
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self._plane = plane
         self.state: int = _NONE
@@ -263,7 +263,7 @@ class PlaneFence(Fence):
     CIRCLE_BACKUP_M: ClassVar[float] = 100.0
     WATCHES_DISARMED: ClassVar[bool] = True
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self._plane = plane
         self._mode_before: int | None = None

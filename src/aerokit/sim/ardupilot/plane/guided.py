@@ -17,10 +17,10 @@ from aerokit.sim.motion import euler_from_quaternion
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.plane.host import PlaneHost
     from aerokit.sim.channel import Channel
     from aerokit.sim.commands import Command, CommandHandler
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Guided", "PlaneSetpoints", "guided_commands"]
 
@@ -113,7 +113,7 @@ class Guided(NavigatingMode):
 class PlaneSetpoints:
     """Of the position messages an aeroplane takes only heights; outside GUIDED it takes nothing, without a word."""
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         self._plane = plane
         plane.on(m.SetPositionTargetLocalNed, self._on_local)
         plane.on(m.SetPositionTargetGlobalInt, self._on_global)
@@ -121,16 +121,16 @@ class PlaneSetpoints:
 
     @property
     def _is_guided(self) -> bool:
-        return self._plane.mode is self._plane.guided
+        return self._plane.mode is self._plane.mode_of(Guided)
 
     def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
         """Metres down from the present target; the rest is ignored."""
         plane = self._plane
-        target = plane.guided.destination
+        target = plane.mode_of(Guided).destination
         if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
         down = target[2] + message.z
-        plane.guided.change_altitude(down)
+        plane.mode_of(Guided).change_altitude(down)
         home = plane.navigation.home or (0.0, 0.0, plane.wing.ground_down)
         plane.info(f"Change alt to {home[2] - down:.1f}")
 
@@ -143,14 +143,14 @@ class PlaneSetpoints:
             plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
         elif not message.type_mask & PositionMask.Z_IGNORE:
-            plane.guided.change_altitude(point[2])
+            plane.mode_of(Guided).change_altitude(point[2])
 
     def _on_attitude(self, message: m.SetAttitudeTarget, _: Channel) -> None:
         if self._is_guided:
-            self._plane.guided.take_attitude(message)
+            self._plane.mode_of(Guided).take_attitude(message)
 
 
-def guided_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
+def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
     """MAV_CMD → handler: speed, height and course with rates of change; in GUIDED only."""
     handlers: dict[int, CommandHandler] = {
         MavCmd.GUIDED_CHANGE_SPEED: lambda command: _change_speed(plane, command),
@@ -159,7 +159,7 @@ def guided_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
     }
 
     def in_guided(handler: CommandHandler) -> CommandHandler:
-        return lambda command: handler(command) if plane.mode is plane.guided else MavResult.FAILED
+        return lambda command: handler(command) if plane.mode is plane.mode_of(Guided) else MavResult.FAILED
 
     return {
         **{command: in_guided(handler) for command, handler in handlers.items()},
@@ -167,43 +167,43 @@ def guided_commands(plane: SimulatedPlane) -> dict[int, CommandHandler]:
     }
 
 
-def _change_speed(plane: SimulatedPlane, command: Command) -> int:
+def _change_speed(plane: PlaneHost, command: Command) -> int:
     """Params: SPEED_TYPE, of which only the airspeed is taken; m/s."""
     if whole(command.param1) != SpeedType.AIRSPEED:
         return MavResult.DENIED
     if not plane.can_fly_at(command.param2):
         return MavResult.FAILED
-    plane.guided.speed = command.param2
+    plane.mode_of(Guided).speed = command.param2
     return MavResult.ACCEPTED
 
 
-def _change_altitude(plane: SimulatedPlane, command: Command) -> int:
+def _change_altitude(plane: PlaneHost, command: Command) -> int:
     """Param 3: climb in m/s, 0 as fast as it can; neither 0 nor -1 is taken as an altitude."""
     point = plane.point(0, 0, command.z, command.altitude_frame)
     if command.z in _UNCHANGEABLE or point is None:
         return MavResult.DENIED
-    plane.guided.change_altitude(point[2], abs(command.param3) or _AT_ONCE_M_S)
+    plane.mode_of(Guided).change_altitude(point[2], abs(command.param3) or _AT_ONCE_M_S)
     return MavResult.ACCEPTED
 
 
-def _change_heading(plane: SimulatedPlane, command: Command) -> int:
+def _change_heading(plane: PlaneHost, command: Command) -> int:
     """Params: HEADING_TYPE, degrees. Course over ground and heading are the same here; the default ends it."""
     if not 0.0 <= command.param2 < 360.0:
         return MavResult.DENIED
     if command.param1 == HeadingType.DEFAULT:
-        plane.guided.change_course(None)
+        plane.mode_of(Guided).change_course(None)
         return MavResult.ACCEPTED
     if command.param1 not in (HeadingType.COURSE_OVER_GROUND, HeadingType.HEADING):
         return MavResult.DENIED
-    plane.guided.change_course(math.radians(command.param2))
+    plane.mode_of(Guided).change_course(math.radians(command.param2))
     return MavResult.ACCEPTED
 
 
-def _change_target_altitude(plane: SimulatedPlane, command: Command) -> int:
+def _change_target_altitude(plane: PlaneHost, command: Command) -> int:
     """Params: metres, MAV_FRAME. What it changes is the target of GUIDED."""
     point = plane.point(0, 0, command.param1, whole(command.param2))
     if point is None:
         return MavResult.DENIED
-    if plane.mode is plane.guided:
-        plane.guided.change_altitude(point[2])
+    if plane.mode is plane.mode_of(Guided):
+        plane.mode_of(Guided).change_altitude(point[2])
     return MavResult.ACCEPTED

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink.enums import MavModeFlag, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.navigation import best_return_place
-from aerokit.sim.ardupilot.plane.landing import Landing
+from aerokit.sim.ardupilot.plane.host import Landing
 
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+    from aerokit.sim.ardupilot.plane.host import PlaneHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = [
     "Autoland",
@@ -49,7 +49,7 @@ class PlaneModeBase(VehicleMode):
     flags: int = MavModeFlag.STABILIZE_ENABLED
     """MAV_MODE_FLAGs that HEARTBEAT shows."""
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         self.plane = plane
 
     def stick(self, index: int) -> float:
@@ -109,7 +109,7 @@ class FlyByWireB(PlaneModeBase):
     number: ClassVar[int] = PlaneMode.FLY_BY_WIRE_B
     name = "FLY_BY_WIRE_B"
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self._down = 0.0
 
@@ -139,7 +139,7 @@ class Cruise(FlyByWireB):
     number: ClassVar[int] = PlaneMode.CRUISE
     name = "CRUISE"
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self._course: float | None = None
 
@@ -182,7 +182,7 @@ class NavigatingMode(PlaneModeBase):
 
     flags: int = _NAVIGATES
 
-    def __init__(self, plane: SimulatedPlane) -> None:
+    def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self.speed: float = 0.0
         """Airspeed in m/s that was asked for; 0 is AIRSPEED_CRUISE."""
@@ -321,7 +321,7 @@ class Autoland(NavigatingMode):
         self._landing.update(dt)
 
 
-def climb_out(plane: SimulatedPlane) -> None:
+def climb_out(plane: PlaneHost) -> None:
     """Full throttle straight on, and up as soon as it is fast enough."""
     wing = plane.wing
     plane.lift_off()

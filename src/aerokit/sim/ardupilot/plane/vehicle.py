@@ -17,10 +17,11 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.commands import common_commands
-from aerokit.sim.ardupilot.outputs import Motors
+from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.plane.auto import Auto
 from aerokit.sim.ardupilot.plane.failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane.guided import Guided, PlaneSetpoints, guided_commands
+from aerokit.sim.ardupilot.plane.host import PlaneHost
 from aerokit.sim.ardupilot.plane.modes import (
     Autoland,
     Circle,
@@ -36,9 +37,8 @@ from aerokit.sim.ardupilot.plane.modes import (
     TakeOff,
 )
 from aerokit.sim.ardupilot.plane.other_modes import Acro, Autotune, AvoidAdsb, Initialising, Thermal, Training
-from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import whole
-from aerokit.sim.fixed_wing import FixedWing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from aerokit.sim.ardupilot.mode import VehicleMode
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.motion import Motion, Wind
 
 __all__ = ["PlaneArming", "SimulatedPlane", "plane_commands"]
 
@@ -158,7 +157,7 @@ _STANDS_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
 
-class SimulatedPlane(ArduPilotVehicle):
+class SimulatedPlane(PlaneHost):
     """Speaks and behaves as ArduPlane does where a client can see it; flies as `FixedWing` does.
 
     Its arguments are those of `ArduPilotVehicle`. It starts on a runway along its heading. Not simulated: lifting
@@ -170,6 +169,7 @@ class SimulatedPlane(ArduPilotVehicle):
     MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     CAPABILITIES: ClassVar[int] = 0xF36F
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = (
         Manual, Circle, Stabilize, Training, Acro, FlyByWireA, FlyByWireB, Cruise, Autotune, Auto, Rtl, Loiter,
         AvoidAdsb, Guided, Initialising, TakeOff, Thermal, Autoland,
@@ -180,22 +180,6 @@ class SimulatedPlane(ArduPilotVehicle):
 
     fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def make_motion(self, wind: Wind | None) -> Motion:
-        """An aeroplane within the limits of the parameters."""
-        self.wing: FixedWing = FixedWing(self.rng, wind=wind)
-        """What flies; the same as ``motion``."""
-        self._read_limits()
-        return self.wing
-
-    def _read_limits(self) -> None:
-        limits, parameters = self.wing.wing, self.parameters
-        limits.airspeed_min_m_s = parameters["AIRSPEED_MIN"]
-        limits.airspeed_max_m_s = parameters["AIRSPEED_MAX"]
-        limits.climb_m_s = parameters["TECS_CLMB_MAX"]
-        limits.sink_m_s = parameters["TECS_SINK_MAX"]
-        limits.glide_sink_m_s = parameters["TECS_SINK_MIN"]
-        limits.bank_rad = math.radians(parameters["ROLL_LIMIT_DEG"])
 
     def make_motors(self) -> Motors:
         """One engine."""
@@ -208,12 +192,6 @@ class SimulatedPlane(ArduPilotVehicle):
     def hear_setpoints(self) -> None:
         """See `PlaneSetpoints`."""
         PlaneSetpoints(self)
-
-    def reset_controllers(self) -> None:
-        """Forget the take-off."""
-        self.take_off_yaw: float | None = None
-        """Where it has taken off to, in radians; None before."""
-        self._rests_since = math.nan
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
         """Those for lifting rotors need Q_ENABLE."""
@@ -242,22 +220,6 @@ class SimulatedPlane(ArduPilotVehicle):
         flags = int(mode.flags) if isinstance(mode, PlaneModeBase) else 0
         armed = MavModeFlag.SAFETY_ARMED if self.motors.is_armed else 0
         return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
-
-    @property
-    def cruise_m_s(self) -> float:
-        """AIRSPEED_CRUISE."""
-        return self.parameters["AIRSPEED_CRUISE"]
-
-    def can_fly_at(self, airspeed: float) -> bool:
-        """Whether an airspeed in m/s is between AIRSPEED_MIN and AIRSPEED_MAX."""
-        return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
-
-    def lift_off(self) -> None:
-        """The engine runs: from now on it moves, on the ground at first."""
-        if self.is_landed:
-            self._read_limits()
-            self.is_landed, self._rests_since = False, math.nan
-            self.take_off_yaw = self.wing.yaw
 
     def move(self, dt: float) -> None:
         """Motion, and whether it stands."""

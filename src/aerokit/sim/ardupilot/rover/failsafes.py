@@ -12,7 +12,7 @@ from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
+    from aerokit.sim.ardupilot.rover.host import RoverHost
 
 __all__ = ["RoverArming", "RoverFailsafes", "RoverFence", "modes_of_action"]
 
@@ -23,7 +23,7 @@ _NEEDS_LOCATION = 1
 class RoverArming(Arming):
     """A position only in the modes that drive by it, or always with ARMING_NEED_LOC."""
 
-    def __init__(self, rover: SimulatedRover) -> None:
+    def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self._rover = rover
 
@@ -103,7 +103,7 @@ class RoverFailsafes(Failsafes):
         _TERMINATE, _HOLD, _RTL, _SMART_RTL_OR_HOLD, _SMART_RTL, _NONE,
     )  # fmt: skip
 
-    def __init__(self, rover: SimulatedRover) -> None:
+    def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self._rover = rover
         self._lost: set[str] = set()

@@ -15,8 +15,8 @@ from aerokit.sim.ardupilot.targets import Target
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
+    from aerokit.sim.ardupilot.rover.host import RoverHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["ROVER_MODES", "RoverAuto", "RoverGuided"]
 
@@ -28,7 +28,7 @@ _STANDING_M = 0.5
 class _Mode(VehicleMode):
     """Every mode has its rover."""
 
-    def __init__(self, rover: SimulatedRover) -> None:
+    def __init__(self, rover: RoverHost) -> None:
         self.rover = rover
 
     def sticks(self) -> tuple[float, float]:
@@ -122,7 +122,7 @@ class _Rtl(_Mode):
     can_arm = False
     can_change_speed = True
 
-    def __init__(self, rover: SimulatedRover) -> None:
+    def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed = 0.0
         self._way: list[Ned] = []
@@ -186,7 +186,7 @@ class RoverAuto(LevelAuto):
     number: ClassVar[int] = RoverMode.AUTO
     name = "AUTO"
 
-    vehicle: SimulatedRover
+    vehicle: RoverHost
 
     def default_speed(self) -> float:
         """WP_SPEED, or CRUISE_SPEED."""
@@ -231,7 +231,7 @@ class RoverGuided(_Mode):
     number: ClassVar[int] = RoverMode.GUIDED
     name = "GUID"
 
-    def __init__(self, rover: SimulatedRover) -> None:
+    def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed: float = 0.0
         self._place: Ned | None = None

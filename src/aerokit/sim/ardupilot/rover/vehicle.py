@@ -7,15 +7,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, RoverMode
-from aerokit.sim.ardupilot.level import LevelVehicle
-from aerokit.sim.ardupilot.outputs import Motors
+from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.radio import LevelJoystick
 from aerokit.sim.ardupilot.rover.failsafes import RoverArming, RoverFailsafes, RoverFence
+from aerokit.sim.ardupilot.rover.host import RoverHost
 from aerokit.sim.ardupilot.rover.modes import ROVER_MODES, RoverAuto, RoverGuided
-from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ardupilot.targets import RoverTargets
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.ground_motion import GroundLimits, GroundMotion
-from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.arming import Arming
@@ -30,7 +29,6 @@ __all__ = ["SimulatedRover"]
 
 _GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
 _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
-_ARRIVED_M, _STANDING_M_S = 0.3, 0.1
 _AMPERES_AT_FULL = 16.0
 _MIDDLE_PWM = 1500
 
@@ -49,7 +47,7 @@ class _Motors(Motors):
             self.throttle = 0.0
 
 
-class SimulatedRover(LevelVehicle):
+class SimulatedRover(RoverHost):
     """Speaks and behaves as ArduRover does where a client can see it; drives as `GroundMotion` does.
 
     Its arguments are those of `ArduPilotVehicle`. It has 1,235 parameters. Simulated: MANUAL, ACRO, STEERING and
@@ -65,12 +63,11 @@ class SimulatedRover(LevelVehicle):
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     TELLS_HOME: ClassVar[bool] = True
     CAPABILITIES: ClassVar[int] = 0xF1EF
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
     ARMING: ClassVar[type[Arming]] = RoverArming
     FAILSAFES: ClassVar[type[Failsafes]] = RoverFailsafes
     FENCE: ClassVar[type[Fence]] = RoverFence
-
-    motion: GroundMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_motion(self, wind: Wind | None) -> GroundMotion:
         """Limits as the parameters have them now; wind is only told, it moves nothing."""
@@ -88,15 +85,6 @@ class SimulatedRover(LevelVehicle):
         """One motor."""
         return _Motors()
 
-    def reset_controllers(self) -> None:
-        """The throttle stick rests in the middle, and the way back of SMART_RTL is forgotten."""
-        super().reset_controllers()
-        self.path: SmartPath = SmartPath(self, only_armed=False)
-
-    def _become_ready(self) -> None:
-        super()._become_ready()
-        self.path.start()
-
     def hear_setpoints(self) -> None:
         """See `RoverTargets`."""
         RoverTargets(self, self.guided)
@@ -104,12 +92,6 @@ class SimulatedRover(LevelVehicle):
     def make_joystick(self) -> LevelJoystick:
         """Two axes."""
         return LevelJoystick(self)
-
-    @property
-    def top_speed(self) -> float:
-        """In m/s: SPEED_MAX, or what CRUISE_SPEED at CRUISE_THROTTLE leads to."""
-        parameters = self.parameters
-        return parameters["SPEED_MAX"] or 100.0 * parameters["CRUISE_SPEED"] / parameters["CRUISE_THROTTLE"]
 
     @property
     def is_landed(self) -> bool:
@@ -155,12 +137,3 @@ class SimulatedRover(LevelVehicle):
             MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(RoverMode.RTL),
             MavCmd.DO_FLIGHTTERMINATION: lambda _: MavResult.UNSUPPORTED,
         }
-
-    def has_arrived(self, place: tuple[float, float, float]) -> bool:
-        """At a place where it is to stop, or past it."""
-        motion = self.motion
-        north, east = place[0] - motion.north, place[1] - motion.east
-        away = math.hypot(north, east)
-        behind = abs(wrap_pi(math.atan2(east, north) - motion.yaw)) > math.pi / 2
-        near = self.parameters["WP_RADIUS"] / 2.0
-        return away <= _ARRIVED_M or (behind and away <= near and motion.ground_speed_m_s > _STANDING_M_S)

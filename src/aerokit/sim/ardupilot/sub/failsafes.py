@@ -10,7 +10,7 @@ from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.failsafes import Failsafes
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
+    from aerokit.sim.ardupilot.sub.host import SubHost
 
 __all__ = ["SubArming", "SubFailsafes"]
 
@@ -27,7 +27,7 @@ class SubArming(Arming):
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
-    def __init__(self, sub: SimulatedSub) -> None:
+    def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
         self._sub = sub
 
@@ -65,7 +65,7 @@ class SubFailsafes(Failsafes):
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
 
-    def __init__(self, sub: SimulatedSub) -> None:
+    def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
         self._sub = sub
         self.pilot: bool = False
@@ -178,7 +178,7 @@ class _HullLimit:
         self._what, self._prefix = what, prefix
         self._good_at = self._warned_at = 0.0
 
-    def watch(self, sub: SimulatedSub, value: float) -> None:
+    def watch(self, sub: SubHost, value: float) -> None:
         """Look at the value of now."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return

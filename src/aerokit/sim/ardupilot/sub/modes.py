@@ -14,8 +14,8 @@ from aerokit.sim.motion import wrap_pi
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
+    from aerokit.sim.ardupilot.sub.host import SubHost
+    from aerokit.sim.local_frame import Ned
 
 __all__ = ["SUB_MODES", "SubAuto", "SubGuided"]
 
@@ -28,7 +28,7 @@ _THROTTLE, _YAW, _FORWARD, _LATERAL = 2, 3, 4, 5
 class _Mode(VehicleMode):
     """Every mode has its submarine."""
 
-    def __init__(self, sub: SimulatedSub) -> None:
+    def __init__(self, sub: SubHost) -> None:
         self.sub = sub
 
     def stick(self, index: int) -> float:
@@ -133,7 +133,7 @@ class SubAuto(LevelAuto):
     number: ClassVar[int] = SubMode.AUTO
     name = "AUTO"
 
-    vehicle: SimulatedSub
+    vehicle: SubHost
 
     def default_speed(self) -> float:
         """WPNAV_SPEED."""
@@ -163,7 +163,7 @@ class SubGuided(_Mode):
     name = "GUIDED"
     can_change_speed = True
 
-    def __init__(self, sub: SimulatedSub) -> None:
+    def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
         self.speed: float = 0.0
         self._place: Ned | None = None

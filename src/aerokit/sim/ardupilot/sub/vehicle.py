@@ -8,20 +8,20 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SpeedType, SubMode
-from aerokit.sim.ardupilot.level import LevelVehicle
-from aerokit.sim.ardupilot.outputs import Motors
+from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.radio import SubJoystick
+from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
 from aerokit.sim.ardupilot.sub.failsafes import SubArming, SubFailsafes
+from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.sub.modes import SUB_MODES, SubAuto, SubGuided
 from aerokit.sim.ardupilot.targets import SubTargets
-from aerokit.sim.ardupilot.telemetry import DISPLAY_VALUES
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.ground_motion import UnderwaterMotion
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.arming import Arming
     from aerokit.sim.ardupilot.failsafes import Failsafes
     from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.navigation import Ned
     from aerokit.sim.ardupilot.parameter_tables import Kind
     from aerokit.sim.commands import Command, CommandHandler
     from aerokit.sim.motion import Motion, Wind
@@ -32,14 +32,13 @@ _GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
 _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
 _HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
 _AMPERES_AT_FULL = 26.3
-_LOOK_AHEAD_M = 1.0
 _STICKS, _THROTTLE = 8, 2
 
 
 class _Motors(Motors):
     """The thrusters that hold the depth, or follow the stick; 0.5 is no thrust at all."""
 
-    def __init__(self, sub: SimulatedSub) -> None:
+    def __init__(self, sub: SubHost) -> None:
         super().__init__()
         self._sub = sub
 
@@ -59,7 +58,7 @@ class _Motors(Motors):
         self.throttle = max(0.0, min(1.0, wanted)) if self.is_armed else 0.0
 
 
-class SimulatedSub(LevelVehicle):
+class SimulatedSub(SubHost):
     """Speaks and behaves as ArduSub does where a client can see it; moves as `UnderwaterMotion` does.
 
     Its arguments are those of `ArduPilotVehicle`; ``home`` is at the surface, so altitudes above home are negative.
@@ -74,14 +73,10 @@ class SimulatedSub(LevelVehicle):
     FIRMWARE: ClassVar[str] = "ArduSub"
     MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
     CAPABILITIES: ClassVar[int] = 0xF9E7
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = SUB_MODES
     ARMING: ClassVar[type[Arming]] = SubArming
     FAILSAFES: ClassVar[type[Failsafes]] = SubFailsafes
-
-    motion: UnderwaterMotion  # pyright: ignore[reportIncompatibleVariableOverride]
-    hull_pressure_pa: float = 101_325.0
-    """What the sensors inside measure."""
-    hull_temperature_c: float = 28.0
 
     def make_motion(self, wind: Wind | None) -> UnderwaterMotion:
         """SIM_BUOYANCY 1 lifts it with 0.1 m/s; wind does not reach it."""
@@ -101,8 +96,7 @@ class SimulatedSub(LevelVehicle):
 
     def reset_controllers(self) -> None:
         """All sticks rest in the middle."""
-        self.display_names: cycle[str] = cycle(DISPLAY_VALUES)
-        """Which of `DISPLAY_VALUES` is told next."""
+        self.display_names = cycle(DISPLAY_VALUES)
         for index in range(_STICKS):
             self.rc[index] = 1500
 
@@ -143,16 +137,6 @@ class SimulatedSub(LevelVehicle):
         """Whether it floats."""
         return self.motion.is_still
 
-    @property
-    def is_at_surface(self) -> bool:
-        """Within SURFACE_DEPTH of the air."""
-        return self.motion.down <= max(0.0, -self.parameters["SURFACE_DEPTH"] / 100.0)
-
-    @property
-    def climb_speed(self) -> float:
-        """In m/s, of a full stick."""
-        return self.parameters["PILOT_SPEED_UP"] / 100.0
-
     def refusal(self, mode: VehicleMode, reason: str) -> str:
         """Why a mode is not entered."""
         if reason == "requires position":
@@ -167,28 +151,6 @@ class SimulatedSub(LevelVehicle):
             MavCmd.NAV_LOITER_UNLIM: lambda _: self.change_to(SubMode.POSHOLD),
             MavCmd.CONDITION_YAW: self._turn,
         }
-
-    def distance(self, place: Ned) -> float:
-        """Metres to a point."""
-        return math.dist(self._below(place), (self.motion.north, self.motion.east, self.motion.down))
-
-    def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
-        """Towards a point with this speed in m/s, up and down as WPNAV_SPEED_UP and …_DN allow."""
-        motion, parameters = self.motion, self.parameters
-        north, east, down = self._below(place)
-        up, dn = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
-        ahead = math.hypot(north - motion.north, east - motion.east)
-        if looks_ahead and ahead > _LOOK_AHEAD_M:
-            motion.face(math.atan2(east - motion.east, north - motion.north))
-        slope = abs(down - motion.down)
-        slower = speed * min(1.0, ahead / max(slope, 1e-3))
-        depth = speed * min(1.0, slope / max(ahead, 1e-3))
-        motion.seek_position(
-            north, east, down, speed=max(slower, 0.05), climb=min(up, depth), descent=min(dn, depth)
-        )
-
-    def _below(self, place: Ned) -> Ned:
-        return (place[0], place[1], max(place[2], self.motion.ground_down))
 
     def _change_speed_at_any_time(self, command: Command) -> int:
         """Also in modes that have no use for it."""

@@ -1,92 +1,18 @@
-"""What a simulated ArduPilot drives: its motors, servos, relays and switches."""
+"""Servos, relays and switches of a simulated ArduPilot that nothing else uses."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavResult, MavSeverity
 from aerokit.sim.commands import whole
-from aerokit.sim.motion import GRAVITY_M_S2, Motion
 
 if TYPE_CHECKING:
+    from aerokit.sim.ardupilot.host import Host
     from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
     from aerokit.sim.commands import Command
 
-__all__ = ["Accessories", "Motors"]
-
-
-_ARMING_DELAY_S = 2.0
-_SPOOL_UP_S = 1.3
-_SPOOL_DOWN_S = 1.1
-_HOVER_THROTTLE = 0.36
-_AMPERES_AT_FULL = 78.0
-_STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
-
-
-class Motors:
-    """``spool`` is 0 while the motors idle or stand, 1 when they can lift; ``wanted`` asks for that."""
-
-    def __init__(self) -> None:
-        self.is_armed: bool = False
-        self.armed_at: float = -math.inf
-        self.disarmed_at: float = -math.inf
-        self.may_turn: bool = False
-        """Whether the arming delay is over."""
-        self.wanted: bool = False
-        self.spool: float = 0.0
-        self.throttle: float = 0.0
-        """0 to 1, as VFR_HUD says it in percent."""
-
-    @property
-    def can_lift(self) -> bool:
-        """Whether the propellers turn fast enough to fly."""
-        return self.is_armed and self.spool >= 1.0
-
-    @property
-    def is_idle(self) -> bool:
-        """Whether they turn at their lowest speed, or not at all."""
-        return self.spool <= 0.0
-
-    @property
-    def current_a(self) -> float:
-        """What the battery gives to all of them and the electronics."""
-        return 0.08 * self.is_armed + self.throttle * _AMPERES_AT_FULL
-
-    @property
-    def pwm(self) -> int:
-        """What SERVO_OUTPUT_RAW shows for each; they begin to turn when the arming delay is over."""
-        if not (self.is_armed and self.may_turn):
-            return _STOPPED_PWM
-        return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
-
-    def set_armed(self, armed: bool, now: float) -> None:
-        """Arm or stop them."""
-        if self.is_armed and not armed:
-            self.disarmed_at = now
-        self.is_armed = armed
-        self.armed_at = now
-        self.may_turn = False
-        self.spool = self.throttle = 0.0
-        self.wanted = False
-
-    def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
-        """Follow what is wanted."""
-        self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
-        if self.may_turn and self.wanted:
-            if self.spool < 1.0:
-                self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
-        else:
-            self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
-        if landed or not self.is_armed:
-            self.throttle = 0.05 * self.spool
-            return
-        lean = math.cos(motion.roll) * math.cos(motion.pitch)
-        lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
-        throttle = _HOVER_THROTTLE * lift / (lean if lean > 0.5 else 0.5)
-        self.throttle = 0.0 if throttle < 0.0 else throttle if throttle < 1.0 else 1.0
-
+__all__ = ["Accessories"]
 
 _SERVOS = 32
 _RELAYS = {"rover": 2}
@@ -106,7 +32,7 @@ _AUX_POSITIONS = (0.0, 1.0, 2.0)
 class Accessories:
     """What DO_SET_SERVO, DO_SET_RELAY and DO_AUX_FUNCTION set; a reboot forgets it."""
 
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+    def __init__(self, vehicle: Host) -> None:
         self._vehicle = vehicle
         self.servos: dict[int, int] = {}
         """Output, from 1 on → its pulse in microseconds."""

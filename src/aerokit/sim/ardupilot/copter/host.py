@@ -1,4 +1,4 @@
-"""Where an ArduCopter points its nose while it flies by itself."""
+"""What the parts of a simulated ArduCopter use of it beside what every ArduPilot has: its heading and its way back."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.sim.ardupilot.smart_path import SmartPath
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.motion import wrap_pi
 
 if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
-    from aerokit.sim.ardupilot.navigation import Ned
+    from aerokit.sim.local_frame import Ned
 
-__all__ = ["AutoYaw"]
+__all__ = ["AutoYaw", "CopterHost"]
 
 _LOOK_AHEAD_FROM_M_S = 0.5
 
@@ -20,7 +21,7 @@ _LOOK_AHEAD_FROM_M_S = 0.5
 class AutoYaw:
     """One of: hold the heading, look ahead, a fixed heading, a turn rate, a region of interest."""
 
-    def __init__(self, copter: SimulatedCopter) -> None:
+    def __init__(self, copter: ArduPilotVehicle) -> None:
         self._copter = copter
         self._apply: Callable[[], None] = self._hold
         self._roi: tuple[float, float] | None = None
@@ -109,3 +110,20 @@ class AutoYaw:
         assert self._roi is not None
         motion = self._copter.motion
         motion.face(math.atan2(self._roi[1] - motion.east, self._roi[0] - motion.north))
+
+
+class CopterHost(ArduPilotVehicle):
+    """A copter, as its modes and failsafes see it."""
+
+    def reset_controllers(self) -> None:
+        """Where it points its nose, and the way back of SMART_RTL."""
+        self.yaw: AutoYaw = AutoYaw(self)
+        self.path: SmartPath = SmartPath(self, only_armed=True)
+
+    def _become_ready(self) -> None:
+        super()._become_ready()
+        self.path.start()
+
+    def look_at(self, place: Ned | None) -> None:
+        """See `AutoYaw.region_of_interest`."""
+        self.yaw.region_of_interest(place)

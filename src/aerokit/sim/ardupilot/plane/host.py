@@ -1,15 +1,18 @@
-"""How a simulated ArduPlane lands: to the start of its approach, down the slope, flare, roll-out, disarming."""
+"""What the parts of a simulated ArduPlane use of it beside what every ArduPilot has, and how it lands."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.navigation import Ned
-    from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.fixed_wing import FixedWing
+from aerokit.sim.motion import Motion, Wind
 
-__all__ = ["Landing"]
+if TYPE_CHECKING:
+    from aerokit.sim.local_frame import Ned
+
+__all__ = ["Landing", "PlaneHost"]
 
 _FLARE_SINK_M_S = 0.5
 _APPROACH_SHARE = 0.85
@@ -18,10 +21,55 @@ _LINED_UP_RAD = math.radians(25.0)
 _LOOK_AHEAD_M = 80.0
 
 
-class Landing:
-    """Comes down on ``point``; with ``start`` it flies there first, to come in from there."""
+class PlaneHost(ArduPilotVehicle):
+    """An aeroplane, as its modes and failsafes see it."""
 
-    def __init__(self, plane: SimulatedPlane, point: Ned, start: Ned | None = None) -> None:
+    def make_motion(self, wind: Wind | None) -> Motion:
+        """An aeroplane within the limits of the parameters."""
+        self.wing: FixedWing = FixedWing(self.rng, wind=wind)
+        """What flies; the same as ``motion``."""
+        self._read_limits()
+        return self.wing
+
+    def _read_limits(self) -> None:
+        limits, parameters = self.wing.wing, self.parameters
+        limits.airspeed_min_m_s = parameters["AIRSPEED_MIN"]
+        limits.airspeed_max_m_s = parameters["AIRSPEED_MAX"]
+        limits.climb_m_s = parameters["TECS_CLMB_MAX"]
+        limits.sink_m_s = parameters["TECS_SINK_MAX"]
+        limits.glide_sink_m_s = parameters["TECS_SINK_MIN"]
+        limits.bank_rad = math.radians(parameters["ROLL_LIMIT_DEG"])
+
+    def reset_controllers(self) -> None:
+        """Forget the take-off."""
+        self.take_off_yaw: float | None = None
+        """Where it has taken off to, in radians; None before."""
+        self._rests_since = math.nan
+
+    @property
+    def cruise_m_s(self) -> float:
+        """AIRSPEED_CRUISE."""
+        return self.parameters["AIRSPEED_CRUISE"]
+
+    def can_fly_at(self, airspeed: float) -> bool:
+        """Whether an airspeed in m/s is between AIRSPEED_MIN and AIRSPEED_MAX."""
+        return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
+
+    def lift_off(self) -> None:
+        """The engine runs: from now on it moves, on the ground at first."""
+        if self.is_landed:
+            self._read_limits()
+            self.is_landed, self._rests_since = False, math.nan
+            self.take_off_yaw = self.wing.yaw
+
+
+class Landing:
+    """To the start of the approach, down the slope, flare, roll-out, disarming.
+
+    Comes down on ``point``; with ``start`` it flies there first, to come in from there.
+    """
+
+    def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
         self._plane = plane
         self.point: Ned = point
         self._start = start
