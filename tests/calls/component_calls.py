@@ -16,7 +16,7 @@ from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import MavCmd
 from aerokit.parameters import parse_definition
 from aerokit.sim import SimulatedCamera
-from aerokit.sim.components.camera_commands import DEFINITION_PATH, own_definition
+from aerokit.sim.components.camera_body import DEFINITION_PATH, own_definition
 from aerokit.vehicle.components.component import Component
 from aerokit.whole_file import LARGEST_FILE
 

@@ -13,7 +13,7 @@ import pytest
 
 from aerokit.errors import FileFormatError, FileTimeout, OperationRejected
 from aerokit.parameters import parse_definition
-from aerokit.sim.components.camera_commands import own_definition
+from aerokit.sim.components.camera_body import own_definition
 from aerokit.vehicle.components.remote_file import fetch
 from aerokit.whole_file import LARGEST_FILE
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from aerokit.errors import AerokitError, InvalidArgument
-from aerokit.sim.track import metres_from
+from aerokit.sim.track_points import Failure, TrackPoint, metres_from
 from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from aerokit.position import Position
-    from aerokit.sim.track import Track, TrackPoint
 
 __all__ = ["check_picture", "draw_svg", "save_picture"]
 
@@ -33,6 +32,26 @@ _LABEL_HEIGHT, _LABEL_WIDTH, _MOST_LABELS = 13, 60, 40
 _CORNERS = 90  # of a circle
 
 
+class Drawable(Protocol):
+    """A track, as far as it is drawn."""
+
+    home: Position
+    name: str
+    failure: Failure | None
+
+    def __iter__(self) -> Iterator[TrackPoint]: ...
+
+    def __len__(self) -> int: ...
+
+    def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
+        """Metres north and east of a place, of home without one, and up from its own home."""
+        ...
+
+    def as_it_is(self) -> Drawable:
+        """A copy that does not grow."""
+        ...
+
+
 def check_picture(path: str | PathLike[str]) -> None:
     """InvalidArgument when this is no name of a picture; AerokitError when what draws it is not installed."""
     suffix = Path(path).suffix.lower()
@@ -42,7 +61,7 @@ def check_picture(path: str | PathLike[str]) -> None:
         _pillow("Image")
 
 
-def save_picture(tracks: Iterable[Track], path: str | PathLike[str]) -> None:
+def save_picture(tracks: Iterable[Drawable], path: str | PathLike[str]) -> None:
     """Draw tracks from above, and their heights over time: an .svg file, or a .png one (with Pillow).
 
     Raises what `check_picture` raises, and OSError when the file cannot be written.
@@ -55,7 +74,7 @@ def save_picture(tracks: Iterable[Track], path: str | PathLike[str]) -> None:
         _save_png(_shapes(tracks), path)
 
 
-def draw_svg(tracks: Sequence[Track]) -> str:
+def draw_svg(tracks: Sequence[Drawable]) -> str:
     """The picture as the text of an SVG file: north is up, metres from the first vehicle's home."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{_HEIGHT}"'
@@ -131,7 +150,7 @@ class _Text:
 _Shape = _Line | _GridLine | _Dot | _Text
 
 
-def _shapes(tracks: Sequence[Track]) -> list[_Shape]:
+def _shapes(tracks: Sequence[Drawable]) -> list[_Shape]:
     drawn = [track.as_it_is() for track in tracks if track]
     return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
 
@@ -168,7 +187,7 @@ class _Axes:
         return shapes
 
 
-def _map(tracks: Sequence[Track]) -> list[_Shape]:
+def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
     paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
     outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
     easts, norths = zip(*(place for path in paths + outlines for place in path), strict=True)
@@ -184,7 +203,7 @@ def _map(tracks: Sequence[Track]) -> list[_Shape]:
     return shapes
 
 
-def _outlines(track: Track, origin: Position) -> list[list[tuple[float, float]]]:
+def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float]]]:
     """The circle or polygon of the assertion that failed: metres east and north."""
     failure = track.failure
     if failure is None:
@@ -202,7 +221,7 @@ def _outlines(track: Track, origin: Position) -> list[list[tuple[float, float]]]
     return found
 
 
-def _failed_point(track: Track, places: Sequence[tuple[float, float]]) -> list[_Shape]:
+def _failed_point(track: Drawable, places: Sequence[tuple[float, float]]) -> list[_Shape]:
     """A cross where the assertion failed."""
     if track.failure is None:
         return []
@@ -214,7 +233,7 @@ def _failed_point(track: Track, places: Sequence[tuple[float, float]]) -> list[_
     return [*strokes, _Text(x, y + 22, "failed here", "middle", _FAILED)]
 
 
-def _index_of(track: Track, point: TrackPoint) -> int:
+def _index_of(track: Drawable, point: TrackPoint) -> int:
     distances = [abs(each.time_s - point.time_s) for each in track]
     return distances.index(min(distances))
 
@@ -226,7 +245,7 @@ class _Labels:
         self._places: list[tuple[float, float]] = []
 
     def modes(
-        self, track: Track, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8
+        self, track: Drawable, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8
     ) -> list[_Shape]:
         """Dots and names at the places where another mode begins."""
         shapes: list[_Shape] = []
@@ -247,7 +266,7 @@ class _Labels:
         return all(abs(x - a) > _LABEL_WIDTH or abs(y - b) >= _LABEL_HEIGHT for a, b in self._places)
 
 
-def _profile(tracks: Sequence[Track]) -> list[_Shape]:
+def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((each for each in limits if each is not None), None)
@@ -272,7 +291,7 @@ def _profile(tracks: Sequence[Track]) -> list[_Shape]:
     return shapes
 
 
-def _legend(tracks: Sequence[Track]) -> list[_Shape]:
+def _legend(tracks: Sequence[Drawable]) -> list[_Shape]:
     named = list(zip(tracks, _colours(len(tracks)), strict=True))[:_MOST_NAMES]
     return [
         _Text(_MARGIN + 90 * number, 18, track.name, "start", colour)

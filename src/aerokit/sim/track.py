@@ -17,66 +17,26 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast, overload
 
-from aerokit import geo
 from aerokit.autopilots import autopilot_for
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.position import Position
 from aerokit.sim.ardupilot.fence import PolygonZone
 from aerokit.sim.local_frame import true_place
+from aerokit.sim.picture import save_picture
+from aerokit.sim.track_points import Failure, TrackPoint, metres_from
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["Failure", "Track", "TrackPoint", "least_distance_m", "metres_from", "record_track", "true_point"]
+__all__ = ["Failure", "Track", "TrackPoint", "least_distance_m", "record_track", "true_point"]
 
 _ON_GROUND_M = 0.3
-
-
-@dataclass(frozen=True)
-class TrackPoint:
-    """Where the vehicle was at one instant, whatever its estimator thought."""
-
-    time_s: float
-    """Simulated seconds."""
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-    """Above home."""
-    armed: bool
-    mode: str
-    """Its name, as a client has it."""
-    speed_m_s: float = 0.0
-    """Over the ground."""
-    battery_percent: float = 100.0
-
-    @property
-    def position(self) -> Position:
-        """The place, for `Position.distance_to` and the like."""
-        return Position(self.latitude_deg, self.longitude_deg, altitude_relative_m=self.altitude_m)
-
-    def __str__(self) -> str:
-        place = f"{self.latitude_deg:.6f}, {self.longitude_deg:.6f}"
-        armed = "armed" if self.armed else "disarmed"
-        return f"at {self.time_s:.1f} s: {place}, {self.altitude_m:.1f} m above home, {armed}, {self.mode}"
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Where an assertion about a track failed, and the limit that it was about; the picture of the track shows it."""
-
-    point: TrackPoint
-    circle: tuple[Position, float] | None = None
-    """Centre, and radius in metres."""
-    polygon: Sequence[Position] | None = None
-    altitude_m: float | None = None
-    """Above home."""
 
 
 class Track(Sequence[TrackPoint]):
@@ -173,7 +133,7 @@ class Track(Sequence[TrackPoint]):
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
         """Metres north and east of a place, of home without one, and up from its own home."""
-        plane = _plane(self.home if origin is None else origin)
+        plane = metres_from(self.home if origin is None else origin)
         return [(*plane(point), point.altitude_m) for point in self]
 
     def as_it_is(self) -> Track:
@@ -184,8 +144,6 @@ class Track(Sequence[TrackPoint]):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Draw it: an .svg file, or a .png one; see `aerokit.sim.picture.save_picture`."""
-        from aerokit.sim.picture import save_picture
-
         save_picture([self], path)
 
     def nearest_m(self, place: Position) -> float:
@@ -234,7 +192,7 @@ class Track(Sequence[TrackPoint]):
         __tracebackhide__ = True
         assert len(polygon) >= 3, f"a polygon has three places or more, not {len(polygon)}"
         _ = self.end
-        plane = _plane(self.home)
+        plane = metres_from(self.home)
         border = PolygonZone([plane(corner) for corner in polygon])
         outside = [point for point in self if border.outside_m(plane(point)) > 0]
         self._note(not outside, Failure(outside[0] if outside else self.end, polygon=polygon))
@@ -304,13 +262,13 @@ class Track(Sequence[TrackPoint]):
 
     def _farthest(self, centre: Position) -> tuple[float, TrackPoint]:
         _ = self.end
-        plane = _plane(centre)
+        plane = metres_from(centre)
         point = max(self, key=lambda point: math.hypot(*plane(point)))
         return math.hypot(*plane(point)), point
 
     def _nearest(self, place: Position) -> tuple[float, TrackPoint]:
         _ = self.end
-        plane, altitude = _plane(place), place.altitude_relative_m
+        plane, altitude = metres_from(place), place.altitude_relative_m
         nearest, point, before = math.inf, self._points[0], None
         for candidate in self:
             up = 0.0 if altitude is None else candidate.altitude_m - altitude
@@ -320,11 +278,6 @@ class Track(Sequence[TrackPoint]):
                 nearest, point = distance, candidate
             before = here
         return nearest, point
-
-
-def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
-    """What gives metres north and east of a place."""
-    return _plane(origin)
 
 
 def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
@@ -406,19 +359,6 @@ def _text(place: Position) -> str:
     above = place.altitude_relative_m
     height = "" if above is None else f" at {above:.1f} m above home"
     return f"{place.latitude_deg:.6f}, {place.longitude_deg:.6f}{height}"
-
-
-def _plane(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
-    """Metres north and east of a place, on a plane that touches the ellipsoid there."""
-    latitude, longitude = origin.latitude_deg, origin.longitude_deg
-    per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
-    per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100
-
-    def place(point: Position | TrackPoint) -> tuple[float, float]:
-        north = (point.latitude_deg - latitude) * per_latitude
-        return north, geo.wrap_longitude(point.longitude_deg - longitude) * per_longitude
-
-    return place
 
 
 def _distance_of_origin(start: tuple[float, float, float], end: tuple[float, float, float]) -> float:

@@ -305,6 +305,12 @@ class SimulatedVehicle:
             if not self._is_lost(message):
                 port.write(data)
 
+    def send_built(self, message_id: int, channel: Channel | None = None) -> None:
+        """Send what would be streamed now, if there is such a message."""
+        message = self.build(message_id)
+        if message is not None:
+            self.send(message, channel)
+
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT on every channel; a text of more than 50 characters goes out in chunks."""
         text = text.encode("ascii", "replace").decode()

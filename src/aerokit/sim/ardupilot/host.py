@@ -179,10 +179,8 @@ class Host(SimulatedAutopilot):
 
     def send_home(self, channel: Channel | None = None) -> None:
         """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""
-        for message_id in (m.GpsGlobalOrigin.ID, m.HomePosition.ID):
-            message = self.build(message_id)
-            if message is not None:
-                self.send(message, channel)
+        self.send_built(m.GpsGlobalOrigin.ID, channel)
+        self.send_built(m.HomePosition.ID, channel)
 
     def send_banner(self) -> None:
         """Firmware, hash and frame as texts."""

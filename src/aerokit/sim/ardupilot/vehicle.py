@@ -339,13 +339,8 @@ class ArduPilotVehicle(Host):
         self.mode.leave()
         self.mode = mode
         self.fence.mode_changed()
-        self.call_later(0.0, self._send_heartbeat)
+        self.call_later(0.0, lambda: self.send_built(m.Heartbeat.ID))
         return True
-
-    def _send_heartbeat(self) -> None:
-        heartbeat = self.build(m.Heartbeat.ID)
-        assert heartbeat is not None
-        self.send(heartbeat)
 
     def set_mode_from(self, base_mode: int, custom_mode: int) -> int:
         """DO_SET_MODE and SET_MODE: only custom modes; the MAV_RESULT. SET_MODE does not tell it."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
@@ -16,27 +15,20 @@ from aerokit.sim.components.extended_parameters import ExtendedParameters
 if TYPE_CHECKING:
     from aerokit.parameters import SettingValue
     from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.components.camera import SimulatedCamera
+    from aerokit.sim.components.camera_body import CameraBody
 
-__all__ = ["DEFINITION_PATH", "CameraParameters", "camera_commands", "own_definition"]
+__all__ = ["CameraParameters", "camera_commands"]
 
 
-DEFINITION_PATH = "/camera_definition.xml"
-"""Where the camera serves its definition by MAVFTP."""
 MODE, EXPOSURE, ISO, SHUTTER = "CAM_MODE", "CAM_EXPMODE", "CAM_ISO", "CAM_SHUTTER"
 AUTO, AUTO_ISO, AUTO_SHUTTER_S = 0, 200, 0.002
 MOST_IN_VIDEO = 400
 
 
-def own_definition() -> bytes:
-    """The file of cameras that were given no other."""
-    return Path(__file__).with_name("camera_definition.xml").read_bytes()
-
-
 class CameraParameters(ExtendedParameters):
     """Set while a picture is taken or a video recorded, the mode is FAILED."""
 
-    def __init__(self, camera: SimulatedCamera) -> None:
+    def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
         super().__init__(camera, camera.definition)
 
@@ -68,7 +60,7 @@ _CAN_ALWAYS_CAPTURE = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE
 _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 
 
-def camera_commands(camera: SimulatedCamera) -> dict[int, CommandHandler]:
+def camera_commands(camera: CameraBody) -> dict[int, CommandHandler]:
     """MAV_CMD → handler, those of before REQUEST_MESSAGE too."""
     pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
     return {
@@ -92,7 +84,7 @@ def camera_commands(camera: SimulatedCamera) -> dict[int, CommandHandler]:
     }
 
 
-def _requests_of_old(camera: SimulatedCamera) -> dict[int, CommandHandler]:
+def _requests_of_old(camera: CameraBody) -> dict[int, CommandHandler]:
     wanted: dict[int, int] = {
         MavCmd.REQUEST_CAMERA_INFORMATION: m.CameraInformation.ID,
         MavCmd.REQUEST_CAMERA_SETTINGS: m.CameraSettings.ID,
@@ -112,7 +104,7 @@ def _requests_of_old(camera: SimulatedCamera) -> dict[int, CommandHandler]:
 class _Pictures:
     """Single ones, series, and the card."""
 
-    def __init__(self, camera: SimulatedCamera) -> None:
+    def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
         self._last_number = 0
 
@@ -169,7 +161,7 @@ class _Pictures:
 class _Videos:
     """Recorded and streamed ones."""
 
-    def __init__(self, camera: SimulatedCamera) -> None:
+    def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
 
     def start(self, command: Command) -> int:
@@ -207,7 +199,7 @@ class _Videos:
 class _Settings:
     """Mode, zoom, focus; each change is told by CAMERA_SETTINGS."""
 
-    def __init__(self, camera: SimulatedCamera) -> None:
+    def __init__(self, camera: CameraBody) -> None:
         self._camera = camera
 
     def set_mode(self, command: Command) -> int:
@@ -264,5 +256,5 @@ class _Settings:
         return MavResult.ACCEPTED
 
 
-def _has_wrong_mode(camera: SimulatedCamera, wrong: int, unless: int) -> bool:
+def _has_wrong_mode(camera: CameraBody, wrong: int, unless: int) -> bool:
     return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong and not camera.can(unless)

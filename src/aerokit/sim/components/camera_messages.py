@@ -12,7 +12,7 @@ from aerokit.sim.components.lens import FOCAL_LENGTH_MM
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command
-    from aerokit.sim.components.camera import SimulatedCamera
+    from aerokit.sim.components.camera_body import CameraBody
     from aerokit.sim.components.component import Builder
 
 __all__ = ["camera_builders", "camera_settings"]
@@ -23,7 +23,7 @@ _STREAM_HZ, _STREAM_SIZE, _STREAM_BITS_S = 30.0, (1920, 1080), 4_000_000
 _TO_THE_END = -1
 
 
-def camera_builders(camera: SimulatedCamera) -> dict[int, Builder]:
+def camera_builders(camera: CameraBody) -> dict[int, Builder]:
     """Message id → what to send. Param 2 of REQUEST_MESSAGE picks a card, a stream or the first picture."""
     return {
         m.CameraInformation.ID: lambda _: [_information(camera)],
@@ -39,7 +39,7 @@ def camera_builders(camera: SimulatedCamera) -> dict[int, Builder]:
     }
 
 
-def camera_settings(camera: SimulatedCamera) -> m.CameraSettings:
+def camera_settings(camera: CameraBody) -> m.CameraSettings:
     """CAMERA_SETTINGS; zoom and focus are NaN when it has none."""
     return m.CameraSettings(
         time_boot_ms=camera.time_boot_ms,
@@ -54,7 +54,7 @@ def _number(command: Command | None) -> int:
     return 0 if command is None else whole(command.param2)
 
 
-def _information(camera: SimulatedCamera) -> m.CameraInformation:
+def _information(camera: CameraBody) -> m.CameraInformation:
     return m.CameraInformation(
         time_boot_ms=camera.time_boot_ms,
         vendor_name=camera.vendor.encode()[:32].ljust(32, b"\0"),
@@ -73,7 +73,7 @@ def _information(camera: SimulatedCamera) -> m.CameraInformation:
     )
 
 
-def _images(camera: SimulatedCamera, command: Command | None) -> list[m.CameraImageCaptured]:
+def _images(camera: CameraBody, command: Command | None) -> list[m.CameraImageCaptured]:
     """Param 2 is the first index, -1 for all; param 3 the last one, 0 for only that, -1 for all that follow."""
     images = camera.captures.images
     if command is None:
@@ -86,7 +86,7 @@ def _images(camera: SimulatedCamera, command: Command | None) -> list[m.CameraIm
     return images[first : max(first, last) + 1]
 
 
-def _streams(camera: SimulatedCamera, number: int) -> list[m.VideoStreamInformation]:
+def _streams(camera: CameraBody, number: int) -> list[m.VideoStreamInformation]:
     return [
         m.VideoStreamInformation(
             stream_id=stream,
@@ -108,7 +108,7 @@ def _streams(camera: SimulatedCamera, number: int) -> list[m.VideoStreamInformat
     ]
 
 
-def _stream_status(camera: SimulatedCamera, number: int) -> list[m.VideoStreamStatus]:
+def _stream_status(camera: CameraBody, number: int) -> list[m.VideoStreamStatus]:
     return [
         m.VideoStreamStatus(
             stream_id=stream,
@@ -125,14 +125,14 @@ def _stream_status(camera: SimulatedCamera, number: int) -> list[m.VideoStreamSt
     ]
 
 
-def _flags(camera: SimulatedCamera, stream: int) -> int:
+def _flags(camera: CameraBody, stream: int) -> int:
     flags: int = VideoStreamStatusFlags.RUNNING if stream in camera.running_streams else 0
     if camera.thermal_celsius and stream == len(camera.streams):
         flags |= VideoStreamStatusFlags.THERMAL | VideoStreamStatusFlags.THERMAL_RANGE_ENABLED
     return flags
 
 
-def _thermal_range(camera: SimulatedCamera) -> list[m.CameraThermalRange]:
+def _thermal_range(camera: CameraBody) -> list[m.CameraThermalRange]:
     """Cold at the upper left, hot at the lower right."""
     if camera.thermal_celsius is None:
         return []

@@ -5,18 +5,13 @@ from __future__ import annotations
 import base64
 import math
 from functools import partial
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import StorageStatus, StorageType, StorageUsageFlag
 from aerokit.mavlink.messages import CameraCaptureStatus, CameraImageCaptured, StorageInformation
-from aerokit.sim.components.component import pose_of
+from aerokit.sim.components.component import SimulatedComponent, pose_of
 from aerokit.sim.motion import quaternion_from_euler
 
-if TYPE_CHECKING:
-    from aerokit.sim.components.camera import SimulatedCamera
-    from aerokit.sim.components.component import SimulatedComponent
-
-__all__ = ["GREY_JPEG", "Captures", "MemoryCard"]
+__all__ = ["GREY_JPEG", "CameraHost", "Captures", "MemoryCard"]
 
 
 GREY_JPEG = base64.b85decode(
@@ -76,6 +71,28 @@ class MemoryCard:
         ]
 
 
+class CameraHost(SimulatedComponent):
+    """A camera, as its captures and its tracking see it."""
+
+    capabilities: int
+    card: MemoryCard
+    image_mib: float
+    video_mib_s: float
+    shutter_s: float
+
+    def can(self, *flags: int) -> bool:
+        """Whether it has one of these CAMERA_CAP_FLAGS."""
+        return any(self.capabilities & flag for flag in flags)
+
+    def angles(self) -> tuple[float, float, float] | None:
+        """Roll, pitch and yaw in radians of what it looks at, yaw from north; None when nobody knows."""
+        raise NotImplementedError
+
+    def keep(self, image: CameraImageCaptured) -> str:
+        """Write the file of a picture; its URL."""
+        raise NotImplementedError
+
+
 _IDLE, _CAPTURING, _WAITING, _WAITING_AND_CAPTURING = 0, 1, 2, 3
 _FOR_EVER = -1
 _NOWHERE = (math.nan, math.nan, math.nan, math.nan)
@@ -84,7 +101,7 @@ _NOWHERE = (math.nan, math.nan, math.nan, math.nan)
 class Captures:
     """The shutter opens at once and the picture is there ``shutter_s`` later, told by CAMERA_IMAGE_CAPTURED."""
 
-    def __init__(self, camera: SimulatedCamera) -> None:
+    def __init__(self, camera: CameraHost) -> None:
         self._camera = camera
         self.images: list[CameraImageCaptured] = []
         """One for each picture since the log of pictures was last cleared; their indices count from 0."""

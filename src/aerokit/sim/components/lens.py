@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.sim.commands import Command
-    from aerokit.sim.components.camera import SimulatedCamera
+    from aerokit.sim.components.captures import CameraHost
 
 __all__ = ["FOCAL_LENGTH_MM", "Axis", "Lens", "Tracking"]
 
@@ -108,7 +108,7 @@ _NOT_KNOWN, _ACCURACY_M = math.nan, 1.0
 class Tracking:
     """A point or a rectangle; ``lose()`` has it lost."""
 
-    def __init__(self, camera: SimulatedCamera) -> None:
+    def __init__(self, camera: CameraHost) -> None:
         self._camera = camera
         self.reset()
 

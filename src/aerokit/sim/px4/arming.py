@@ -24,7 +24,7 @@ from aerokit.sim.px4.modes import (
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Arming", "Calibration"]
 
@@ -50,7 +50,7 @@ _SIDE_STEP_S = 0.8
 class Calibration:
     """One at a time, on the ground."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._sensor = ""
         self._number = 0
@@ -127,8 +127,8 @@ _LEFT_AFTER_DISARMING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
 class Arming:
     """Checks, texts, and the log that begins with every arming."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
-        self._px4 = px4
+    def __init__(self, px4: Px4Host, calibration: Calibration) -> None:
+        self._px4, self._calibration = px4, calibration
         self.since: float = -math.inf
         """When it was armed the last time."""
         self.is_terminated: bool = False
@@ -174,7 +174,7 @@ class Arming:
             return True
         if not px4.is_ready and not px4.faults.prearm_failures:
             return False  # without a text, as seen
-        if px4.calibration.is_running:
+        if self._calibration.is_running:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: calibrating")
             return False
         if not self.is_possible:

@@ -13,7 +13,7 @@ from aerokit.sim.motion import quaternion_from_euler
 
 if TYPE_CHECKING:
     from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["CameraTrigger"]
 
@@ -30,7 +30,7 @@ class CameraTrigger:
 
     sequence: int
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.sequence = 0
         """The number of the next picture."""

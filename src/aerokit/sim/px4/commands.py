@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.commands import Command, CommandHandler, Progress, whole
-from aerokit.sim.px4.gimbal import gimbal_commands
-from aerokit.sim.px4.link_rates import message_requests
+from aerokit.sim.px4.gimbal_commands import gimbal_commands
 from aerokit.sim.px4.modes import (
     AUTO,
     HOLD,
@@ -25,9 +25,10 @@ from aerokit.sim.px4.modes import (
     TAKEOFF,
     Px4Mode,
 )
+from aerokit.sim.px4.telemetry import available_modes
 
 if TYPE_CHECKING:
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.base import Px4Vehicle
 
 __all__ = ["other_commands", "px4_commands", "refusal_by_place", "set_mode"]
 
@@ -84,7 +85,7 @@ _STORAGE_ACTIONS = range(5)
 _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
 
 
-def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
+def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     """MAV_CMD → handler."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_SILENT, lambda _: None)
@@ -100,7 +101,7 @@ def other_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
     return handlers
 
 
-def _with_text(px4: SimulatedPx4) -> Callable[[Command], int]:
+def _with_text(px4: Px4Vehicle) -> Callable[[Command], int]:
     def fail(_: Command) -> int:
         px4.send_text(MavSeverity.CRITICAL, "Control high latency failed! Telemetry unavailable")
         return MavResult.FAILED
@@ -108,7 +109,7 @@ def _with_text(px4: SimulatedPx4) -> Callable[[Command], int]:
     return fail
 
 
-def _calibrate_by_yaw(px4: SimulatedPx4, command: Command) -> int:
+def _calibrate_by_yaw(px4: Px4Vehicle, command: Command) -> int:
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     px4.info(f"Assuming vehicle is facing heading {command.param1:.1f} degrees")
@@ -116,7 +117,7 @@ def _calibrate_by_yaw(px4: SimulatedPx4, command: Command) -> int:
     return MavResult.ACCEPTED
 
 
-def _test_actuator(px4: SimulatedPx4, command: Command) -> int | None:
+def _test_actuator(px4: Px4Vehicle, command: Command) -> int | None:
     """Nothing is seen of it; param 5 is a motor, a servo, or from 1000 on any function of an output."""
     if px4.is_armed:
         return MavResult.DENIED
@@ -125,14 +126,14 @@ def _test_actuator(px4: SimulatedPx4, command: Command) -> int | None:
     return MavResult.ACCEPTED if is_known else None
 
 
-def _store(px4: SimulatedPx4, command: Command) -> int | None:
+def _store(px4: Px4Vehicle, command: Command) -> int | None:
     """Nothing is seen of it; an action that it does not know is not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
 
 
-def _answer_twice(px4: SimulatedPx4, command: Command) -> int:
+def _answer_twice(px4: Px4Vehicle, command: Command) -> int:
     """The estimator takes it, the commander does not know it."""
     px4.commands.answer(command, MavResult.ACCEPTED)
     return MavResult.UNSUPPORTED
@@ -144,7 +145,7 @@ _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 _AUTOTUNE_PERCENTS = (0, 20, 40, 60, 80, 95)
 
 
-def px4_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
+def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     """MAV_CMD → handler."""
     flight = _Flight(px4)
     return {
@@ -184,7 +185,7 @@ def refusal_by_place(command: Command, *, checks_frame: bool) -> int | None:
     return MavResult.COMMAND_UNSUPPORTED_MAV_FRAME if is_wrong else None
 
 
-def set_mode(px4: SimulatedPx4, base_mode: int, mode: Px4Mode) -> int:
+def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
     """What DO_SET_MODE and SET_MODE do."""
     if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
         px4.send_text(MavSeverity.CRITICAL, "Unsupported base mode")
@@ -193,11 +194,11 @@ def set_mode(px4: SimulatedPx4, base_mode: int, mode: Px4Mode) -> int:
     if mode not in SELECTABLE:
         what = "auto" if mode[0] == AUTO else "main"
         px4.send_text(MavSeverity.CRITICAL, f"Unsupported {what} mode")
-        return MavResult.ACCEPTED if px4.accepts_unknown_modes else MavResult.TEMPORARILY_REJECTED
+        return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
     return _change(px4, mode)
 
 
-def _change(px4: SimulatedPx4, mode: Px4Mode) -> int:
+def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
     if px4.change_mode(mode):
         return MavResult.ACCEPTED
     px4.send_text(MavSeverity.CRITICAL, f"Switching to {KNOWN[mode].name} is currently not available")
@@ -205,7 +206,7 @@ def _change(px4: SimulatedPx4, mode: Px4Mode) -> int:
 
 
 class _Flight:
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
 
     def arm_or_disarm(self, command: Command) -> int | None:
@@ -361,3 +362,73 @@ class _Flight:
             return MavResult.DENIED
         self._px4.call_later(0.2, self._px4.restart)
         return MavResult.ACCEPTED
+
+
+_NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, m.CurrentEventSequence.ID})
+_NOTHING_BUT_AN_ANSWER = frozenset({m.Heartbeat.ID})
+
+
+def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
+    """MAV_CMD → handler."""
+    requests = _Requests(px4)
+    handlers: dict[int, CommandHandler] = {
+        MavCmd.REQUEST_MESSAGE: requests.request_message,
+        MavCmd.SET_MESSAGE_INTERVAL: requests.set_interval,
+        MavCmd.GET_MESSAGE_INTERVAL: requests.get_interval,
+    }
+    for command, message_id in _ELDER.items():
+        handlers[command] = lambda each, message_id=message_id: requests.send_now(message_id, each)  # type: ignore[misc]
+    return handlers
+
+
+_ELDER = {
+    MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
+    MavCmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
+    MavCmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
+    MavCmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
+    MavCmd.GET_HOME_POSITION: m.HomePosition.ID,
+}
+"""Commands that ask for one message each."""
+
+
+class _Requests:
+    def __init__(self, px4: Px4Vehicle) -> None:
+        self._px4 = px4
+
+    def send_now(self, message_id: int, command: Command) -> int:
+        """The message goes out before its acknowledgement; DENIED when there is none."""
+        message = None if message_id in _NOT_ON_REQUEST else self._px4.build(message_id)
+        self._px4.rates.requested(command.channel, message_id)
+        if message is None:
+            return MavResult.DENIED
+        if message_id not in _NOTHING_BUT_AN_ANSWER:
+            self._px4.send(message, command.channel)
+        return MavResult.ACCEPTED
+
+    def request_message(self, command: Command) -> int:
+        message_id = _number(command.param1)
+        if message_id == m.MessageInterval.ID:
+            return self._send_interval(_number(command.param2), command)
+        if message_id != m.AvailableModes.ID:
+            return self.send_now(message_id, command)
+        modes, index = available_modes(self._px4), _number(command.param2)
+        for message in modes if index == 0 else modes[index - 1 : index]:
+            self._px4.send(message, command.channel)
+        return MavResult.ACCEPTED if 0 <= index <= len(modes) else MavResult.DENIED
+
+    def set_interval(self, command: Command) -> int:
+        message_id = _number(command.param1)
+        return self._px4.rates.set_interval_us(command.channel, message_id, command.param2, self._px4.now)
+
+    def get_interval(self, command: Command) -> int:
+        return self._send_interval(_number(command.param1), command)
+
+    def _send_interval(self, message_id: int, command: Command) -> int:
+        interval_us = self._px4.rates.interval_us(command.channel, message_id)
+        if 0 <= message_id < 1 << 16:
+            self._px4.send(m.MessageInterval(message_id, interval_us), command.channel)
+        return MavResult.ACCEPTED
+
+
+def _number(value: float) -> int:
+    return round(value) if abs(value) < 2**31 else -1

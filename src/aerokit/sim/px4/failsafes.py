@@ -22,7 +22,7 @@ from aerokit.sim.px4.texts import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
     from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["FailsafeAction", "Failsafes", "Fence"]
 
@@ -36,7 +36,7 @@ _NO_ACTION, _WARNING = 0, 1
 class Fence:
     """What PX4 checks of a place while GF_ACTION is not 0. One inclusion is enough to be inside."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._is_valid = True
 
@@ -150,7 +150,7 @@ class Failsafes:
 
     battery_state: MavBatteryChargeState
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.fence: Fence = Fence(px4)
         self.action: FailsafeAction = _A.NONE

@@ -26,7 +26,7 @@ from aerokit.sim.px4.modes import (
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Flight", "Orbit", "return_destination"]
 
@@ -38,7 +38,7 @@ _BACK_TO_CIRCLE_PER_S = 0.5
 class Orbit:
     """The circle: its middle, its height, how wide and how fast; a negative radius is anticlockwise."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.middle: tuple[float, float] = (0.0, 0.0)
         self.down: float = 0.0
@@ -85,7 +85,7 @@ _NEAREST, _RALLY_FIRST = (0, 3), 1
 _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
-def return_destination(px4: SimulatedPx4) -> Ned:
+def return_destination(px4: Px4Host) -> Ned:
     """North, east, and the level that heights above the destination are counted from."""
     kind = round(px4.parameters["RTL_TYPE"])
     points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
@@ -96,7 +96,7 @@ def return_destination(px4: SimulatedPx4) -> Ned:
     return min(candidates, key=lambda place: math.dist(here, place[:2]))
 
 
-def _place(px4: SimulatedPx4, item: MissionItem) -> Ned:
+def _place(px4: Px4Host, item: MissionItem) -> Ned:
     north, east = px4.frame.to_local(round(item.x), round(item.y))
     level = px4.home[2] if item.frame in _RELATIVE else px4.frame.origin.altitude_m
     return (north, east, level - item.z)
@@ -110,7 +110,7 @@ _YAW_FROM_M_S = 0.5
 class Flight:
     """The navigator: a target, speeds, and the phase of a mode that has several."""
 
-    def __init__(self, vehicle: SimulatedPx4) -> None:
+    def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
         self.target: Ned = (0.0, 0.0, 0.0)
         """Where HOLD stays, TAKEOFF and RTL go: north, east, down in the world's frame."""

@@ -8,29 +8,24 @@ the way home it takes control itself for a moment and turns to neutral.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
+from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
-from aerokit.sim.commands import whole
 from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
     from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
-__all__ = ["GIMBAL_BUILDERS", "BuiltWithGimbal", "Gimbal", "gimbal_commands"]
+__all__ = ["Gimbal"]
 
 _FITTED_BY = frozenset({0, 4})
 """MNT_MODE_IN: the radio and MAVLink, MAVLink alone."""
 _DEVICE_ID = 1
-_UNCHANGED, _ITSELF, _RELEASE = -1, -2, -3
 _LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
 _TAU_S, _STEP_S = 0.3, 0.0187
 _SLOWED = _STEP_S / (_TAU_S + _STEP_S)
@@ -49,7 +44,7 @@ _AHEAD: Angles = (0.0, 0.0, 0.0)
 class Gimbal:
     """Set-point, and who is in control."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.in_control: tuple[int, int] = (0, 0)
         """System and component id; zeros are nobody."""
@@ -69,6 +64,11 @@ class Gimbal:
         self.in_control = (0, 0)
         if self.is_fitted:
             self._px4.every(_LOOKS_S, self._look_home)
+
+    @property
+    def own_ids(self) -> tuple[int, int]:
+        """System and component id of the vehicle."""
+        return self._px4.system_id, self._px4.component_id
 
     @property
     def is_from_north(self) -> bool:
@@ -141,112 +141,21 @@ class Gimbal:
         rates = (order.angular_velocity_x, order.angular_velocity_y, order.angular_velocity_z)
         self.obey(order.flags, (angles[0], angles[1], angles[2]), rates)
 
+    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
+        if not self.is_fitted:
+            return None
+        q = quaternion_from_euler(*self.angles())
+        return m.GimbalDeviceAttitudeStatus(
+            0, 0, self._px4.time_boot_ms, self.flags, q, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
+        )
 
-def gimbal_commands(px4: SimulatedPx4) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler; without a gimbal nobody answers those for it."""
+    def manager_information(self) -> m.GimbalManagerInformation | None:
+        if not self.is_fitted:
+            return None
+        limits = [math.radians(end) for axis in _LIMITS for end in axis]
+        return m.GimbalManagerInformation(self._px4.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
-    def if_fitted(handler: Callable[[Gimbal, Command], int]) -> CommandHandler:
-        return lambda command: handler(px4.gimbal, command) if px4.gimbal.is_fitted else None
-
-    return {
-        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: if_fitted(_configure),
-        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: if_fitted(_pitch_and_yaw),
-        MavCmd.DO_MOUNT_CONTROL: if_fitted(_control_mount),
-        MavCmd.DO_MOUNT_CONFIGURE: if_fitted(lambda *_: MavResult.ACCEPTED),
-        MavCmd.DO_SET_ROI_LOCATION: lambda command: _look(px4.gimbal, command),
-        MavCmd.DO_SET_ROI_NONE: lambda _: _look(px4.gimbal, None),
-    }
-
-
-def _configure(gimbal: Gimbal, command: Command) -> int:
-    """Ids; −2 is PX4 itself, not who asks. Secondary control is not known."""
-    own = (gimbal._px4.system_id, gimbal._px4.component_id)
-    now = []
-    for number, before, mine, sender in zip(
-        (command.param1, command.param2), gimbal.in_control, own, command.sender, strict=True
-    ):
-        wanted = whole(number)
-        if wanted == _ITSELF:
-            now.append(mine)
-        elif wanted == _RELEASE:
-            now.append(0 if before == sender else before)
-        else:
-            now.append(wanted if 0 <= wanted <= 255 else before)
-    gimbal.in_control = (now[0], now[1])
-    return MavResult.ACCEPTED
-
-
-def _pitch_and_yaw(gimbal: Gimbal, command: Command) -> int:
-    if command.sender != gimbal.in_control:
-        return MavResult.DENIED
-    angles = (0.0, math.radians(command.param1), math.radians(command.param2))
-    rates = (math.nan, math.radians(command.param3), math.radians(command.param4))
-    gimbal.obey(whole(command.x), angles, rates)
-    return MavResult.ACCEPTED
-
-
-def _control_mount(gimbal: Gimbal, command: Command) -> int:
-    """Modes that it does not know are accepted as well."""
-    mode = whole(command.z)
-    if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
-        gimbal.rest()
-    elif mode == MavMountMode.MAVLINK_TARGETING:
-        pitch, roll, yaw = (math.radians(each) for each in (command.param1, command.param2, command.param3))
-        angles = (roll, pitch, math.remainder(yaw, math.tau))
-        gimbal.obey(Flags.ROLL_LOCK | Flags.PITCH_LOCK, angles, _AHEAD)
-    return MavResult.ACCEPTED
-
-
-def _look(gimbal: Gimbal, command: Command | None) -> int:
-    """The altitude is taken for one above the sea, whatever the frame."""
-    if command is None:
-        gimbal.rest()
-    elif math.isfinite(command.z):
-        gimbal.look_at(*command.place(), command.z)
-    return MavResult.ACCEPTED
-
-
-# -------------------------------------------------------------------------------------------- telemetry
-
-
-def _attitude_status(px4: SimulatedPx4) -> m.GimbalDeviceAttitudeStatus | None:
-    gimbal = px4.gimbal
-    if not gimbal.is_fitted:
-        return None
-    q = quaternion_from_euler(*gimbal.angles())
-    return m.GimbalDeviceAttitudeStatus(
-        0, 0, px4.time_boot_ms, gimbal.flags, q, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
-    )
-
-
-def _manager_information(px4: SimulatedPx4) -> m.GimbalManagerInformation | None:
-    if not px4.gimbal.is_fitted:
-        return None
-    limits = [math.radians(end) for axis in _LIMITS for end in axis]
-    return m.GimbalManagerInformation(px4.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
-
-
-def _manager_status(px4: SimulatedPx4) -> m.GimbalManagerStatus | None:
-    gimbal = px4.gimbal
-    if not gimbal.is_fitted:
-        return None
-    return m.GimbalManagerStatus(px4.time_boot_ms, gimbal.flags, _DEVICE_ID, *gimbal.in_control, 0, 0)
-
-
-GIMBAL_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
-    m.GimbalDeviceAttitudeStatus.ID: _attitude_status,
-    m.GimbalManagerInformation.ID: _manager_information,
-    m.GimbalManagerStatus.ID: _manager_status,
-}
-"""Message id → what to send now, or None."""
-
-
-class BuiltWithGimbal(Container[int]):
-    """The ids of the messages that a PX4 has, those of a gimbal only with one."""
-
-    def __init__(self, px4: SimulatedPx4, others: Container[int]) -> None:
-        self._px4, self._others = px4, others
-
-    def __contains__(self, message_id: object) -> bool:
-        is_of_gimbal = message_id in GIMBAL_BUILDERS and self._px4.gimbal.is_fitted
-        return is_of_gimbal or (isinstance(message_id, int) and message_id in self._others)
+    def manager_status(self) -> m.GimbalManagerStatus | None:
+        if not self.is_fitted:
+            return None
+        return m.GimbalManagerStatus(self._px4.time_boot_ms, self.flags, _DEVICE_ID, *self.in_control, 0, 0)

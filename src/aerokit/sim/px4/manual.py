@@ -11,7 +11,7 @@ from aerokit.sim.px4.modes import ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["ManualFlight", "Sticks", "curved"]
 
@@ -25,7 +25,7 @@ _MAPS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THROTTLE")
 class Sticks:
     """The latest position of the sticks, -1 to 1 each: right, forward, clockwise and up are positive."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.roll: float = 0.0
         self.pitch: float = 0.0
@@ -110,7 +110,7 @@ _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
 class ManualFlight:
     """Sticks to motion. `update` is called fifty times a second in a mode flown by hand."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._place: tuple[float, float] | None = None
         self._down: float | None = None

@@ -16,7 +16,7 @@ from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
 if TYPE_CHECKING:
     from aerokit.missions import MissionItem
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Mission", "outside_fence", "rejection", "warning"]
 
@@ -38,7 +38,7 @@ _VTOL = (_C.NAV_VTOL_TAKEOFF, _C.NAV_VTOL_LAND)
 _FAR_M = 10_000.0
 
 
-def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
+def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """Why such a mission cannot be flown; None when it can. Gliding is not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
@@ -57,7 +57,7 @@ def rejection(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
     return _missing_landing(px4, items) or _landing_problem(items)
 
 
-def _missing_landing(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
+def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """MIS_TKO_LAND_REQ: 1 demands a take-off, 2 a landing, 3 both, 4 both or none; an aeroplane has 2."""
     if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # not in the multicopter's table
         return None
@@ -74,7 +74,7 @@ def _missing_landing(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | N
     return None
 
 
-def _height(px4: SimulatedPx4, item: MissionItem) -> float:
+def _height(px4: Px4Host, item: MissionItem) -> float:
     above_sea = item.frame == MavFrame.GLOBAL
     return item.z - (px4.frame.origin.altitude_m - px4.home[2]) if above_sea else item.z
 
@@ -95,7 +95,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
     return "invalid land start." if start > approach else None
 
 
-def outside_fence(px4: SimulatedPx4, items: Sequence[MissionItem]) -> int | None:
+def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
     """The number, from 1 on, of the first item whose place the geofence forbids."""
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
@@ -105,7 +105,7 @@ def outside_fence(px4: SimulatedPx4, items: Sequence[MissionItem]) -> int | None
     return None
 
 
-def warning(px4: SimulatedPx4, items: Sequence[MissionItem]) -> str | None:
+def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     """What it says of a mission that it flies nevertheless: the first place is far away, 0, 0 for example."""
     for item in items:
         if item.command in _WITH_PLACE:
@@ -135,7 +135,7 @@ _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 class Mission:
     """The navigator's mission mode. `update` is called while it is in charge."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.current: int = 0
         """The item that is flown, or will be."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.missions import MissionItem
     from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["MissionLink", "MissionServer"]
 
@@ -42,7 +42,7 @@ class State(Enum):
 class MissionLink:
     """Texts and results are those of the firmware; each ``on_…`` hears one message."""
 
-    def __init__(self, px4: SimulatedPx4, server: MissionServer, channel: Channel) -> None:
+    def __init__(self, px4: Px4Host, server: MissionServer, channel: Channel) -> None:
         self._px4, self._server, self._channel = px4, server, channel
         self._state = State.IDLE
         self._partner = _NOBODY
@@ -323,7 +323,7 @@ _CAPACITIES: dict[int, int] = {
 class MissionServer:
     """Mission, fence and rally points: kept here, and shared by all links."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._items: dict[int, list[MissionItem]] = {kind: [] for kind in _CAPACITIES}
         self._ids: dict[int, int] = dict.fromkeys(_CAPACITIES, 0)

@@ -18,7 +18,7 @@ from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Offboard"]
 
@@ -34,7 +34,7 @@ _CLIMB_AT_FULL_THRUST_M_S = 5.0
 class Offboard:
     """The latest set-point; it is heard in every mode and flown in OFFBOARD."""
 
-    def __init__(self, vehicle: SimulatedPx4) -> None:
+    def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
         self.updated_at: float = -math.inf
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3

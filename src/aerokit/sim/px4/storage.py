@@ -21,7 +21,7 @@ from aerokit.sim.signing import VehicleSigning
 
 if TYPE_CHECKING:
     from aerokit.sim.parameters import Parameters
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "Px4ParameterMount", "Storage"]
 
@@ -122,7 +122,7 @@ class Storage:
 
     def __init__(
         self,
-        px4: SimulatedPx4,
+        px4: Px4Host,
         logs: Sequence[SimulatedLog],
         *,
         parameter_file: bool,
@@ -185,7 +185,7 @@ class Px4Signing(VehicleSigning):
     The time stamp is stored when a key is taken, and not again.
     """
 
-    def __init__(self, vehicle: SimulatedPx4, key: SigningKey | None, timestamp: int) -> None:
+    def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:
         super().__init__(vehicle, key, timestamp)
         self._px4 = vehicle
 

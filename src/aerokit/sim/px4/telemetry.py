@@ -49,9 +49,9 @@ from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.base import Px4Vehicle
 
-__all__ = ["BUILDERS", "available_modes", "global_origin"]
+__all__ = ["BUILDERS", "GIMBAL_MESSAGES", "available_modes"]
 
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
@@ -89,7 +89,7 @@ _BOOT_FLAGS = _F.ATTITUDE | _F.VELOCITY_VERT | _F.POS_VERT_ABS | _F.POS_VERT_AGL
 _POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.PRED_POS_HORIZ_ABS
 
 
-def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
+def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
     mode = TERMINATION if px4.arming.is_terminated else px4.mode
     base = KNOWN[mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
     if mode == OFFBOARD and px4.offboard.is_fresh:
@@ -97,7 +97,7 @@ def _heartbeat(px4: SimulatedPx4) -> m.Heartbeat:
     return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), _state(px4), 3)
 
 
-def _state(px4: SimulatedPx4) -> MavState:
+def _state(px4: Px4Vehicle) -> MavState:
     if px4.arming.is_terminated:
         return MavState.FLIGHT_TERMINATION
     if px4.is_in_failsafe:
@@ -109,7 +109,7 @@ def _state(px4: SimulatedPx4) -> MavState:
     return MavState.STANDBY if px4.arming.is_possible else MavState.UNINIT
 
 
-def _sys_status(px4: SimulatedPx4) -> m.SysStatus:
+def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
     health = _HEALTHY if px4.is_ready else _BOOTING
     if not px4.is_armed and not px4.arming.is_possible:
         health &= ~_PREARM_BIT
@@ -123,7 +123,7 @@ def _sys_status(px4: SimulatedPx4) -> m.SysStatus:
     return m.SysStatus(present, enabled, health, 120, voltage, -100, percent, 0, 0, 0, 0, 0, 0, 0, 0, 1)
 
 
-def _estimator_status(px4: SimulatedPx4) -> m.EstimatorStatus:
+def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
     flags = _ALL_BUT_STILL
     if not px4.is_armed:
         flags |= _F.CONST_POS_MODE
@@ -135,7 +135,7 @@ def _estimator_status(px4: SimulatedPx4) -> m.EstimatorStatus:
     return m.EstimatorStatus(px4.time_boot_us, flags, size, size, 0.003, size, 0.002, math.nan, 0.3, 0.3)
 
 
-def _extended_sys_state(px4: SimulatedPx4) -> m.ExtendedSysState:
+def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
     state = MavLandedState.IN_AIR
     if px4.is_landed:
         state = MavLandedState.ON_GROUND
@@ -146,7 +146,7 @@ def _extended_sys_state(px4: SimulatedPx4) -> m.ExtendedSysState:
     return m.ExtendedSysState(0, state)
 
 
-def _battery_status(px4: SimulatedPx4) -> m.BatteryStatus:
+def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
     battery = px4.battery
     voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)
     return m.BatteryStatus(
@@ -164,24 +164,24 @@ def _battery_status(px4: SimulatedPx4) -> m.BatteryStatus:
     )
 
 
-def _attitude(px4: SimulatedPx4) -> m.Attitude:
+def _attitude(px4: Px4Vehicle) -> m.Attitude:
     o = px4.motion
     return m.Attitude(px4.time_boot_ms, o.roll, o.pitch, o.yaw, o.roll_rate, o.pitch_rate, o.yaw_rate)
 
 
-def _attitude_quaternion(px4: SimulatedPx4) -> m.AttitudeQuaternion:
+def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
     o = px4.motion
     q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
     return m.AttitudeQuaternion(px4.time_boot_ms, *q, o.roll_rate, o.pitch_rate, o.yaw_rate)
 
 
-def _attitude_target(px4: SimulatedPx4) -> m.AttitudeTarget:
+def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
     o = px4.motion
     q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
     return m.AttitudeTarget(px4.time_boot_ms, 0, q, 0.0, 0.0, o.yaw_rate, px4.throttle)
 
 
-def _global_position(px4: SimulatedPx4) -> m.GlobalPositionInt | None:
+def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
     """Absent without a position, not zero as with ArduPilot."""
     if not px4.has_position:
         return None
@@ -200,13 +200,13 @@ def _global_position(px4: SimulatedPx4) -> m.GlobalPositionInt | None:
     )
 
 
-def _local_position(px4: SimulatedPx4) -> m.LocalPositionNed:
+def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
     o = px4.motion
     velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
     return m.LocalPositionNed(px4.time_boot_ms, o.north, o.east, o.down, *velocity)
 
 
-def _altitude(px4: SimulatedPx4) -> m.Altitude:
+def _altitude(px4: Px4Vehicle) -> m.Altitude:
     amsl = px4.frame.origin.altitude_m - px4.motion.down
     above, ground = px4.altitude_m, px4.motion.ground_down
     return m.Altitude(
@@ -214,7 +214,7 @@ def _altitude(px4: SimulatedPx4) -> m.Altitude:
     )
 
 
-def _vfr_hud(px4: SimulatedPx4) -> m.VfrHud:
+def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
     o = px4.motion
     heading = int(math.degrees(o.yaw) % 360.0)
     amsl = px4.frame.origin.altitude_m - o.down
@@ -223,7 +223,7 @@ def _vfr_hud(px4: SimulatedPx4) -> m.VfrHud:
     )
 
 
-def _gps_raw(px4: SimulatedPx4) -> m.GpsRawInt:
+def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
     o = px4.motion
     if px4.faults.gps_lost:
         return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 65535, 65535, 0)
@@ -248,7 +248,7 @@ def _gps_raw(px4: SimulatedPx4) -> m.GpsRawInt:
     )
 
 
-def _home_position(px4: SimulatedPx4) -> m.HomePosition | None:
+def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
     if not px4.is_ready:
         return None
     place = px4.frame.to_global(*px4.home)
@@ -259,14 +259,14 @@ def _home_position(px4: SimulatedPx4) -> m.HomePosition | None:
     )
 
 
-def global_origin(px4: SimulatedPx4) -> m.GpsGlobalOrigin:
+def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin:
     """Where the local frame begins."""
     origin = px4.frame.origin
     altitude = round(origin.altitude_m * 1000)
     return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
 
 
-def _target_local(px4: SimulatedPx4) -> m.PositionTargetLocalNed:
+def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
     """Nothing but a push towards the ground while disarmed."""
     yaw, o = px4.motion.yaw, px4.motion
     if not px4.is_armed:
@@ -281,35 +281,35 @@ def _target_local(px4: SimulatedPx4) -> m.PositionTargetLocalNed:
     )
 
 
-def _servo_output(px4: SimulatedPx4) -> m.ServoOutputRaw:
+def _servo_output(px4: Px4Vehicle) -> m.ServoOutputRaw:
     pwm = 900 if not px4.is_armed else round(1000 + 1000 * px4.throttle)
     return m.ServoOutputRaw(px4.time_boot_us, 0, *(pwm,) * 4, *(900,) * 12)
 
 
-def _mission_current(px4: SimulatedPx4) -> m.MissionCurrent:
+def _mission_current(px4: Px4Vehicle) -> m.MissionCurrent:
     mission, store = px4.mission, px4.missions
     ids = (store.id(0), store.id(1), store.id(2))
     total = mission.count or INVALID_INDEX
     return m.MissionCurrent(mission.current, total, mission.state, mission.mode, *ids)
 
 
-def _vibration(px4: SimulatedPx4) -> m.Vibration:
+def _vibration(px4: Px4Vehicle) -> m.Vibration:
     return m.Vibration(px4.time_boot_us, 0.0, 0.1, 1.4 if px4.is_armed else 0.1, 0, 0, 0)
 
 
-def _system_time(px4: SimulatedPx4) -> m.SystemTime:
+def _system_time(px4: Px4Vehicle) -> m.SystemTime:
     return m.SystemTime(round(px4.unix_time * 1e6), px4.time_boot_ms)
 
 
-def _current_mode(px4: SimulatedPx4) -> m.CurrentMode:
+def _current_mode(px4: Px4Vehicle) -> m.CurrentMode:
     return m.CurrentMode(_STANDARD.get(px4.mode, 0), custom_mode(px4.mode), custom_mode(px4.intended_mode))
 
 
-def _ping(px4: SimulatedPx4) -> m.Ping:
+def _ping(px4: Px4Vehicle) -> m.Ping:
     return m.Ping(px4.time_boot_us, px4.next_ping(), 0, 0)
 
 
-def available_modes(_: SimulatedPx4) -> list[m.AvailableModes]:
+def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
     """AVAILABLE_MODES: PX4 gives no name to a mode that the standard names (RETURN, LAND …)."""
     listed, count = _LISTED, len(_LISTED) + _EXTERNAL_MODES
     messages = []
@@ -324,7 +324,12 @@ def available_modes(_: SimulatedPx4) -> list[m.AvailableModes]:
     return messages
 
 
-BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
+GIMBAL_MESSAGES = frozenset(
+    {m.GimbalDeviceAttitudeStatus.ID, m.GimbalManagerInformation.ID, m.GimbalManagerStatus.ID}
+)
+"""Sent by a vehicle that has one."""
+
+BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.Heartbeat.ID: _heartbeat,
     m.SysStatus.ID: _sys_status,
     m.EstimatorStatus.ID: _estimator_status,
@@ -350,5 +355,8 @@ BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
     m.CurrentEventSequence.ID: lambda px4: px4.events.current(),
     **SENSOR_BUILDERS,
     **IDENTITY_BUILDERS,
+    m.GimbalDeviceAttitudeStatus.ID: lambda px4: px4.gimbal.attitude_status(),
+    m.GimbalManagerInformation.ID: lambda px4: px4.gimbal.manager_information(),
+    m.GimbalManagerStatus.ID: lambda px4: px4.gimbal.manager_status(),
 }
 """Message id → what to send now, or None."""

@@ -13,7 +13,7 @@ from aerokit.sim.px4.modes import ORBIT, custom_mode
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.base import Px4Vehicle
 
 __all__ = ["IDENTITY_BUILDERS", "SENSOR_BUILDERS"]
 
@@ -26,43 +26,43 @@ _REMOTE_ID_EPOCH = 1_546_300_800
 _ANYONE = bytes(20)
 
 
-def _autopilot_version(px4: SimulatedPx4) -> m.AutopilotVersion:
+def _autopilot_version(px4: Px4Vehicle) -> m.AutopilotVersion:
     number, commit = px4.version_number, b"\0\0\0\xfd\xaf\xd6\xde\x59"
     return m.AutopilotVersion(
         px4.capabilities, number, number, 101854463, 1, commit, commit, bytes(8), 0, 0, 5283920058631409231
     )
 
 
-def _protocol_version(_: SimulatedPx4) -> m.ProtocolVersion:
+def _protocol_version(_: Px4Vehicle) -> m.ProtocolVersion:
     return m.ProtocolVersion(200, 100, 203, bytes(8), _LIBRARY_HASH)
 
 
-def _storage_information(px4: SimulatedPx4) -> m.StorageInformation:
+def _storage_information(px4: Px4Vehicle) -> m.StorageInformation:
     free = _CAPACITY_MIB - _USED_MIB
     return m.StorageInformation(
         px4.time_boot_ms, 1, 1, StorageStatus.READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0
     )
 
 
-def _flight_information(px4: SimulatedPx4) -> m.FlightInformation:
+def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
     armed_for = px4.now - px4.arming.since
     since = int((px4.unix_time - armed_for) * 1e6) if px4.is_armed else 0
     return m.FlightInformation(px4.time_boot_ms, since, 0 if px4.is_landed else since, 0)
 
 
-def _component_metadata(px4: SimulatedPx4) -> m.ComponentMetadata:
+def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
     return m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI)
 
 
-def _component_information(px4: SimulatedPx4) -> m.ComponentInformation:
+def _component_information(px4: Px4Vehicle) -> m.ComponentInformation:
     return m.ComponentInformation(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI, 0, "")
 
 
-def _mag_cal_report(_: SimulatedPx4) -> m.MagCalReport:
+def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
     return m.MagCalReport(0, 0, 4, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0, 0, 1.0)
 
 
-def _high_latency(px4: SimulatedPx4) -> m.HighLatency2:
+def _high_latency(px4: Px4Vehicle) -> m.HighLatency2:
     o = px4.motion
     place = px4.frame.to_global(o.north, o.east, o.down)
     heading = round(math.degrees(o.yaw) % 360.0 / 2)
@@ -99,13 +99,13 @@ def _high_latency(px4: SimulatedPx4) -> m.HighLatency2:
     )
 
 
-def _basic_id(px4: SimulatedPx4) -> m.OpenDroneIdBasicId:
+def _basic_id(px4: Px4Vehicle) -> m.OpenDroneIdBasicId:
     is_plane = px4.VEHICLE_TYPE == MavType.FIXED_WING
     kind = MavOdidUaType.AEROPLANE if is_plane else MavOdidUaType.HELICOPTER_OR_MULTIROTOR
     return m.OpenDroneIdBasicId(0, 0, _ANYONE, 1, kind, b"1006554d49534954414\0")
 
 
-def _remote_location(px4: SimulatedPx4) -> m.OpenDroneIdLocation | None:
+def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
     if not px4.has_position:
         return None
     o = px4.motion
@@ -134,7 +134,7 @@ def _remote_location(px4: SimulatedPx4) -> m.OpenDroneIdLocation | None:
     )
 
 
-def _remote_system(px4: SimulatedPx4) -> m.OpenDroneIdSystem | None:
+def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
     if not px4.is_ready:
         return None
     home = px4.frame.to_global(*px4.home)
@@ -158,7 +158,7 @@ def _remote_system(px4: SimulatedPx4) -> m.OpenDroneIdSystem | None:
     )
 
 
-IDENTITY_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
+IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.AutopilotVersion.ID: _autopilot_version,
     m.MagCalReport.ID: _mag_cal_report,
     m.HighLatency2.ID: _high_latency,
@@ -185,26 +185,26 @@ _DISARMED_US = 900
 _CLIMB_M_S, _DESCENT_M_S = 3.0, 0.7
 
 
-def _height(px4: SimulatedPx4) -> float:
+def _height(px4: Px4Vehicle) -> float:
     return px4.frame.origin.altitude_m - px4.motion.down
 
 
-def _pressure_hpa(px4: SimulatedPx4) -> float:
+def _pressure_hpa(px4: Px4Vehicle) -> float:
     return float(_SEA_LEVEL_HPA * (1.0 - 2.25577e-5 * _height(px4)) ** 5.25588)
 
 
-def _scaled_pressure(px4: SimulatedPx4) -> m.ScaledPressure:
+def _scaled_pressure(px4: Px4Vehicle) -> m.ScaledPressure:
     temperature = _SEA_LEVEL_C - _LAPSE_C_PER_M * _height(px4)
     return m.ScaledPressure(px4.time_boot_ms, _pressure_hpa(px4), 0.0, round(temperature * 100), 0)
 
 
-def _distance_sensor(px4: SimulatedPx4) -> m.DistanceSensor:
+def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
     height = px4.motion.ground_down - px4.motion.down
     distance = min(_RANGE_FINDER_CM[1], max(0, round(height * 100)))
     return m.DistanceSensor(px4.time_boot_ms, *_RANGE_FINDER_CM, distance, 0, 0, 25, 0)
 
 
-def _body(px4: SimulatedPx4) -> tuple[float, float, float]:
+def _body(px4: Px4Vehicle) -> tuple[float, float, float]:
     """What the accelerometer feels, in m/s² forward, right, down."""
     o = px4.motion
     north, east, down = o.acceleration_north, o.acceleration_east, o.acceleration_down - GRAVITY_M_S2
@@ -217,12 +217,12 @@ def _body(px4: SimulatedPx4) -> tuple[float, float, float]:
     )
 
 
-def _field(px4: SimulatedPx4) -> tuple[float, float, float]:
+def _field(px4: Px4Vehicle) -> tuple[float, float, float]:
     north, _, down = _FIELD_GAUSS
     return (north * math.cos(px4.motion.yaw), -north * math.sin(px4.motion.yaw), down)
 
 
-def _highres_imu(px4: SimulatedPx4) -> m.HighresImu:
+def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
     o, height = px4.motion, _height(px4)
     rates = (o.roll_rate, o.pitch_rate, o.yaw_rate)
     pressure = _pressure_hpa(px4)
@@ -231,7 +231,7 @@ def _highres_imu(px4: SimulatedPx4) -> m.HighresImu:
     )
 
 
-def _scaled_imu(px4: SimulatedPx4) -> m.ScaledImu:
+def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
     o = px4.motion
     force_x, force_y, force_z = (round(part / GRAVITY_M_S2 * 1000) for part in _body(px4))
     rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (o.roll_rate, o.pitch_rate, o.yaw_rate))
@@ -242,7 +242,7 @@ def _scaled_imu(px4: SimulatedPx4) -> m.ScaledImu:
     )
 
 
-def _odometry(px4: SimulatedPx4) -> m.Odometry:
+def _odometry(px4: Px4Vehicle) -> m.Odometry:
     o = px4.motion
     q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
     velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
@@ -265,7 +265,7 @@ def _odometry(px4: SimulatedPx4) -> m.Odometry:
     )
 
 
-def _rc_channels(px4: SimulatedPx4) -> m.RcChannels | None:
+def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
     """Only while RC_CHANNELS_OVERRIDE comes: there is no receiver."""
     if not px4.sticks.has_channels:
         return None
@@ -276,24 +276,24 @@ def _rc_channels(px4: SimulatedPx4) -> m.RcChannels | None:
     return m.RcChannels(time_boot_ms=px4.time_boot_ms, chancount=used, rssi=100, **pulses, **unused)
 
 
-def _manual_control(px4: SimulatedPx4) -> m.ManualControl:
+def _manual_control(px4: Px4Vehicle) -> m.ManualControl:
     sticks = px4.sticks
     throttle = round((sticks.throttle + 1) * 500)
     pitch, roll, yaw = (round(axis * 1000) for axis in (sticks.pitch, sticks.roll, sticks.yaw))
     return m.ManualControl(px4.system_id, pitch, roll, throttle, yaw, 0)
 
 
-def _timesync(px4: SimulatedPx4) -> m.Timesync:
+def _timesync(px4: Px4Vehicle) -> m.Timesync:
     return m.Timesync(0, int(px4.uptime * 1e9))
 
 
-def _actuator_outputs(px4: SimulatedPx4) -> m.ActuatorOutputStatus:
+def _actuator_outputs(px4: Px4Vehicle) -> m.ActuatorOutputStatus:
     pulse = _DISARMED_US if not px4.is_armed else round(1000 + 1000 * px4.throttle)
     outputs = (*(float(pulse),) * 4, *(float(_DISARMED_US),) * (_OUTPUTS - 4))
     return m.ActuatorOutputStatus(px4.time_boot_us, _OUTPUTS, outputs)
 
 
-def _state_for_gimbal(px4: SimulatedPx4) -> m.AutopilotStateForGimbalDevice:
+def _state_for_gimbal(px4: Px4Vehicle) -> m.AutopilotStateForGimbalDevice:
     o = px4.motion
     q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
     velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
@@ -313,7 +313,7 @@ def _state_for_gimbal(px4: SimulatedPx4) -> m.AutopilotStateForGimbalDevice:
     )
 
 
-def _position_target_global(px4: SimulatedPx4) -> m.PositionTargetGlobalInt | None:
+def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None:
     """Only while armed."""
     if not px4.is_armed or not px4.has_position:
         return None
@@ -335,11 +335,11 @@ def _position_target_global(px4: SimulatedPx4) -> m.PositionTargetGlobalInt | No
     )
 
 
-def _orbit_status(px4: SimulatedPx4) -> m.OrbitExecutionStatus | None:
+def _orbit_status(px4: Px4Vehicle) -> m.OrbitExecutionStatus | None:
     return px4.flight.orbit.status() if px4.mode == ORBIT else None
 
 
-def _time_estimate(px4: SimulatedPx4) -> m.TimeEstimateToTarget:
+def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
     """Only the return is estimated: up or down to its height, back, down."""
     if px4.is_landed:
         return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
@@ -350,11 +350,11 @@ def _time_estimate(px4: SimulatedPx4) -> m.TimeEstimateToTarget:
     return m.TimeEstimateToTarget(round(seconds), -1, -1, -1, -1)
 
 
-def _link_status(px4: SimulatedPx4) -> m.LinkNodeStatus:
+def _link_status(px4: Px4Vehicle) -> m.LinkNodeStatus:
     return m.LinkNodeStatus(px4.time_boot_us, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 
 
-SENSOR_BUILDERS: dict[int, Callable[[SimulatedPx4], Message | None]] = {
+SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.LinkNodeStatus.ID: _link_status,
     m.ScaledImu.ID: _scaled_imu,
     m.ScaledPressure.ID: _scaled_pressure,

@@ -17,7 +17,7 @@ from aerokit.mavlink.messages import CurrentEventSequence, Event
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Statustext
     from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.vehicle import SimulatedPx4
+    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["NO_STATION", "OUTSIDE", "TOO_FAR", "TOO_HIGH", "Events", "TextLinks", "on_the_wire"]
 
@@ -39,7 +39,7 @@ _RETURN_TEXT = re.compile(r"RTL: start return at (-?\d+) m \((-?\d+) m above des
 class Events:
     """Counts them; the numbers begin ten before the overflow, so that clients learn about that."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._next = _FIRST_SEQUENCE
 
@@ -93,7 +93,7 @@ _MAX_WAITING, _MAX_AGE_S = 8, 5.0
 class TextLinks:
     """Sends texts to links on which a ground station is heard (streams/STATUSTEXT.hpp); others wait a while for one."""
 
-    def __init__(self, px4: SimulatedPx4) -> None:
+    def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._station_at: dict[Channel, float] = {}
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}

@@ -2,70 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, ClassVar
-
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavType
-from aerokit.sim.autopilot import SimulatedAutopilot
-from aerokit.sim.battery import Battery
-from aerokit.sim.commands import Command
-from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
-from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
-from aerokit.sim.px4.arming import Arming, Calibration
-from aerokit.sim.px4.camera_trigger import CameraTrigger
+from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.message import Message
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import Command, CommandHandler
+from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.commands import px4_commands, refusal_by_place, set_mode
-from aerokit.sim.px4.failsafes import Failsafes
-from aerokit.sim.px4.flight import Flight
-from aerokit.sim.px4.gimbal import GIMBAL_BUILDERS, BuiltWithGimbal, Gimbal
-from aerokit.sim.px4.link_rates import LinkRates
-from aerokit.sim.px4.manual import Sticks
-from aerokit.sim.px4.mission import Mission
-from aerokit.sim.px4.mission_server import MissionServer
-from aerokit.sim.px4.modes import (
-    HOLD,
-    KNOWN,
-    LAND,
-    MISSION,
-    OFFBOARD,
-    POSITION,
-    PRECISION_LAND,
-    RTL,
-    TAKEOFF,
-    TERMINATION,
-    Px4Mode,
-    mode_from_custom,
-)
-from aerokit.sim.px4.offboard import Offboard
-from aerokit.sim.px4.parameters import px4_parameters
-from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage
-from aerokit.sim.px4.telemetry import BUILDERS, global_origin
-from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
-from aerokit.sim.vehicle import Component, sender_of
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.mavlink.signing import SigningKey
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import CommandServer
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.logs import SimulatedLog
-    from aerokit.sim.parameters import Parameters
-    from aerokit.sim.px4.ftp import Px4Ftp
+from aerokit.sim.px4.modes import mode_from_custom
+from aerokit.sim.px4.telemetry import BUILDERS, GIMBAL_MESSAGES
+from aerokit.sim.vehicle import sender_of
 
 __all__ = ["SimulatedPx4"]
 
-_FIRST_HEARTBEAT_SHARE = 0.15
-_REBOOT_SILENCE_S = 1.5
-_LAND_DETECTOR_S = 1.0
-_HOVER_THROTTLE = 0.5
-_AMPERES_AT_FULL = 40.0
-_NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
 
-
-class SimulatedPx4(SimulatedAutopilot):
+class SimulatedPx4(Px4Vehicle):
     """Speaks as PX4 v1.16/v1.17 does where a client can see it; flies as `Motion` does.
 
     Simulated: arming and its denial, every mode with its double acknowledgement, take-off to an AMSL altitude, hold,
@@ -89,342 +40,23 @@ class SimulatedPx4(SimulatedAutopilot):
     - ``signing_key``: see `Px4Signing`
     """
 
-    CAPABILITIES: ClassVar[int] = 0xE8FF
-    VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
-    PARAMETER_TABLE: ClassVar[str] = "quadrotor"
-
-    events: Events
-
-    def __init__(
-        self,
-        *,
-        system_id: int = 1,
-        home: tuple[float, float, float] = HOME,
-        heading_deg: float = 0.0,
-        seed: int = 0,
-        boot_time_s: float = 3.5,
-        version: str = "1.17.0-alpha",
-        parameters: dict[str, float] | None = None,
-        parameter_count: int | None = None,
-        parameter_file: bool = False,
-        logs: Sequence[SimulatedLog] = DEFAULT_LOGS,
-        link_bytes_per_s: float | None = None,
-        battery_percent: float = 100.0,
-        wind: Wind | None = None,
-        fast_rate_hz: float = 50.0,
-        link_modes: Sequence[str] = ("normal",),
-        unsupported_commands: Collection[int] = (),
-        components: Iterable[Component] = (),
-        unix_time_at_boot: float = 1_790_000_000.0,
-        signing_key: SigningKey | None = None,
-    ) -> None:
-        self.parameters: Parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
-        """By name; they survive a reboot."""
-        self.parameters["MAV_SYS_ID"] = system_id
-        self.parameters.change(parameters or {})
-        super().__init__(
-            system_id=system_id,
-            seed=seed,
-            components=components,
-            version=version,
-            unsupported_commands=unsupported_commands,
-            unix_time_at_boot=unix_time_at_boot,
-            signing_key=signing_key,
-        )
-        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-        self.battery: Battery = Battery(5000.0, cells=4, percent=battery_percent)
-        self.motion: Motion = self._make_motion(wind)
-        self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
-        self._boot_time_s = boot_time_s
-        self.rates: LinkRates = LinkRates(link_modes, BuiltWithGimbal(self, BUILDERS), fast_rate_hz)
-        self.events = Events(self)
-        self._next_text_id = 0
-        self._pings = 0
-        self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        self.missions: MissionServer = MissionServer(self)
-        """Mission, fence and rally points; they survive a reboot."""
-        self.camera_trigger: CameraTrigger = CameraTrigger(self)
-        """There while the parameter TRIG_MODE is not 0."""
-        self._reset()
-        self._listen()
-        self.storage: Storage = Storage(
-            self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s
-        )
-        """Files, logs, and the servers of them and of the parameters."""
-        self.files: FileTree = self.storage.files
-
-    def _make_motion(self, wind: Wind | None) -> Motion:
-        limits = MotionLimits(
-            acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45)
-        )
-        return Motion(self.rng, limits, wind)
-
-    def _make_flight(self) -> Flight:
-        return Flight(self)
-
-    def _make_mission(self) -> Mission:
-        return Mission(self)
-
-    def _reset(self) -> None:
-        self.is_ready: bool = False
-        self.is_armed: bool = False
-        self.is_landed: bool = True
-        self.mode: Px4Mode = HOLD
-        self.intended_mode: Px4Mode = HOLD
-        self.is_in_failsafe: bool = False
-        self.arming: Arming = Arming(self)
-        self.calibration: Calibration = Calibration(self)
-        self.throttle: float = 0.0
-        self.home_is_set_by_hand = False
-        self.mode_after_landing: Px4Mode = HOLD
-        self._touched_at = math.nan
-        self._landed_at = math.nan
-        self._has_flown = False
-        self.flight: Flight = self._make_flight()
-        self.mission: Mission = self._make_mission()
-        self.failsafes: Failsafes = Failsafes(self)
-        self.text_links: TextLinks = TextLinks(self)
-        self.missions.reset()
-
-    def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
-        """Keeps the key."""
-        return Px4Signing(self, key, timestamp)
-
-    def _listen(self) -> None:
-        self.offboard: Offboard = Offboard(self)
-        self.sticks: Sticks = Sticks(self)
-        self.gimbal: Gimbal = Gimbal(self)
-        """On its AUX outputs, if MNT_MODE_IN fits one."""
-        self.commands: CommandServer = self.serve_commands(px4_commands(self))
+    def make_commands(self) -> dict[int, CommandHandler]:
+        """See `px4_commands`; SET_MODE does as DO_SET_MODE."""
         self.on(m.SetMode, self._on_set_mode)
-        self.on(m.Ping, self._on_ping)
-        self.listen_to_clocks()
-        self.missions.listen()
-        self.failsafes.listen()
+        return px4_commands(self)
 
-    # ----------------------------------------------------------------------------------------- state
+    def can_build(self, message_id: int) -> bool:
+        """Those of a gimbal only with one."""
+        return message_id in BUILDERS and (message_id not in GIMBAL_MESSAGES or self.gimbal.is_fitted)
 
-    @property
-    def ftp(self) -> Px4Ftp:
-        """The server of the files."""
-        return self.storage.ftp
-
-    @property
-    def altitude_m(self) -> float:
-        """Metres above home."""
-        return self.home[2] - self.motion.down
-
-    @property
-    def airspeed_m_s(self) -> float:
-        """What an airspeed sensor says; NaN without one."""
-        return math.nan
-
-    @property
-    def has_position(self) -> bool:
-        """Whether the estimator has a global position."""
-        return self.uptime >= 0.5 * self._boot_time_s and not self.faults.gps_lost
-
-    @property
-    def accepts_unknown_modes(self) -> bool:
-        """v1.16 says ACCEPTED to a mode that it does not know."""
-        return self.version.startswith("1.16")
+    def build(self, message_id: int) -> Message | None:
+        """What is to be streamed now."""
+        builder = BUILDERS.get(message_id)
+        return None if builder is None else builder(self)
 
     def refusal_of_command(self, command: Command) -> int | None:
         """Of frames; and of NaN sent as an integer, or "ignore" as a number (mavlink_receiver.cpp)."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
-
-    def next_ping(self) -> int:
-        """Sequence number of the next PING."""
-        self._pings += 1
-        return self._pings - 1
-
-    # ------------------------------------------------------------------------------- boot and reboot
-
-    def boot(self) -> None:
-        """Start up."""
-        self.storage.restart()
-        self.camera_trigger.restart()
-        self.gimbal.start()
-        self.call_later(0.3 * self._boot_time_s, self._warn_while_booting)
-        self.mission.start()
-        self.failsafes.listen()
-        self.failsafes.start()
-        self.call_later(self._boot_time_s, self._become_ready)
-
-    def _warn_while_booting(self) -> None:
-        self.arming.report_reasons()
-        self.arming.start_first_log()
-
-    def _become_ready(self) -> None:
-        self.is_ready = True
-        self.home = (self.motion.north, self.motion.east, self.motion.down)
-
-    def start_channel(self, channel: Channel) -> None:
-        """Everything is streamed without being asked."""
-        first = max(self.now, self.booted_at + _FIRST_HEARTBEAT_SHARE * self._boot_time_s)
-        self.rates.start(channel, self.channels.index(channel), first)
-        known = max(self.now, self.booted_at + self._boot_time_s)
-        self.call_at(known, lambda: self.send(global_origin(self), channel))  # once, and when it changes
-
-    def restart(self) -> None:
-        """Reboot now."""
-        self.motion.down = self.motion.ground_down
-        self.motion.settle()
-        self._reset()
-        self._next_text_id = 0
-        self.reboot(_REBOOT_SILENCE_S)
-
-    def build(self, message_id: int) -> Message | None:
-        """What is to be streamed now."""
-        builder = BUILDERS.get(message_id) or GIMBAL_BUILDERS.get(message_id)
-        return None if builder is None else builder(self)
-
-    def send_text(self, severity: int, text: str) -> None:
-        """Every text has an id, most end in a tab; it leaves after what is being answered."""
-        self.call_later(0.0, partial(self.events.tell, text))
-        text = on_the_wire(text)
-        number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
-        self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
-
-    def send_parts(self, chunks: list[m.Statustext]) -> None:
-        """See `TextLinks`."""
-        self.text_links.tell(chunks)
-
-    # ------------------------------------------------------------------------------ arming and modes
-
-    def armed(self) -> None:
-        """It was armed just now."""
-        self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
-        if not self.home_is_set_by_hand:
-            self.home = (self.motion.north, self.motion.east, self.motion.down)
-        self.failsafes.armed()
-        if self.mode == MISSION:
-            self.mission.enter()
-        elif self.mode == TAKEOFF:
-            self.flight.announce_take_off()
-        self.set_ticking(True)
-
-    def disarmed(self) -> None:
-        """It was disarmed just now."""
-        self.is_armed = False
-        self.throttle = 0.0
-        self.is_in_failsafe = False
-
-    def terminate(self) -> None:
-        """Stop the motors for good."""
-        self.arming.terminate()
-        self.switch_to(TERMINATION)
-
-    def change_mode(self, mode: Px4Mode) -> bool:
-        """What a user asks for: anything while disarmed, only what can run while armed; LAND always."""
-        if self.is_armed and mode != LAND and not self.can_run(mode):
-            return False
-        if mode not in _NOT_AFTER_LANDING:
-            self.mode_after_landing = mode
-        self.is_in_failsafe = False
-        self.intended_mode = mode
-        self.failsafes.take_over()
-        if mode == self.mode == MISSION:
-            self.mission.enter()
-        elif mode == self.mode:
-            self.flight.stay_here()
-        else:
-            self.switch_to(mode)
-        if mode == TAKEOFF:
-            self.flight.plan_take_off()
-        return True
-
-    def can_run(self, mode: Px4Mode) -> bool:
-        """Whether the mode has what it needs: sticks, a mission, set-points, a position."""
-        traits = KNOWN.get(mode)
-        if traits is None or self.arming.is_terminated or (mode == MISSION and not self.mission.is_valid):
-            return False
-        if (traits.needs_sticks and not self.sticks.are_fresh) or (
-            mode == OFFBOARD and not self.offboard.is_fresh
-        ):
-            return False
-        return self.has_position or not traits.needs_position
-
-    def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode, whoever wants it; only the next heartbeat tells."""
-        self.mode = mode
-        self.flight.enter(mode)
-        if mode == RTL and self.is_armed:  # tells its own parts
-            self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
-
-    # ---------------------------------------------------------------------------------------- flying
-
-    def leave_ground(self) -> None:
-        """The land detector sees a take-off."""
-        self.is_landed, self._has_flown, self._touched_at = False, True, math.nan
-        self.info("Takeoff detected")
-
-    def sticks_moved(self, size: float) -> None:
-        """Somebody takes the sticks (COM_RC_STICK_OV per cent) in a mode that flies by itself (COM_RC_OVERRIDE)."""
-        if self.is_armed and not self.is_landed and self.failsafes.may_be_taken_over(size):
-            self.info("Pilot took over using sticks")
-            self.change_mode(POSITION)
-
-    def tick(self, dt: float) -> None:
-        """Mode, motion, land detector, battery, failsafe."""
-        if self.is_armed:
-            self.offboard.watch()
-            self.flight.update()
-        if self._moves():
-            self.motion.step(dt, powered=self.has_power)
-        if not self.is_landed:
-            self._detect_landing()
-        self._disarm_by_itself()
-        self._run_motors(dt)
-        if not self.is_armed and self.is_landed:
-            self.set_ticking(False)
-
-    @property
-    def has_power(self) -> bool:
-        """Whether the motors turn."""
-        return self.is_armed and not self.faults.motor_failed and not self.arming.is_terminated
-
-    def _moves(self) -> bool:
-        return not self.is_landed
-
-    def _is_down(self) -> bool:
-        return self.motion.is_on_ground
-
-    def _run_motors(self, dt: float) -> None:
-        self.throttle = 0.0
-        if self.is_armed and not self.is_landed:
-            lift = max(0.0, 1.0 - self.motion.acceleration_down / GRAVITY_M_S2)
-            lean = math.cos(self.motion.roll) * math.cos(self.motion.pitch)
-            self.throttle = min(1.0, _HOVER_THROTTLE * lift / max(0.5, lean))
-        self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
-
-    def _detect_landing(self) -> None:
-        wants_up = self.is_armed and self.flight.lifts_off
-        if not self._is_down() or wants_up or self.arming.is_terminated:
-            self._touched_at = math.nan
-        elif math.isnan(self._touched_at):
-            self._touched_at = self.now
-        elif self.now - self._touched_at >= _LAND_DETECTOR_S or not self.is_armed:
-            self.is_landed = True
-            self._landed_at = self.now
-            self.motion.settle()
-            self.info("Landing detected")
-            self.mission.landed()
-
-    def _disarm_by_itself(self) -> None:
-        if not self.is_armed or not self.is_landed or self.flight.lifts_off:
-            return
-        if self._has_flown and self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
-            self.arming.disarm("landing")
-        elif not self._has_flown and 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.since:
-            self.arming.disarm("auto preflight disarming")
-
-    # -------------------------------------------------------------------------------- other messages
-
-    def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        """Only one to everybody is a question."""
-        if ping.target_system == ping.target_component == 0:
-            self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
         main, sub = mode_from_custom(request.custom_mode)
