@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavProtocolCapability
-from aerokit.mavlink.signing import timestamp_at
+from aerokit.mavlink.signing import SigningKey, timestamp_at
+from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandHandler, CommandServer
+from aerokit.sim.file_tree import FileTree
+from aerokit.sim.signing import VehicleSigning
 from aerokit.sim.vehicle import Component, SimulatedVehicle
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.signing import SigningKey
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.signing import VehicleSigning
 
 __all__ = ["SimulatedAutopilot"]
 

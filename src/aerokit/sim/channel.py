@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Hashable, Iterable
 from heapq import heappop, heappush, heapreplace
-from typing import TYPE_CHECKING
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.signing import Signing
 from aerokit.sim.fitting import fitted
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.mavlink.signing import Signing
 
 __all__ = ["MOST_PEERS", "Channel", "Hearing", "SharedHearing", "Streams", "datagrams"]
 

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from aerokit.mavlink.enums import MavFrame, MavResult, MavSeverity
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
-from aerokit.sim.faults import CommandFault
+from aerokit.sim.channel import Channel
+from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.faults import Faults
 
 __all__ = ["Command", "CommandServer", "Commanded", "Progress", "whole"]
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavResult
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
+from aerokit.mavlink.message import Message
 
 __all__ = ["CommandFault", "Faults"]
 

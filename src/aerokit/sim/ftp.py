@@ -6,21 +6,17 @@ https://mavlink.io/en/services/ftp.html
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import FileTransferProtocol
 from aerokit.protocols.ftp_message import FtpMessage
-from aerokit.sim.file_tree import EEXIST, ENOENT
+from aerokit.sim.channel import Channel
+from aerokit.sim.faults import Faults
+from aerokit.sim.file_tree import EEXIST, ENOENT, FileTree
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.faults import Faults
-    from aerokit.sim.file_tree import FileTree
 
 __all__ = ["FileHost", "FtpPacket", "FtpServer", "crc32", "path_in", "read_crc32"]
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aerokit.errors import InvalidArgument
+from aerokit.sim.vehicle import SimulatedVehicle
 from aerokit.wording import did_you_mean, shown
-
-if TYPE_CHECKING:
-    from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["kind_class", "kind_names", "simulated"]
 

@@ -9,8 +9,8 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import (
     LogData,
     LogEntry,
@@ -19,11 +19,8 @@ from aerokit.mavlink.messages import (
     LogRequestEnd,
     LogRequestList,
 )
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.channel import Channel
+from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["ArduPilotLogServer", "LogServer", "Px4LogServer", "SimulatedLog"]
 

@@ -6,19 +6,15 @@ import math
 import struct
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavParamError, MavParamType, MavSeverity
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.px4_hash import HASH_NAME, px4_hash
-from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.parameters import Parameters
-    from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.channel import Channel
+from aerokit.sim.parameters import Parameters
+from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 __all__ = ["ArduPilotParameterServer", "ParameterServer", "Px4ParameterServer", "rounded"]
 

@@ -7,17 +7,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import import_module
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.position import Position
 from aerokit.sim.track_points import Failure, TrackPoint, metres_from
 from aerokit.whole_file import write_whole
-
-if TYPE_CHECKING:
-    from os import PathLike
-
-    from aerokit.position import Position
 
 __all__ = ["check_picture", "draw_svg", "save_picture"]
 

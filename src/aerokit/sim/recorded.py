@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, BinaryIO
+from os import PathLike
+from typing import BinaryIO
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult, MavParamError, MavResult
+from aerokit.mavlink.message import Message
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandServer
 from aerokit.sim.ftp import FtpPacket
 from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
 from aerokit.sim.recording import Answer, FlightRecording
-from aerokit.sim.vehicle import SimulatedVehicle, sender_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from os import PathLike
-
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.vehicle import Component
+from aerokit.sim.vehicle import Component, SimulatedVehicle, sender_of
 
 __all__ = ["RecordedMissions", "RecordedParameters", "RecordedVehicle"]
 

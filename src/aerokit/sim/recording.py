@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, BinaryIO
+from os import PathLike
+from typing import BinaryIO
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavMissionResult, MavType
+from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import read_tlog
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from os import PathLike
-
-    from aerokit.mavlink.frame import Frame
-    from aerokit.mavlink.message import Message
 
 __all__ = ["LONGEST_GAP_S", "Answer", "FlightRecording", "Plan"]
 

@@ -8,17 +8,14 @@ import sys
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from typing_extensions import Self
 
 from aerokit.errors import BusyError, InvalidArgument, LinkLost
 from aerokit.links import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
-from aerokit.sim.channel import SharedHearing, datagrams
+from aerokit.sim.channel import Channel, SharedHearing, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
-    from aerokit.sim.channel import Channel
 
 __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 

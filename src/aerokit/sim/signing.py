@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.channel import Channel
+from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["VehicleSigning"]
 

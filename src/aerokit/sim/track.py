@@ -18,7 +18,8 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, cast, overload
+from os import PathLike
+from typing import Any, cast, overload
 
 from aerokit.autopilots import autopilot_for
 from aerokit.errors import InvalidArgument
@@ -28,11 +29,7 @@ from aerokit.sim.ardupilot.fence import PolygonZone
 from aerokit.sim.local_frame import true_place
 from aerokit.sim.picture import save_picture
 from aerokit.sim.track_points import Failure, TrackPoint, metres_from
-
-if TYPE_CHECKING:
-    from os import PathLike
-
-    from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["Failure", "Track", "TrackPoint", "least_distance_m", "record_track", "true_point"]
 

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from aerokit import geo
 from aerokit.position import Position
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Failure", "TrackPoint", "metres_from"]
 

@@ -12,18 +12,15 @@ import random
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import TYPE_CHECKING, Any, Protocol
+from random import Random
+from typing import Any, Protocol
 
 from aerokit.mavlink.enums import MavAutopilot, MavModeFlag, MavSeverity, MavState, MavType
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
-
-if TYPE_CHECKING:
-    from random import Random
-
-    from aerokit.sim.journal import Journal
+from aerokit.sim.journal import Journal
 
 __all__ = ["TICK_S", "Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
 

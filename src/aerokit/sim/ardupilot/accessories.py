@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from aerokit.mavlink.enums import MavResult, MavSeverity
-from aerokit.sim.commands import whole
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.commands import Command
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.commands import Command, whole
 
 __all__ = ["Accessories"]
 

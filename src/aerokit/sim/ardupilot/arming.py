@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from enum import IntFlag
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import GpsFixType, MavSeverity
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["Arming", "Check"]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -15,11 +14,8 @@ from aerokit.mavlink.enums import (
     PreflightCalibrationAccelerometer,
 )
 from aerokit.mavlink.messages import CommandLong
-from aerokit.sim.commands import Progress, whole
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.commands import Command, CommandHandler
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.commands import Command, CommandHandler, Progress, whole
 
 __all__ = ["AccelerometerCalibration", "Calibrations", "CompassCalibration"]
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
-from aerokit.sim.commands import whole
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.commands import Command, whole
 from aerokit.sim.motion import quaternion_from_euler
-
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.commands import Command
 
 __all__ = ["Camera"]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
 from aerokit.mavlink.messages import AutopilotVersion, GpsGlobalOrigin, MissionCurrent, SetGpsGlobalOrigin
 from aerokit.sim.ardupilot.payload_commands import (
@@ -12,12 +10,10 @@ from aerokit.sim.ardupilot.payload_commands import (
     camera_commands,
     equipment_commands,
 )
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandHandler, whole
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["HomeAndOrigin", "common_commands"]
 

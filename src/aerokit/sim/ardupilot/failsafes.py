@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.host import Host
 
 __all__ = ["BatteryFailsafe", "Failsafes"]
 

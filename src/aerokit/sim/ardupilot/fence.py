@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -16,14 +16,11 @@ from aerokit.mavlink.enums import (
     MavResult,
     MavSeverity,
 )
-from aerokit.sim.commands import whole
-
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.commands import Command
-    from aerokit.sim.local_frame import LocalFrame, Ned
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.commands import Command, whole
+from aerokit.sim.local_frame import LocalFrame, Ned
 
 __all__ = ["CIRCLE", "MAX_ALT", "MIN_ALT", "POLYGON", "REPORT_ONLY", "Fence", "Zones"]
 

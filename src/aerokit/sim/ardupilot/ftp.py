@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
 from aerokit.protocols.ftp_message import DATA_SIZE
-from aerokit.sim.file_tree import EISDIR, ENOENT, FileFault
+from aerokit.sim.channel import Channel
+from aerokit.sim.file_tree import EISDIR, ENOENT, Entry, FileFault, FileTree, OpenFile
 from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import Entry, FileTree, OpenFile
-    from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["ArduPilotFtp"]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -21,13 +20,11 @@ from aerokit.mavlink.enums import (
     MavSeverity,
 )
 from aerokit.mavlink.messages import GlobalPositionInt
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.channel import Channel
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Gimbal", "Target"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavResult, MavSeverity, SpeedType
 from aerokit.mavlink.messages import MissionItemReached
@@ -11,11 +11,8 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-from aerokit.sim.commands import whole
-
-if TYPE_CHECKING:
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.commands import Command, CommandHandler, whole
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["LevelAuto", "LevelVehicle"]
 

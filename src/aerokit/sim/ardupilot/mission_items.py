@@ -8,14 +8,11 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.missions import float32
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.parameter_tables import Kind
 
 __all__ = ["COMMAND_NAMES", "altitude_frame", "has_location", "is_place", "stored", "whole"]
 

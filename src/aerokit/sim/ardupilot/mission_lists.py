@@ -7,15 +7,13 @@ that is neither the old nor the new one. A fence is put together aside and check
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored, whole
+from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.missions import float32
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.parameter_tables import Kind
 
 __all__ = ["CommandList", "FenceList", "ItemList", "RallyList"]
 

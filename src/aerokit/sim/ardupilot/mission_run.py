@@ -7,15 +7,13 @@ after the other while the second of the two runs. The mode that flies the missio
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from aerokit.mavlink.enums import MavCmd, MissionState
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.ardupilot.mission_items import COMMAND_NAMES
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
 
 __all__ = ["MissionFlyer", "MissionRun", "is_navigation"]
 

@@ -8,21 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire
+from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
+from aerokit.sim.channel import Channel
 from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.channel import Channel
 
 __all__ = ["MissionServer"]
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.local_frame import Ned
+from aerokit.missions import MissionItem
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["AutoMode", "VehicleMode"]
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import EkfStatusFlags as Ekf
 from aerokit.mavlink.enums import GpsFixType, MavMissionType
+from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame, Ned
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
 
 __all__ = ["Navigation", "best_return_place"]
 

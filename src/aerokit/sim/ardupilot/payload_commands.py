@@ -7,20 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMountMode, MavResult, MavSeverity
 from aerokit.sim.ardupilot.accessories import Accessories
-from aerokit.sim.commands import whole
+from aerokit.sim.ardupilot.gimbal import Gimbal
+from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.motion import euler_from_quaternion
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.gimbal import Gimbal
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import Command, CommandHandler
 
 __all__ = ["GimbalCommands", "RegionOfInterest", "camera_commands", "equipment_commands"]
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.messages import ManualControl
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.channel import Channel
 
 __all__ = ["Joystick", "LevelJoystick", "Radio", "SubJoystick"]
 

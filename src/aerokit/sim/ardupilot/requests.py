@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavDataStream, MavResult
 from aerokit.mavlink.messages import (
@@ -16,13 +14,10 @@ from aerokit.mavlink.messages import (
     RequestDataStream,
     TerrainRequest,
 )
-from aerokit.sim.commands import whole
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import Command
+from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import Command, whole
 
 __all__ = ["KNOWN_MESSAGES", "RATE_PARAMETERS", "STREAM_GROUPS", "Requests"]
 

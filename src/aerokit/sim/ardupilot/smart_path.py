@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavSeverity
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["SmartPath", "prune", "simplify"]
 

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
+from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.file_tree import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
 from aerokit.sim.parameters import ParameterPackMount
 from aerokit.sim.signing import VehicleSigning
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.host import Host
 
 __all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "ArduPilotSigning", "Storage"]
 

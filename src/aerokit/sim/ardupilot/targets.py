@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.channel import Channel
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["RoverTargets", "SubTargets", "Target", "TargetMode", "Targets"]
 

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GpsFixType, HlFailureFlag, MavAutopilot, PlaneMode
+from aerokit.mavlink.message import Message
+from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.plane.host import PlaneHost
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
+from aerokit.sim.ardupilot.rover.host import RoverHost
+from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.telemetry_motion import ATTITUDE_BUILDERS, POSITION_BUILDERS
 from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.plane.host import PlaneHost
-    from aerokit.sim.ardupilot.rover.host import RoverHost
-    from aerokit.sim.ardupilot.sub.host import SubHost
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["BUILDERS_OF_KIND", "Builders"]
 

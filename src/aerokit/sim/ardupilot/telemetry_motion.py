@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, PlaneMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
+from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.copter.guided import Guided
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["ATTITUDE_BUILDERS", "POSITION_BUILDERS", "global_origin", "home_position"]
 

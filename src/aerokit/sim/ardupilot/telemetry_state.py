@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -21,11 +20,9 @@ from aerokit.mavlink.enums import (
     SubMode,
 )
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.mavlink.message import Message
+from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 __all__ = ["STATE_BUILDERS", "heartbeat", "sensor_status"]
 

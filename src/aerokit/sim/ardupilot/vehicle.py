@@ -5,21 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.accessories import Accessories
-from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES
+from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES, BootTimeline
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.gimbal import Gimbal
 from aerokit.sim.ardupilot.host import ArmingPart, Host
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
+from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.navigation import Navigation
 from aerokit.sim.ardupilot.parameter_tables import parameters_of
@@ -27,22 +31,14 @@ from aerokit.sim.ardupilot.radio import Joystick, Radio
 from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, Storage
 from aerokit.sim.battery import Battery
-from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import CommandHandler
+from aerokit.sim.file_tree import FileTree
+from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame, Ned
+from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import Motion, Wind
+from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import Component, sender_of
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.mavlink.signing import SigningKey
-    from aerokit.sim.ardupilot.boot import BootTimeline
-    from aerokit.sim.ardupilot.ftp import ArduPilotFtp
-    from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import CommandHandler
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.local_frame import Ned
-    from aerokit.sim.logs import SimulatedLog
-    from aerokit.sim.parameters import Parameters
 
 __all__ = ["ArduPilotVehicle"]
 

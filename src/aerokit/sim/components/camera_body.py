@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, MavType
+from aerokit.mavlink.messages import CameraImageCaptured
 from aerokit.parameters import parse_definition
+from aerokit.parameters.definition import CameraDefinition
 from aerokit.sim.components.captures import GREY_JPEG, CameraHost, Captures, MemoryCard
 from aerokit.sim.components.component import pose_of
 from aerokit.sim.components.extended_parameters import ExtendedParameters
+from aerokit.sim.components.gimbal import SimulatedGimbal
 from aerokit.sim.components.lens import Lens, Tracking
 from aerokit.sim.file_tree import FileTree
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from aerokit.mavlink.messages import CameraImageCaptured
-    from aerokit.parameters.definition import CameraDefinition
-    from aerokit.sim.components.gimbal import SimulatedGimbal
 
 __all__ = ["CAPABILITIES", "DEFINITION_PATH", "CameraBody"]
 

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraMode, CameraSource, MavCmd, MavResult
-from aerokit.sim.commands import Progress, whole
+from aerokit.parameters import SettingValue
+from aerokit.sim.commands import Command, CommandHandler, Progress, whole
+from aerokit.sim.components.camera_body import CameraBody
 from aerokit.sim.components.camera_messages import camera_settings
 from aerokit.sim.components.extended_parameters import ExtendedParameters
-
-if TYPE_CHECKING:
-    from aerokit.parameters import SettingValue
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.components.camera_body import CameraBody
 
 __all__ = ["CameraParameters", "camera_commands"]
 

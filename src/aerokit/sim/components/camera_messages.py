@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, VideoStreamEncoding, VideoStreamStatusFlags, VideoStreamType
-from aerokit.sim.commands import whole
+from aerokit.sim.commands import Command, whole
+from aerokit.sim.components.camera_body import CameraBody
+from aerokit.sim.components.component import Builder
 from aerokit.sim.components.lens import FOCAL_LENGTH_MM
-
-if TYPE_CHECKING:
-    from aerokit.sim.commands import Command
-    from aerokit.sim.components.camera_body import CameraBody
-    from aerokit.sim.components.component import Builder
 
 __all__ = ["camera_builders", "camera_settings"]
 

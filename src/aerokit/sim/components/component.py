@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState
+from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
-from aerokit.sim.commands import CommandServer, whole
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import Command, CommandHandler, CommandServer, whole
 from aerokit.sim.faults import Faults
-from aerokit.sim.local_frame import true_place
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.ftp import FtpServer
-    from aerokit.sim.local_frame import GlobalPoint
-    from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.sim.file_tree import FileTree
+from aerokit.sim.ftp import FtpServer
+from aerokit.sim.local_frame import GlobalPoint, true_place
+from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["Builder", "Pose", "SimulatedComponent", "pose_of", "serve_files"]
 

@@ -5,17 +5,13 @@ https://mavlink.io/en/services/parameter_ext.html
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamExtType, ParamAck
+from aerokit.parameters import CameraDefinition, SettingValue
 from aerokit.parameters.setting import setting_bytes, setting_value, settings_equal
-
-if TYPE_CHECKING:
-    from aerokit.parameters import CameraDefinition, SettingValue
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.components.component import SimulatedComponent
+from aerokit.sim.channel import Channel
+from aerokit.sim.components.component import SimulatedComponent
 
 __all__ = ["ExtendedParameters"]
 

@@ -6,7 +6,7 @@ https://mavlink.io/en/services/gimbal_v2.html
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -19,15 +19,12 @@ from aerokit.mavlink.enums import (
     MavType,
 )
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
-from aerokit.sim.commands import whole
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.components.component import Builder, SimulatedComponent, pose_of
 from aerokit.sim.local_frame import GlobalPoint
 from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import Command, CommandHandler
 
 __all__ = ["SimulatedGimbal"]
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraCapFlags, CameraTrackingMode, CameraZoomType, MavResult, SetFocusType
 from aerokit.mavlink.enums import CameraTrackingStatusFlags as Flags
 from aerokit.mavlink.enums import CameraTrackingTargetData as Target
+from aerokit.sim.commands import Command
+from aerokit.sim.components.captures import CameraHost
 from aerokit.sim.components.component import pose_of
 from aerokit.sim.local_frame import LocalFrame
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from aerokit.sim.commands import Command
-    from aerokit.sim.components.captures import CameraHost
 
 __all__ = ["FOCAL_LENGTH_MM", "Axis", "Lens", "Tracking"]
 

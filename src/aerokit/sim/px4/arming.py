@@ -6,10 +6,11 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from functools import partial
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavComponent, MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandLong
+from aerokit.sim.commands import Command
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import (
     ALTITUDE,
     KNOWN,
@@ -21,10 +22,6 @@ from aerokit.sim.px4.modes import (
     STICK_MODES,
     TAKEOFF,
 )
-
-if TYPE_CHECKING:
-    from aerokit.sim.commands import Command
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Arming", "Calibration"]
 

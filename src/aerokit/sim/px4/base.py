@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavType
+from aerokit.mavlink.signing import SigningKey
 from aerokit.sim.battery import Battery
-from aerokit.sim.commands import CommandHandler
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import CommandHandler, CommandServer
+from aerokit.sim.file_tree import FileTree
 from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
+from aerokit.sim.logs import SimulatedLog
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
+from aerokit.sim.parameters import Parameters
 from aerokit.sim.px4.arming import Arming, Calibration
 from aerokit.sim.px4.camera_trigger import CameraTrigger
 from aerokit.sim.px4.failsafes import Failsafes
 from aerokit.sim.px4.flight import Flight
+from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.gimbal import Gimbal
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.link_rates import LinkRates
@@ -41,15 +47,6 @@ from aerokit.sim.px4.parameters import px4_parameters
 from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage
 from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
 from aerokit.sim.vehicle import Component, sender_of
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.signing import SigningKey
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import CommandServer
-    from aerokit.sim.file_tree import FileTree
-    from aerokit.sim.logs import SimulatedLog
-    from aerokit.sim.parameters import Parameters
-    from aerokit.sim.px4.ftp import Px4Ftp
 
 __all__ = ["Px4Vehicle"]
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.sim.commands import whole
+from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.components.component import pose_of
 from aerokit.sim.motion import quaternion_from_euler
-
-if TYPE_CHECKING:
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.px4.host import Px4Host
+from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["CameraTrigger"]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
 from aerokit.sim.commands import Command, CommandHandler, Progress, whole
+from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.gimbal_commands import gimbal_commands
 from aerokit.sim.px4.modes import (
     AUTO,
@@ -26,9 +26,6 @@ from aerokit.sim.px4.modes import (
     Px4Mode,
 )
 from aerokit.sim.px4.telemetry import available_modes
-
-if TYPE_CHECKING:
-    from aerokit.sim.px4.base import Px4Vehicle
 
 __all__ = ["other_commands", "px4_commands", "refusal_by_place", "set_mode"]
 

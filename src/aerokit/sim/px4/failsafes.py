@@ -11,18 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavMissionType, MavSeverity, MavType
+from aerokit.missions import MissionItem
+from aerokit.sim.channel import Channel
 from aerokit.sim.local_frame import Ned
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
 from aerokit.sim.px4.texts import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
-
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["FailsafeAction", "Failsafes", "Fence"]
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
+from aerokit.missions import MissionItem
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import approach_speed
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.manual import ManualFlight
 from aerokit.sim.px4.modes import (
     HOLD,
@@ -23,10 +24,6 @@ from aerokit.sim.px4.modes import (
     TERMINATION,
     Px4Mode,
 )
-
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Flight", "Orbit", "return_destination"]
 

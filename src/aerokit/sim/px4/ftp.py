@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp_message import DATA_SIZE
-from aerokit.sim.file_tree import EEXIST, FileFault
-from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.file_tree import FileTree, OpenFile
-    from aerokit.sim.ftp import FileHost
+from aerokit.sim.channel import Channel
+from aerokit.sim.file_tree import EEXIST, FileFault, FileTree, OpenFile
+from aerokit.sim.ftp import FileHost, FtpPacket, FtpServer, path_in, read_crc32
 
 __all__ = ["Px4Ftp"]
 

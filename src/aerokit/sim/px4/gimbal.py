@@ -8,18 +8,15 @@ the way home it takes control itself for a moment and turns to neutral.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.sim.channel import Channel
 from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Gimbal"]
 

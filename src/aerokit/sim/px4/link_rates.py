@@ -7,13 +7,10 @@ import math
 import pkgutil
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
+from aerokit.sim.channel import Channel
 
 __all__ = ["LINK_MODES", "LinkRates"]
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
+from aerokit.sim.channel import Channel
 from aerokit.sim.motion import GRAVITY_M_S2
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW, STICK_MODES
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["ManualFlight", "Sticks", "curved"]
 

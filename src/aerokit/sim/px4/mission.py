@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavSeverity, MavType, MissionState
 from aerokit.mavlink.messages import MissionItemReached
+from aerokit.missions import MissionItem
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
-
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Mission", "outside_fence", "rejection", "warning"]
 

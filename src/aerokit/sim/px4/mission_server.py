@@ -8,20 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavMissionType, MavSeverity
+from aerokit.mavlink.message import Message
+from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire
+from aerokit.sim.channel import Channel
 from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.mission_items import checksum, given_back, stored
 from aerokit.sim.vehicle import sender_of
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.missions import MissionItem
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["MissionLink", "MissionServer"]
 

@@ -6,19 +6,16 @@ https://docs.px4.io/main/en/flight_modes/offboard.html
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.channel import Channel
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
 from aerokit.sim.px4.flight import velocity_towards
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
-
-if TYPE_CHECKING:
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["Offboard"]
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavType
+from aerokit.missions import MissionItem
 from aerokit.sim.fixed_wing import FixedWing, WingLimits
-from aerokit.sim.motion import Wind
+from aerokit.sim.local_frame import Ned
+from aerokit.sim.motion import Motion, Wind
 from aerokit.sim.px4.flight import Flight
 from aerokit.sim.px4.mission import Mission
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, STICK_MODES, TAKEOFF, Px4Mode
 from aerokit.sim.px4.vehicle import SimulatedPx4
-
-if TYPE_CHECKING:
-    from aerokit.missions import MissionItem
-    from aerokit.sim.local_frame import Ned
-    from aerokit.sim.motion import Motion
 
 __all__ = ["PlaneFlight", "PlaneMission", "SimulatedPx4Plane"]
 

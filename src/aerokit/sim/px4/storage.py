@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.mavlink.enums import MavSeverity
@@ -15,13 +15,10 @@ from aerokit.protocols.ftp_message import DATA_SIZE
 from aerokit.sim.file_tree import EINVAL, FileFault, FileTree, OpenFile
 from aerokit.sim.logs import Px4LogServer, SimulatedLog
 from aerokit.sim.parameter_server import Px4ParameterServer
-from aerokit.sim.parameters import ParameterPackMount
+from aerokit.sim.parameters import ParameterPackMount, Parameters
 from aerokit.sim.px4.ftp import Px4Ftp
+from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.signing import VehicleSigning
-
-if TYPE_CHECKING:
-    from aerokit.sim.parameters import Parameters
-    from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "Px4ParameterMount", "Storage"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -18,8 +17,10 @@ from aerokit.mavlink.enums import (
     MavState,
     MavSysStatusSensor,
 )
+from aerokit.mavlink.message import Message
 from aerokit.sim.missions import INVALID_INDEX
 from aerokit.sim.motion import quaternion_from_euler
+from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.modes import (
     ACRO,
     ALTITUDE,
@@ -46,10 +47,6 @@ from aerokit.sim.px4.modes import (
     custom_mode,
 )
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.px4.base import Px4Vehicle
 
 __all__ = ["BUILDERS", "GIMBAL_MESSAGES", "available_modes"]
 

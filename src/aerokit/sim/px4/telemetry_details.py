@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavLandedState, MavOdidUaType, MavType, StorageStatus
+from aerokit.mavlink.message import Message
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
+from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.modes import ORBIT, custom_mode
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.message import Message
-    from aerokit.sim.px4.base import Px4Vehicle
 
 __all__ = ["IDENTITY_BUILDERS", "SENSOR_BUILDERS"]
 

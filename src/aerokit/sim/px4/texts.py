@@ -10,14 +10,10 @@ import math
 import re
 import struct
 from collections import deque
-from typing import TYPE_CHECKING
 
-from aerokit.mavlink.messages import CurrentEventSequence, Event
-
-if TYPE_CHECKING:
-    from aerokit.mavlink.messages import Statustext
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.px4.host import Px4Host
+from aerokit.mavlink.messages import CurrentEventSequence, Event, Statustext
+from aerokit.sim.channel import Channel
+from aerokit.sim.px4.host import Px4Host
 
 __all__ = ["NO_STATION", "OUTSIDE", "TOO_FAR", "TOO_HIGH", "Events", "TextLinks", "on_the_wire"]
 

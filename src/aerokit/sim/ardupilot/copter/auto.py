@@ -9,20 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavSeverity, SpeedType
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.copter.auto_legs import Circle, Climb, Descent, Leg, Return, Stay, Way
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import Mode
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.copter.host import CopterHost
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Auto"]
 

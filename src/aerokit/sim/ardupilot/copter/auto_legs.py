@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import TakeOff
 from aerokit.sim.ardupilot.copter.returning import Rtl, sink
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.host import CopterHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["Circle", "Climb", "Descent", "Leg", "Limits", "Return", "Stay", "Way"]
 

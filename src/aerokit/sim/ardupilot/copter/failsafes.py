@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode, FenceMitigate, MavSeverity
 from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
 from aerokit.sim.ardupilot.mode import VehicleMode
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.host import CopterHost
 
 __all__ = ["CopterArming", "CopterFailsafes", "CopterFence"]
 

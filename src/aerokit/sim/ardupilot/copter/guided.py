@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import Mode, TakeOff
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.copter.host import CopterHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["Guided", "Submode"]
 

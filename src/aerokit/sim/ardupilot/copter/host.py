@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
-
-if TYPE_CHECKING:
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["AutoYaw", "CopterHost"]
 

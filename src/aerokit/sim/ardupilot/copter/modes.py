@@ -8,16 +8,12 @@ the firmware for quadrotors.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.mode import VehicleMode
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.copter.host import CopterHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["AltHold", "Brake", "Circle", "Loiter", "Mode", "PosHold", "Stabilize", "TakeOff"]
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode
+from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import Mode
 from aerokit.sim.ardupilot.navigation import best_return_place
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.copter.host import CopterHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["Land", "Rtl", "SmartRtl", "sink"]
 

@@ -7,19 +7,16 @@ https://ardupilot.org/dev/docs/copter-commands-in-guided-mode.html
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.copter.guided import Guided
+from aerokit.sim.ardupilot.copter.host import CopterHost
+from aerokit.sim.channel import Channel
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.copter.host import CopterHost
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Setpoints"]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import (
     CopterMode,
@@ -17,6 +18,7 @@ from aerokit.mavlink.enums import (
     MotorTestThrottleType,
     SpeedType,
 )
+from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.copter.auto import Auto
 from aerokit.sim.ardupilot.copter.failsafes import CopterArming, CopterFailsafes, CopterFence
@@ -40,18 +42,12 @@ from aerokit.sim.ardupilot.copter.other_modes import (
 )
 from aerokit.sim.ardupilot.copter.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.copter.setpoints import Setpoints
+from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Any
-
-    from aerokit.sim.ardupilot.arming import Arming
-    from aerokit.sim.ardupilot.failsafes import Failsafes
-    from aerokit.sim.ardupilot.fence import Fence
-    from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.parameter_tables import Kind
 
 __all__ = ["MotorTest", "SimulatedCopter", "copter_commands"]
 

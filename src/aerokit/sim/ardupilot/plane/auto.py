@@ -8,20 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavSeverity, PlaneMode
 from aerokit.mavlink.messages import MissionItemReached
-from aerokit.sim.ardupilot.plane.host import Landing
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.plane.host import Landing, PlaneHost
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode, climb_out
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.missions import MissionItem
-    from aerokit.sim.ardupilot.plane.host import PlaneHost
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Auto"]
 

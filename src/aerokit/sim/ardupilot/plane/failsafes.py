@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavMissionType, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.navigation import best_return_place
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.plane.host import PlaneHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.ardupilot.plane.host import PlaneHost
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["PlaneFailsafes", "PlaneFence"]
 

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import AttitudeTargetTypemask as Mask
 from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
 from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
+from aerokit.sim.ardupilot.plane.host import PlaneHost
 from aerokit.sim.ardupilot.plane.modes import NavigatingMode
-from aerokit.sim.commands import whole
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import Command, CommandHandler, whole
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.plane.host import PlaneHost
-    from aerokit.sim.channel import Channel
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Guided", "PlaneSetpoints", "guided_commands"]
 

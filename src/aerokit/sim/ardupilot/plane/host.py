@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.fixed_wing import FixedWing
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import Motion, Wind
-
-if TYPE_CHECKING:
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["Landing", "PlaneHost"]
 

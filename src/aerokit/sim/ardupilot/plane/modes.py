@@ -6,18 +6,13 @@ The modes of lifting rotors are refused, as without Q_ENABLE.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavModeFlag, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.navigation import best_return_place
-from aerokit.sim.ardupilot.plane.host import Landing
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.plane.host import PlaneHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.ardupilot.plane.host import Landing, PlaneHost
+from aerokit.sim.local_frame import Ned
 
 __all__ = [
     "Autoland",

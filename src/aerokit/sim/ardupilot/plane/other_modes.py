@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import PlaneMode
 from aerokit.sim.ardupilot.plane.modes import FlyByWireA, Loiter, PlaneModeBase, Stabilize
-
-if TYPE_CHECKING:
-    from typing import ClassVar
 
 __all__ = ["Acro", "Autotune", "AvoidAdsb", "Initialising", "Thermal", "Training"]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import (
     MavCmd,
@@ -17,7 +18,11 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.commands import common_commands
+from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.plane.auto import Auto
 from aerokit.sim.ardupilot.plane.failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane.guided import Guided, PlaneSetpoints, guided_commands
@@ -38,16 +43,7 @@ from aerokit.sim.ardupilot.plane.modes import (
 )
 from aerokit.sim.ardupilot.plane.other_modes import Acro, Autotune, AvoidAdsb, Initialising, Thermal, Training
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
-from aerokit.sim.commands import whole
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from aerokit.sim.ardupilot.failsafes import Failsafes
-    from aerokit.sim.ardupilot.fence import Fence
-    from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.commands import Command, CommandHandler
+from aerokit.sim.commands import Command, CommandHandler, whole
 
 __all__ = ["PlaneArming", "SimulatedPlane", "plane_commands"]
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import FenceMitigate, MavSeverity, RoverMode
 from aerokit.sim.ardupilot.arming import Arming, Check
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.rover.host import RoverHost
+from aerokit.sim.ardupilot.rover.host import RoverHost
 
 __all__ = ["RoverArming", "RoverFailsafes", "RoverFence", "modes_of_action"]
 

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.sim.ardupilot.level import LevelAuto
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.navigation import best_return_place
+from aerokit.sim.ardupilot.rover.host import RoverHost
 from aerokit.sim.ardupilot.targets import Target
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.rover.host import RoverHost
-    from aerokit.sim.local_frame import Ned
+from aerokit.sim.local_frame import Ned
 
 __all__ = ["ROVER_MODES", "RoverAuto", "RoverGuided"]
 

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, RoverMode
+from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.radio import LevelJoystick
 from aerokit.sim.ardupilot.rover.failsafes import RoverArming, RoverFailsafes, RoverFence
 from aerokit.sim.ardupilot.rover.host import RoverHost
 from aerokit.sim.ardupilot.rover.modes import ROVER_MODES, RoverAuto, RoverGuided
 from aerokit.sim.ardupilot.targets import RoverTargets
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.commands import CommandHandler
 from aerokit.sim.ground_motion import GroundLimits, GroundMotion
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.arming import Arming
-    from aerokit.sim.ardupilot.failsafes import Failsafes
-    from aerokit.sim.ardupilot.fence import Fence
-    from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.commands import CommandHandler
-    from aerokit.sim.motion import Motion, Wind
+from aerokit.sim.motion import Motion, Wind
 
 __all__ = ["SimulatedRover"]
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from aerokit.mavlink.enums import MavSeverity, SubMode
 from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.failsafes import Failsafes
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.sub.host import SubHost
+from aerokit.sim.ardupilot.sub.host import SubHost
 
 __all__ = ["SubArming", "SubFailsafes"]
 

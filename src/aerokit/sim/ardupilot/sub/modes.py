@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from aerokit.mavlink.enums import SubMode
 from aerokit.sim.ardupilot.level import LevelAuto
 from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.targets import Target
+from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
-
-if TYPE_CHECKING:
-    from typing import ClassVar
-
-    from aerokit.sim.ardupilot.sub.host import SubHost
-    from aerokit.sim.local_frame import Ned
 
 __all__ = ["SUB_MODES", "SubAuto", "SubGuided"]
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavResult, MavType, SpeedType, SubMode
+from aerokit.sim.ardupilot.arming import Arming
+from aerokit.sim.ardupilot.failsafes import Failsafes
+from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.motors import Motors
+from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.radio import SubJoystick
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
 from aerokit.sim.ardupilot.sub.failsafes import SubArming, SubFailsafes
@@ -16,15 +20,9 @@ from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.sub.modes import SUB_MODES, SubAuto, SubGuided
 from aerokit.sim.ardupilot.targets import SubTargets
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.commands import Command, CommandHandler
 from aerokit.sim.ground_motion import UnderwaterMotion
-
-if TYPE_CHECKING:
-    from aerokit.sim.ardupilot.arming import Arming
-    from aerokit.sim.ardupilot.failsafes import Failsafes
-    from aerokit.sim.ardupilot.mode import VehicleMode
-    from aerokit.sim.ardupilot.parameter_tables import Kind
-    from aerokit.sim.commands import Command, CommandHandler
-    from aerokit.sim.motion import Motion, Wind
+from aerokit.sim.motion import Motion, Wind
 
 __all__ = ["SimulatedSub"]
 
