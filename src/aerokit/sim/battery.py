@@ -48,7 +48,6 @@ class Battery:
 
     @property
     def voltage_v(self) -> float:
-        """Voltage under the present load."""
         volts = self.cells * self._resting_cell_volts() - self.current_a * self.resistance_ohm
         return volts if volts > 0.0 else 0.0
 

@@ -47,13 +47,11 @@ class SharedHearing(Hearing):
         self._read: list[Message] | None = None
 
     def messages(self, data: bytes, now: float, peer: Hashable) -> list[Message]:
-        """See `Hearing`."""
         if self._read is None:
             self._read = super().messages(data, now, peer)
         return self._read
 
     def forget(self) -> None:
-        """Everybody has heard it."""
         self._read = None
 
 

@@ -79,11 +79,9 @@ class Commanded(Protocol):
         ...
 
     def send(self, message: Message, channel: Channel | None = None) -> None:
-        """Send on one channel, or on all."""
         ...
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT."""
         ...
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
@@ -122,7 +120,6 @@ class CommandServer:
         self.execute(Command(message.command, *numbers, *place, message.frame, channel, sender_of(message)))
 
     def execute(self, command: Command) -> None:
-        """Do it and answer."""
         if (refused := self._refusal(command)) is not None:
             self.answer(command, refused)
             return

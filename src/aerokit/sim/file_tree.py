@@ -33,7 +33,6 @@ class OpenFile(ABC):
         """Up to ``size`` bytes; nothing at the end."""
 
     def write(self, offset: int, data: bytes) -> None:
-        """Put bytes in; the file grows."""
         raise FileFault(EROFS)
 
     def close(self) -> None:  # noqa: B027 - most have nothing to do then
@@ -69,13 +68,11 @@ class TextMount(Mount):
         self._texts = texts
 
     def size(self, path: str) -> int:
-        """A placeholder."""
         if path not in self._texts:
             raise FileFault(ENOENT)
         return self._PLACEHOLDER
 
     def open(self, path: str, *, writing: bool) -> OpenFile:
-        """Read a text."""
         if writing:
             raise FileFault(EROFS)
         if path not in self._texts:
@@ -83,7 +80,6 @@ class TextMount(Mount):
         return _Opened(None, _File(self._texts[path].encode()))
 
     def entries(self) -> list[Entry]:
-        """All of them."""
         return [(name, self._PLACEHOLDER) for name in self._texts]
 
 
@@ -215,7 +211,6 @@ class FileTree:
         content.extend(bytes(size - len(content)))
 
     def remove_file(self, path: str) -> None:
-        """Delete a file."""
         folder, name = self._parent(path)
         self.claim(-self._file(path).size)
         del folder[name]

@@ -111,7 +111,6 @@ class FixedWing(Motion):
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it stands on the ground."""
         return self.is_on_ground and self._speed < _STOPPED_M_S
 
     def step(self, dt: float, *, powered: bool = True) -> None:
@@ -129,7 +128,6 @@ class FixedWing(Motion):
         self._differentiate(before, dt)
 
     def settle(self) -> None:
-        """Stand still and level on the ground."""
         super().settle()
         self._speed = self.throttle = 0.0
         self.roll_out()

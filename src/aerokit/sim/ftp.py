@@ -105,7 +105,6 @@ class FtpServer:
         raise NotImplementedError
 
     def restart(self) -> None:
-        """Forget everything, as a reboot does."""
         raise NotImplementedError
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
@@ -118,7 +117,6 @@ class FtpServer:
 
 
 def path_in(data: bytes) -> str:
-    """The text up to the first NUL."""
     return data.partition(b"\0")[0].decode("utf-8", "replace")
 
 

@@ -51,7 +51,6 @@ class GroundMotion(Motion):
     # ------------------------------------------------------------------------------------ what to do
 
     def stop(self) -> None:
-        """Brake and stand."""
         self.drive(0.0, 0.0)
 
     def drive(self, speed: float, turn_rate: float) -> None:
@@ -100,7 +99,6 @@ class GroundMotion(Motion):
         self.east += east * dt
 
     def settle(self) -> None:
-        """Stand."""
         super().settle()
         self.speed_m_s = 0.0
         self.stop()
@@ -113,7 +111,6 @@ class GroundMotion(Motion):
         return max(-most, min(most, rate))
 
     def _curve_speed(self, rate: float) -> float:
-        """The wanted speed, less in a curve."""
         most = self.wheels.top_speed_m_s
         if rate:
             most = min(most, max(_SLOW_M_S, self.wheels.sideways_m_s2 / abs(rate)))
@@ -148,12 +145,10 @@ class UnderwaterMotion(Motion):
 
     @property
     def is_on_ground(self) -> bool:
-        """Never: there is water below."""
         return False
 
     @property
     def is_at_surface(self) -> bool:
-        """Whether it touches the air."""
         return self.down <= self.ground_down
 
     @property
@@ -168,7 +163,6 @@ class UnderwaterMotion(Motion):
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
-        """Move at this velocity."""
         super().seek_velocity(north, east, down)
         self._is_floating = False
 

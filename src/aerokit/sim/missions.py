@@ -128,7 +128,6 @@ class MissionMount(Mount):
         self._writer: _Writer | None = None
 
     def size(self, path: str) -> int:
-        """A placeholder."""
         _type_of(path)
         return _PLACEHOLDER_SIZE
 

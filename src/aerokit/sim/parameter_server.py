@@ -43,7 +43,6 @@ class ParameterServer:
         return len(self._lists)
 
     def restart(self) -> None:
-        """Forget everything, as a reboot does."""
         self._lists.clear()
 
     # ------------------------------------------------------------------------------------------- list
@@ -133,7 +132,6 @@ class ArduPilotParameterServer(ParameterServer):
         self._is_reading = False
 
     def restart(self) -> None:
-        """Forget everything, as a reboot does."""
         super().restart()
         self._reads.clear()
         self._is_reading = False

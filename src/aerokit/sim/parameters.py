@@ -130,7 +130,6 @@ class Parameters:
         return self.row(name).type
 
     def default(self, name: str) -> float:
-        """What it is after a reset."""
         return self.row(name).default
 
     def row(self, name: str) -> ParameterRow:
@@ -146,7 +145,6 @@ class Parameters:
         self._names = None
 
     def remove(self, name: str) -> None:
-        """One less: the indices behind it change."""
         del self._rows[name]
         self._switched.pop(name, None)
         self._names = None

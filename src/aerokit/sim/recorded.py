@@ -321,7 +321,6 @@ class RecordedVehicle(SimulatedVehicle):
         return not self._is_on and self._next >= len(self.recording.stream)
 
     def boot(self) -> None:
-        """Begin the recording."""
         stream = self.recording.stream
         self._began_at = self.now
         self._next = bisect_right([time for time, _ in stream], self._start - 1e-9)

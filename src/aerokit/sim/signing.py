@@ -37,7 +37,6 @@ class VehicleSigning:
         vehicle.when_powered_on(self._power_on)
 
     def load(self) -> None:
-        """Use what is stored, on all ports."""
         for channel in self._vehicle.channels:
             self.start(channel)
 

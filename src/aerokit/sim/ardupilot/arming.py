@@ -55,7 +55,6 @@ class Arming:
         self._needs_no_arming = False
 
     def start(self) -> None:
-        """Begin the periodic checks."""
         self._reported_at = self._vehicle.now
         self._vehicle.every(_CHECK_PERIOD_S, self._check)
 
@@ -99,7 +98,6 @@ class Arming:
         )
 
     def own_reasons(self) -> list[str]:
-        """What this kind checks besides."""
         return []
 
     def mandatory_reasons(self) -> list[str]:
@@ -144,12 +142,10 @@ class Arming:
         return self.gps_reasons() if self.is_checked(Check.GPS) else ()
 
     def battery_reasons(self) -> Sequence[str]:
-        """See `BatteryFailsafe.reason_not_to_arm`."""
         reason = self._vehicle.failsafes.battery.reason_not_to_arm()
         return () if reason is None else (reason,)
 
     def radio_reasons(self) -> Sequence[str]:
-        """The radio is lost."""
         return ("Radio failsafe on",) if self._vehicle.failsafes.radio else ()
 
     def mission_reasons(self) -> Sequence[str]:
@@ -158,7 +154,6 @@ class Arming:
         return ("Mode requires mission",) if missing else ()
 
     def fence_reasons(self) -> Sequence[str]:
-        """See `Fence.reason_not_to_arm`."""
         reason = self._vehicle.fence.reason_not_to_arm()
         return () if reason is None else (reason,)
 

@@ -40,16 +40,13 @@ class AccelerometerCalibration:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether it asks for a position."""
         return self._asked is not None and AccelcalVehiclePos.LEVEL <= self._asked <= _LAST
 
     def reset(self) -> None:
-        """Give up, as a reboot does."""
         self._run += 1
         self._asked = None
 
     def start(self) -> None:
-        """Ask for the first position."""
         self._run += 1
         self._vehicle.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
         self._ask(self._run, AccelcalVehiclePos.LEVEL)
@@ -110,7 +107,6 @@ class CompassCalibration:
         self._reported = 0
 
     def reset(self) -> None:
-        """Give up, as a reboot does."""
         self._mask, self._started_at = 0, math.inf
 
     @property
@@ -120,7 +116,6 @@ class CompassCalibration:
 
     @property
     def percent(self) -> int:
-        """How far it is."""
         if not self._mask:
             return 0
         seconds = self._vehicle.now - self._started_at - _SETTLING_S
@@ -128,7 +123,6 @@ class CompassCalibration:
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {
             MavCmd.DO_START_MAG_CAL: self._start,
             MavCmd.DO_ACCEPT_MAG_CAL: self._accept,
@@ -204,7 +198,6 @@ class CompassCalibration:
         )
 
     def _following(self, compass: int) -> int:
-        """The next one that takes part."""
         return next(
             each
             for step in range(1, _COMPASSES + 1)
@@ -237,7 +230,6 @@ class Calibrations:
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {
             MavCmd.PREFLIGHT_CALIBRATION: self._calibrate,
             MavCmd.ACCELCAL_VEHICLE_POS: self.accelerometers.take,

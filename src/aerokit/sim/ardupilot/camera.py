@@ -47,7 +47,6 @@ class Camera:
 
     @property
     def is_fitted(self) -> bool:
-        """Whether there is one."""
         return int(self._vehicle.parameters["CAM1_TYPE"]) != 0
 
     @property
@@ -74,7 +73,6 @@ class Camera:
         return True
 
     def stop(self) -> None:
-        """End a series."""
         self.interval_s = 0.0
         self.remaining = 0
 
@@ -234,7 +232,6 @@ class Camera:
         )
 
     def video_stream(self) -> m.VideoStreamInformation | None:
-        """One that is none."""
         if not self.is_fitted:
             return None
         return m.VideoStreamInformation(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, "", "")

@@ -143,7 +143,6 @@ class HomeAndOrigin:
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {MavCmd.DO_SET_HOME: self._set_home, MavCmd.GET_HOME_POSITION: self._get_home}
 
     def _set_home(self, command: Command) -> int:

@@ -128,7 +128,6 @@ class Failsafes:
 
     @property
     def is_any_active(self) -> bool:
-        """Whether the vehicle reports a critical state."""
         return self.battery_is_low or self.ground_station or self.estimator or self.radio
 
     @property
@@ -151,7 +150,6 @@ class Failsafes:
         raise NotImplementedError
 
     def say(self, text: str, severity: int = MavSeverity.WARNING) -> None:
-        """Send a status text."""
         self._vehicle.send_text(severity, text)
 
     def change_to(self, *modes: int) -> bool:

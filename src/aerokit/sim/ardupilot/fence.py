@@ -178,12 +178,10 @@ class Fence:
 
     @property
     def active(self) -> int:
-        """Kinds that are configured, there, and enabled."""
         return self.enabled & self.present
 
     @property
     def zones(self) -> Zones:
-        """What is uploaded."""
         items = self._vehicle.missions.items(MavMissionType.FENCE)
         if items != self._zones_of:
             self._zones_of = list(items)

@@ -52,7 +52,6 @@ class ArduPilotFtp(FtpServer):
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything, as a reboot does."""
         self._queue: deque[tuple[FtpPacket, Channel]] = deque()
         self._is_awake = False
         self._file: OpenFile | None = None
@@ -68,7 +67,6 @@ class ArduPilotFtp(FtpServer):
         return int(self._file is not None and not self._is_idle())
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
-        """Queue it; what does not fit is lost."""
         if len(self._queue) < _QUEUE_DEPTH:
             self._queue.append((request, channel))
         if not self._is_awake:

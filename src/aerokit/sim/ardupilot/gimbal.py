@@ -86,7 +86,6 @@ class Gimbal:
 
     @property
     def is_fitted(self) -> bool:
-        """Whether there is one."""
         return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
@@ -111,7 +110,6 @@ class Gimbal:
 
     @property
     def target(self) -> Target:
-        """What it is to do now."""
         if self.mode == MavMountMode.RC_TARGETING:  # no stick turns it: all of them are in the middle
             return Target(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _UNTURNED:

@@ -41,7 +41,6 @@ class LevelVehicle(ArduPilotVehicle):
         self.rc[2] = _STICK_MIDDLE
 
     def tick(self, dt: float) -> None:
-        """Mode, motors, motion, battery."""
         if self.motors.is_armed:
             self.mode.update(dt)
         self.motors.update(self.now, dt, self.motion, landed=False)
@@ -51,13 +50,11 @@ class LevelVehicle(ArduPilotVehicle):
             self.set_ticking(False)
 
     def move(self, dt: float) -> None:
-        """Motion."""
         self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
 
     # ------------------------------------------------------------------------------------- commands
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {
             **common_commands(self),
             MavCmd.MISSION_START: self._start_mission,
@@ -144,15 +141,12 @@ class LevelAuto(VehicleMode):
         raise NotImplementedError
 
     def has_arrived(self, place: Ned) -> bool:
-        """Whether it is at the point."""
         raise NotImplementedError
 
     def stay(self) -> None:
-        """Stay where it is for one tick."""
         raise NotImplementedError
 
     def reached_text(self, index: int, seconds: float) -> str:
-        """What it says at a waypoint."""
         raise NotImplementedError
 
     def finish(self) -> None:
@@ -162,11 +156,9 @@ class LevelAuto(VehicleMode):
 
     @property
     def destination(self) -> Ned | None:
-        """Where it is going."""
         return self._place
 
     def enter(self, *, force: bool) -> bool:
-        """A mission is needed."""
         if self.vehicle.mode is self:
             return True
         if not self.vehicle.mission.is_present:
@@ -192,7 +184,6 @@ class LevelAuto(VehicleMode):
             self.vehicle.mission.start_or_resume()
 
     def update(self, dt: float) -> None:
-        """Mission, then motion."""
         self._start_if_waiting()
         if not self._is_waiting:
             self.vehicle.mission.update()
@@ -206,7 +197,6 @@ class LevelAuto(VehicleMode):
     # ---------------------------------------------------------------------------------- MissionFlyer
 
     def start_command(self, index: int, item: MissionItem) -> bool:
-        """See `MissionFlyer`."""
         command = item.command
         if command not in _KNOWN:
             return False
@@ -224,14 +214,12 @@ class LevelAuto(VehicleMode):
         return True
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """See `MissionFlyer`; everybody is told."""
         if self.vehicle.mode is not self or not self._is_done(index, item):
             return False
         self.vehicle.call_later(0.0, lambda: self.vehicle.send(MissionItemReached(index)))
         return True
 
     def end_mission(self) -> None:
-        """Stay there."""
         self._place = None
         self.finish()
 

@@ -90,7 +90,6 @@ class CommandList(ItemList):
 
     @property
     def count(self) -> int:
-        """With home."""
         return len(self._commands)
 
     def item(self, seq: int) -> MissionItem | int:
@@ -109,7 +108,6 @@ class CommandList(ItemList):
             self._commands.append(self._home())
 
     def begin(self, count: int) -> None:
-        """Cut what is longer."""
         del self._commands[count:]
         self.version += 1
 
@@ -138,7 +136,6 @@ class CommandList(ItemList):
         return MavMissionResult.ACCEPTED
 
     def clear(self) -> bool:
-        """Not while it is being flown."""
         if self._is_running():
             return False
         self.begin(0)
@@ -169,7 +166,6 @@ class RallyList(ItemList):
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return len(self._points)
 
     def item(self, seq: int) -> MissionItem | int:
@@ -180,11 +176,9 @@ class RallyList(ItemList):
         return MavMissionResult.INVALID_SEQUENCE if (point.x, point.y) == (0, 0) else point
 
     def begin(self, count: int) -> None:
-        """Cut what is longer."""
         del self._points[count:]
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Replace or append."""
         kept = _kept_rally_point(item)
         if isinstance(kept, int):
             return kept
@@ -194,7 +188,6 @@ class RallyList(ItemList):
         return MavMissionResult.ACCEPTED
 
     def clear(self) -> bool:
-        """Always."""
         self._points.clear()
         return True
 
@@ -247,11 +240,9 @@ class FenceList(ItemList):
         return len(self._stored if self._coming is None else self._coming)
 
     def items(self) -> list[MissionItem]:
-        """What is stored."""
         return list(self._stored)
 
     def item(self, seq: int) -> MissionItem | int:
-        """Out of what is stored."""
         return self._stored[seq] if seq < len(self._stored) else MavMissionResult.INVALID_SEQUENCE
 
     def begin(self, count: int) -> None:
@@ -260,11 +251,9 @@ class FenceList(ItemList):
         self._coming = coming
 
     def begin_update(self) -> None:
-        """What is not sent stays as it is."""
         self._coming = list(self._stored)
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Keep it for later."""
         assert self._coming is not None
         if seq >= len(self._coming):
             return MavMissionResult.INVALID_SEQUENCE
@@ -275,16 +264,13 @@ class FenceList(ItemList):
         return MavMissionResult.ACCEPTED
 
     def finish(self, say: Say) -> int:
-        """Check the whole fence and put it into force."""
         assert self._coming is not None
         return self.store([item for item in self._coming if item is not None], say)
 
     def abandon(self) -> None:
-        """The stored fence stays."""
         self._coming = None
 
     def clear(self) -> bool:
-        """Always."""
         self._stored = []
         return True
 
@@ -302,7 +288,6 @@ class FenceList(ItemList):
         return MavMissionResult.ACCEPTED
 
     def replace(self, items: Sequence[MissionItem], say: Say) -> int:
-        """All at once, as a file does."""
         kept = [_kept(item) for item in items]
         for item in kept:
             if isinstance(item, int):

@@ -127,7 +127,6 @@ class MissionRun:
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
     def starts_with_take_off(self) -> bool:
-        """Whether it can begin on the ground."""
         begin = _FIRST if self._restarts or not self.nav_index else self.nav_index
         return self.is_take_off(begin)
 

@@ -81,7 +81,6 @@ class MissionServer:
 
     @property
     def transfer_is_open(self) -> bool:
-        """Whether an upload is going on."""
         return bool(self._uploads)
 
     def items(self, mission_type: int) -> list[MissionItem]:

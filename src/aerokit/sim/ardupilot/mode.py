@@ -49,7 +49,6 @@ class VehicleMode:
         return False
 
     def resume(self) -> bool:
-        """Go on after `pause`."""
         return False
 
     def go_to(self, position: Ned) -> None:
@@ -58,7 +57,6 @@ class VehicleMode:
 
     @property
     def destination(self) -> Ned | None:
-        """Where it is going to."""
         return None
 
 

@@ -63,7 +63,6 @@ class Motors:
         self.wanted = False
 
     def update(self, now: float, dt: float, motion: Motion, *, landed: bool) -> None:
-        """Follow what is wanted."""
         self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
         if self.may_turn and self.wanted:
             if self.spool < 1.0:

@@ -80,7 +80,6 @@ class Navigation:
 
     @property
     def gps_is_lost(self) -> bool:
-        """Whether its receiver tells nothing."""
         return self._vehicle.faults.gps_lost or not self._vehicle.parameters["SIM_GPS1_ENABLE"]
 
     @property

@@ -36,7 +36,6 @@ class GimbalCommands:
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {
             MavCmd.DO_MOUNT_CONFIGURE: self._configure_mount,
             MavCmd.DO_MOUNT_CONTROL: self._control_mount,
@@ -123,7 +122,6 @@ class RegionOfInterest:
 
     @property
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {
             MavCmd.DO_SET_ROI: self._look_at,
             MavCmd.DO_SET_ROI_LOCATION: self._look_at,

@@ -160,7 +160,6 @@ class LevelJoystick(Joystick):
     """Rover: y steers, z drives, -1000 to 1000."""
 
     def sticks(self, axes: ManualControl) -> Mapping[int, int]:
-        """Two channels."""
         return {
             _ROLL: self.pulse(_ROLL, axes.y),
             _THROTTLE: self.pulse(_THROTTLE, axes.z),
@@ -176,7 +175,6 @@ class SubJoystick(Joystick):
     _SCALE: ClassVar[float] = 0.4
 
     def sticks(self, axes: ManualControl) -> Mapping[int, int]:
-        """Six channels; the first two are pitch and roll."""
         gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
         throttle_scale = 2 * self._SCALE * gain * self.setting("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale

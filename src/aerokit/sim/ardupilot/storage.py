@@ -120,16 +120,13 @@ class ArduPilotSigning(VehicleSigning):
         vehicle.when_powered_on(self._keep_time)
 
     def is_for(self, link_id: int) -> bool:
-        """Signing can be turned off for a port."""
         name, parameters = f"MAV{link_id + 1}_OPTIONS", self._ardupilot.parameters
         return not (name in parameters and int(parameters[name]) & _SIGNING_OFF)
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """Everything on the first port."""
         return _everything if link_id == 0 and self.trusts_first_port else None
 
     def may_change(self) -> bool:
-        """Not while armed."""
         if self._ardupilot.is_armed:
             self._ardupilot.send_text(MavSeverity.WARNING, "ERROR: Won't setup signing when armed")
             return False

@@ -138,7 +138,6 @@ class RoverTargets(Targets):
     """A heading or a turn alone is enough; thrust is a share of the usual speed."""
 
     def refuse_acceleration(self, message: PositionTarget) -> None:
-        """It says so."""
         self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
 
     def is_complete(self, target: Target) -> bool:

@@ -237,7 +237,6 @@ EXTRA_BUILDERS: Builders = {
 
 
 def airspeed(plane: PlaneHost) -> m.Airspeed:
-    """Of the pitot tube."""
     speed = plane.motion.airspeed_m_s
     return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
 
@@ -271,7 +270,6 @@ def outside_pressure(sub: SubHost) -> m.ScaledPressure3:
 
 
 def scaled_channels(rover: ArduPilotVehicle) -> m.RcChannelsScaled:
-    """All zeros, whatever the sticks do."""
     return m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255)
 
 

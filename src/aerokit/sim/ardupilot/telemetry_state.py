@@ -121,7 +121,6 @@ _LESS_CONTROL: dict[Kind, dict[int, int]] = {
 
 
 def sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
-    """Present, enabled and healthy, as integers."""
     suite, nav = _SUITES[vehicle.KIND], vehicle.navigation
     present = suite.working | suite.control | suite.unhealthy | _PREARM | _AHRS | _LOGGING
     enabled = suite.working | suite.unhealthy | _PREARM

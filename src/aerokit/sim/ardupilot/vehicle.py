@@ -169,7 +169,6 @@ class ArduPilotVehicle(Host):
         self.mode: VehicleMode = self._modes[self.first_mode]
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> ArduPilotSigning:
-        """Keeps the key."""
         return ArduPilotSigning(self, key, timestamp)
 
     def _listen(self) -> None:
@@ -355,7 +354,6 @@ class ArduPilotVehicle(Host):
         return mode
 
     def announce_parameter(self, name: str) -> None:
-        """Tell a parameter to everybody."""
         self.storage.parameters.send(name, UNKNOWN_INDEX, None)
 
     def available_modes(self) -> list[m.AvailableModes]:
@@ -378,7 +376,6 @@ class ArduPilotVehicle(Host):
         return m.AvailableModesMonitor(0) if message_id == m.AvailableModesMonitor.ID else None
 
     def tick(self, dt: float) -> None:
-        """Mode, motors, motion, battery."""
         if self.motors.is_armed:
             self.mode.update(dt)
         self.motors.update(self.now, dt, self.motion, landed=self.is_landed)

@@ -54,9 +54,7 @@ class SimulatedCamera(CameraBody):
         self.parameters = CameraParameters(self)
 
     def commands(self) -> dict[int, CommandHandler]:
-        """See `camera_commands`."""
         return camera_commands(self)
 
     def builders(self) -> dict[int, Builder]:
-        """See `camera_builders`."""
         return camera_builders(self)

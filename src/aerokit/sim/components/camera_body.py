@@ -135,7 +135,6 @@ class CameraBody(CameraHost):
             self.files.remove_file(f"/DCIM/{name}")
 
     def keep(self, image: CameraImageCaptured) -> str:
-        """Write the file of a picture; its URL."""
         path = f"/DCIM/IMG_{len(self.captures.images) + 1:04d}.JPG"
         picture = self.picture
         self.files.put(path, picture if isinstance(picture, bytes) else picture(image))

@@ -40,12 +40,10 @@ class CameraParameters(ExtendedParameters):
             values[ISO] = MOST_IN_VIDEO
 
     def can_set(self, name: str) -> bool:
-        """Not everything at any time."""
         captures = self._camera.captures
         return name != MODE or not (captures.is_busy or captures.is_recording)
 
     def has_set(self, name: str, value: SettingValue) -> None:
-        """The mode is the camera's."""
         if name == MODE and isinstance(value, int) and value != self._camera.mode:
             self._camera.mode = value
             self._camera.send(camera_settings(self._camera))
@@ -215,7 +213,6 @@ class _Settings:
         return self._told()
 
     def set_zoom(self, command: Command) -> int:
-        """See `Lens.set_zoom`."""
         camera = self._camera
         if not camera.can(CameraCapFlags.HAS_BASIC_ZOOM):
             return MavResult.UNSUPPORTED
@@ -224,7 +221,6 @@ class _Settings:
         return self._told()
 
     def set_focus(self, command: Command) -> int:
-        """See `Lens.set_focus`."""
         camera = self._camera
         if not camera.can(CameraCapFlags.HAS_BASIC_FOCUS):
             return MavResult.UNSUPPORTED

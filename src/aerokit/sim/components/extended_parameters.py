@@ -138,6 +138,5 @@ class ExtendedParameters:
         self._acknowledge(name, setting_bytes(self.values[name], kind), kind, result)
 
     def _acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
-        """To everybody: others learn of it so."""
         known = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
         self._component.send(m.ParamExtAck(name, data, known, result))

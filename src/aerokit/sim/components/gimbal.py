@@ -325,15 +325,12 @@ class SimulatedGimbal(SimulatedComponent):
             self.stream(m.GimbalDeviceAttitudeStatus.ID, 1.0 / self._attitude_rate_hz)
 
     def commands(self) -> dict[int, CommandHandler]:
-        """See `gimbal_commands`."""
         return gimbal_commands(self)
 
     def builders(self) -> dict[int, Builder]:
-        """See `gimbal_builders`."""
         return gimbal_builders(self)
 
     def listen(self) -> None:
-        """Orders that are messages."""
         hear_gimbal_orders(self)
 
     # -------------------------------------------------------------------------------- where it looks

@@ -35,12 +35,10 @@ class Axis:
 
     @property
     def percent(self) -> float:
-        """Where it is."""
         moved = (self._now() - self._since) * self._speed if self._speed else 0.0
         return max(0.0, min(100.0, self._from + moved))
 
     def set(self, percent: float) -> None:
-        """Stand there, as far as it goes."""
         self._from, self._speed = max(0.0, min(100.0, percent)), 0.0
 
     def move(self, speed: float) -> None:
@@ -109,7 +107,6 @@ class Tracking:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing is tracked."""
         self.mode: CameraTrackingMode = CameraTrackingMode.NONE
         self.place: tuple[float, ...] = ()
         """x, y, radius; or left, top, right, bottom."""

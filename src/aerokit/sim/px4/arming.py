@@ -147,7 +147,6 @@ class Arming:
         return [f"Preflight Fail: {reason}" for reason in reasons] + px4.failsafes.arming_reasons()
 
     def report_reasons(self) -> None:
-        """Say what fails."""
         for reason in self.reasons():
             self._px4.send_text(MavSeverity.CRITICAL, reason)
 

@@ -166,7 +166,6 @@ class Px4Vehicle(Px4Host):
         self.missions.reset()
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
-        """Keeps the key."""
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
@@ -205,7 +204,6 @@ class Px4Vehicle(Px4Host):
     # ------------------------------------------------------------------------------- boot and reboot
 
     def boot(self) -> None:
-        """Start up."""
         self.storage.restart()
         self.camera_trigger.restart()
         self.gimbal.start()
@@ -248,13 +246,11 @@ class Px4Vehicle(Px4Host):
         self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
 
     def send_parts(self, chunks: list[m.Statustext]) -> None:
-        """See `TextLinks`."""
         self.text_links.tell(chunks)
 
     # ------------------------------------------------------------------------------ arming and modes
 
     def armed(self) -> None:
-        """It was armed just now."""
         self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
         if not self.home_is_set_by_hand:
             self.home = (self.motion.north, self.motion.east, self.motion.down)
@@ -266,7 +262,6 @@ class Px4Vehicle(Px4Host):
         self.set_ticking(True)
 
     def disarmed(self) -> None:
-        """It was disarmed just now."""
         self.is_armed = False
         self.throttle = 0.0
         self.is_in_failsafe = False
@@ -316,7 +311,6 @@ class Px4Vehicle(Px4Host):
     # ---------------------------------------------------------------------------------------- flying
 
     def leave_ground(self) -> None:
-        """The land detector sees a take-off."""
         self.is_landed, self._has_flown, self._touched_at = False, True, math.nan
         self.info("Takeoff detected")
 

@@ -46,16 +46,13 @@ class CameraTrigger:
 
     @property
     def is_running(self) -> bool:
-        """Whether it takes a series."""
         return self._is_enabled and not self._is_paused
 
     def restart(self) -> None:
-        """Forget everything, as a reboot does."""
         self.sequence, self._is_enabled, self._is_paused = 0, False, False
         self._series += 1
 
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
         return {
             MavCmd.DO_DIGICAM_CONTROL: self._control,
             MavCmd.DO_TRIGGER_CONTROL: self._switch,
@@ -100,7 +97,6 @@ class CameraTrigger:
             self._px4.call_later(self.interval_s, lambda: self._take_next(series))
 
     def shoot(self) -> None:
-        """A picture now."""
         px4, number = self._px4, self.sequence
         self.sequence += 1
         self._last_at = px4.now

@@ -83,7 +83,6 @@ _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_SILENT, lambda _: None)
     handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
@@ -143,7 +142,6 @@ _AUTOTUNE_PERCENTS = (0, 20, 40, 60, 80, 95)
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler."""
     flight = _Flight(px4)
     return {
         **message_requests(px4),
@@ -243,7 +241,6 @@ class _Flight:
         return result
 
     def _plan_take_off(self, down: float) -> None:
-        """It never goes down for it."""
         px4 = self._px4
         if px4.is_armed and down > px4.motion.down and not px4.is_landed:
             px4.send_text(MavSeverity.CRITICAL, "Already higher than takeoff altitude")
@@ -366,7 +363,6 @@ _NOTHING_BUT_AN_ANSWER = frozenset({m.Heartbeat.ID})
 
 
 def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler."""
     requests = _Requests(px4)
     handlers: dict[int, CommandHandler] = {
         MavCmd.REQUEST_MESSAGE: requests.request_message,

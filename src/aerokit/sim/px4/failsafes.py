@@ -167,11 +167,9 @@ class Failsafes:
         self._is_taken_over = False
 
     def listen(self) -> None:
-        """Hear ground stations."""
         self._px4.on(m.Heartbeat, self._on_heartbeat)
 
     def start(self) -> None:
-        """A boot."""
         self._px4.every(_INTERVAL_S, self.check)
 
     @property

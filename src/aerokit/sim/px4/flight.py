@@ -146,7 +146,6 @@ class Flight:
             self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
-        """Make the present place the target."""
         motion = self._vehicle.motion
         self.target = (motion.north, motion.east, motion.down)
 
@@ -215,7 +214,6 @@ class Flight:
             self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")
 
     def go(self) -> None:
-        """Towards the target, and stay there."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         up, down = limits["MPC_Z_V_AUTO_UP"], limits["MPC_Z_V_AUTO_DN"]
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=up, descent=down)

@@ -61,11 +61,9 @@ class Px4Ftp(FtpServer):
         return sum(port.file is not None for port in self._ports.values())
 
     def restart(self) -> None:
-        """Forget everything, as a reboot does."""
         self._ports.clear()
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
-        """Answer at once."""
         port = self._ports.setdefault(channel, _Port(channel))
         port.used_at = self._vehicle.now
         if request.size > DATA_SIZE:

@@ -69,7 +69,6 @@ class Gimbal:
 
     @property
     def is_from_north(self) -> bool:
-        """Whether its yaw is."""
         return self._place is not None or bool(self._flags & Flags.YAW_LOCK)
 
     @property
@@ -116,7 +115,6 @@ class Gimbal:
         self._rates = (roll, pitch, yaw)
 
     def rest(self) -> None:
-        """Straight ahead."""
         self._place, self._flags, self._target, self._rates = None, 0, _AHEAD, _AHEAD
 
     def look_at(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> None:

@@ -120,7 +120,6 @@ class ManualFlight:
 
     @property
     def wants_up(self) -> bool:
-        """Whether the left stick leaves the ground."""
         px4 = self._px4
         if px4.mode not in STICK_MODES or not px4.sticks.are_fresh:
             return False
@@ -159,7 +158,6 @@ class ManualFlight:
             self._stay(down)
 
     def _stay(self, down: float) -> None:
-        """Brake, and then hold the place."""
         motion = self._px4.motion
         if self._place is None:
             if motion.ground_speed_m_s > _AT_REST_M_S:

@@ -187,7 +187,6 @@ class Mission:
 
     @property
     def wants_up(self) -> bool:
-        """Whether it leaves the ground."""
         return self._item is not None and not self.is_finished and self._phase != "land"
 
     # -------------------------------------------------------------------------------------- directing

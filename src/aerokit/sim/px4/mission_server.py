@@ -54,7 +54,6 @@ class MissionLink:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no transfer goes on here."""
         return self._state is State.IDLE
 
     # ---------------------------------------------------------------------------------------- sending
@@ -394,7 +393,6 @@ class MissionServer:
         return len(self._items.get(mission_type, ()))
 
     def item(self, mission_type: int, seq: int) -> MissionItem | None:
-        """One as it is kept."""
         items = self._items.get(mission_type, [])
         return items[seq] if 0 <= seq < len(items) else None
 

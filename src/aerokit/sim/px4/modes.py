@@ -127,7 +127,6 @@ STANDARD_MODES: Final[dict[int, Px4Mode]] = {
 
 
 def custom_mode(mode: Px4Mode) -> int:
-    """As HEARTBEAT carries it."""
     return mode[0] << 16 | mode[1] << 24
 
 

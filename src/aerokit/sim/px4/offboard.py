@@ -54,7 +54,6 @@ class Offboard:
 
     @property
     def wants_up(self) -> bool:
-        """Whether the set-point leaves the ground."""
         if self._attitude is not None:
             return self._thrust > 0.5
         down = self._position[2] - self._vehicle.motion.down
@@ -140,7 +139,6 @@ class Offboard:
     # ---------------------------------------------------------------------------------------- flying
 
     def fly(self) -> None:
-        """Follow the set-point."""
         motion = self._vehicle.motion
         if self._attitude is not None:
             roll, pitch, yaw = self._attitude

@@ -39,24 +39,20 @@ class PlaneFlight(Flight):
 
     @property
     def cruise_speed_m_s(self) -> float:
-        """FW_AIRSPD_TRIM."""
         return self._plane.parameters["FW_AIRSPD_TRIM"]
 
     @property
     def top_speed_m_s(self) -> float:
-        """FW_AIRSPD_MAX."""
         return self._plane.parameters["FW_AIRSPD_MAX"]
 
     @property
     def is_rolling(self) -> bool:
-        """Whether it is on its take-off run."""
         return (
             self.lifts_off
             and self._plane.now - self._plane.arming.since >= self._plane.parameters["RWTO_RAMP_TIME"]
         )
 
     def enter(self, mode: Px4Mode) -> None:
-        """A mode begins."""
         self.radius_m = self._plane.parameters["NAV_LOITER_RAD"]
         self.course = self._motion.yaw
         super().enter(mode)
@@ -96,19 +92,15 @@ class PlaneFlight(Flight):
         self.stay_here()
 
     def go(self) -> None:
-        """Circle around the target."""
         self.circle()
 
     def circle(self) -> None:
-        """Around the target, at its height."""
         self._motion.circle(*self.target, radius=self.radius_m, airspeed=self.speed_m_s)
 
     def fly_straight(self) -> None:
-        """Towards the target, and over it."""
         self._motion.fly_to(*self.target, airspeed=self.speed_m_s)
 
     def climb_out(self) -> None:
-        """Straight on, upwards."""
         climb = self._plane.parameters["FW_T_CLMB_MAX"]
         self._motion.head(self.course, self.speed_m_s, climb)
 
@@ -122,7 +114,6 @@ class PlaneFlight(Flight):
         self.target = place
 
     def circle_down(self) -> None:
-        """Sink in circles, wings level at last."""
         sink = self._plane.parameters["FW_T_SINK_MIN"]
         self.target = (*self.target[:2], self._motion.down + sink * _AHEAD_S)
         self._touch_down(self.circle)
@@ -288,7 +279,6 @@ class SimulatedPx4Plane(SimulatedPx4):
 
     @property
     def airspeed_m_s(self) -> float:
-        """What its sensor says."""
         return self.motion.airspeed_m_s
 
     def _make_motion(self, wind: Wind | None) -> Motion:

@@ -32,7 +32,6 @@ class Px4ParameterMount(ParameterPackMount):
         super().__init__(parameters, apply, block=DATA_SIZE)
 
     def open(self, path: str, *, writing: bool) -> OpenFile:
-        """Read or write."""
         reader = super().open(path, writing=False)
         return _Writer(self._parameters, self._apply) if writing else reader
 
@@ -187,15 +186,12 @@ class Px4Signing(VehicleSigning):
         self._px4 = vehicle
 
     def is_for(self, link_id: int) -> bool:
-        """Since 1.17."""
         return not self._px4.version.startswith("1.16")
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """Heartbeats and the traffic around, on every port."""
         return _may_be_unsigned
 
     def may_change(self) -> bool:
-        """Not while armed."""
         if not self.is_for(0):
             return False
         if self._px4.is_armed:
@@ -204,7 +200,6 @@ class Px4Signing(VehicleSigning):
         return True
 
     def changed(self) -> None:
-        """Say so."""
         self._px4.info("MAVLink signing disabled" if self.key is None else "MAVLink signing key accepted")
 
 

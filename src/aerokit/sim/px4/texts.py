@@ -116,5 +116,4 @@ class TextLinks:
 
 
 def on_the_wire(text: str) -> str:
-    """The text as STATUSTEXT carries it."""
     return text if text.startswith(_WITHOUT_TAB) else text + "\t"

@@ -41,7 +41,6 @@ class SimulatedPx4(Px4Vehicle):
     """
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        """See `px4_commands`; SET_MODE does as DO_SET_MODE."""
         self.on(m.SetMode, self._on_set_mode)
         return px4_commands(self)
 

@@ -112,7 +112,6 @@ class Auto(Mode):
 
     @property
     def destination(self) -> Ned | None:
-        """Where the present leg ends."""
         return self._leg.destination if isinstance(self._leg, Way | Return) else None
 
     def pause(self) -> bool:
@@ -123,7 +122,6 @@ class Auto(Mode):
         return True
 
     def resume(self) -> bool:
-        """Go on; always possible."""
         self.is_paused = False
         return True
 
@@ -165,7 +163,6 @@ class Auto(Mode):
             self._notice_changes()
 
     def update(self, dt: float) -> None:
-        """Mission, then the leg."""
         self._start_if_waiting()
         if not self._is_waiting:
             if self._notice_changes() and isinstance(self._leg, Way):
@@ -203,7 +200,6 @@ class Auto(Mode):
     # ---------------------------------------------------------------------------------- MissionFlyer
 
     def start_command(self, index: int, item: MissionItem) -> bool:
-        """See `MissionFlyer`."""
         handler = self._handlers.get(item.command)
         if handler is None:
             return False
@@ -211,7 +207,6 @@ class Auto(Mode):
         return True
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """See `MissionFlyer`; everybody is told."""
         if self.copter.mode is not self or not self._is_done(index, item):
             return False
         if not self._last_reached:

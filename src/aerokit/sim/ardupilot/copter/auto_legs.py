@@ -32,7 +32,6 @@ class Leg(Protocol):
     """``update`` tells the motion what to do for the next ``dt`` seconds."""
 
     def update(self, dt: float) -> None:
-        """One step."""
         ...
 
     @property
@@ -50,7 +49,6 @@ class Stay:
         self._copter = copter
 
     def update(self, dt: float) -> None:
-        """Stop."""
         self._copter.motors.wanted = not self._copter.is_landed
         self._copter.motion.seek_velocity(0.0, 0.0, 0.0)
 
@@ -101,11 +99,9 @@ class Circle:
 
     @property
     def is_complete(self) -> bool:
-        """All turns are flown."""
         return self._way is None and self._done / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
-        """Fly to the edge, then around."""
         if self._way is not None:
             self._way.update(dt)
             if self._way.is_complete:
@@ -124,7 +120,6 @@ class Circle:
         )
 
     def _limited_rate(self) -> float:
-        """What the acceleration allows on this circle."""
         fastest = math.sqrt(0.7 * self._copter.motion.limits.acceleration_m_s2 / max(0.5, self._radius))
         return math.copysign(min(abs(self._rate), fastest), self._rate)
 
@@ -148,7 +143,6 @@ class Climb:
 
     @property
     def is_complete(self) -> bool:
-        """At the height."""
         return self._take_off.is_complete
 
     def update(self, dt: float) -> None:
@@ -178,7 +172,6 @@ class Descent:
 
     @property
     def is_complete(self) -> bool:
-        """Landed, and the propellers slow."""
         return self._copter.is_landed and self._copter.motors.is_idle
 
     def update(self, dt: float) -> None:

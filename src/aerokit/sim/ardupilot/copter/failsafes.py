@@ -40,7 +40,6 @@ class CopterArming(Arming):
         return super().ahrs_reasons() or self.mandatory_reasons()
 
     def own_reasons(self) -> list[str]:
-        """Ground station, and a battery that was low before."""
         failsafes = self._copter.failsafes
         reasons = ["GCS failsafe on"] if failsafes.ground_station else []
         return [*reasons, "Battery failsafe"] if failsafes.battery_is_low else reasons
@@ -56,14 +55,12 @@ class CopterArming(Arming):
         return reasons
 
     def arm(self, *, force: bool = False) -> bool:
-        """The way back begins here."""
         done = super().arm(force=force)
         if done:
             self._copter.path.begin()
         return done
 
     def final_reasons(self) -> list[str]:
-        """Mode and throttle."""
         mode = self._copter.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
@@ -125,7 +122,6 @@ class CopterFailsafes(Failsafes):
         self._idle_since = math.nan
 
     def watch(self) -> None:
-        """Everything once."""
         self.battery.update()
         self._check_ground_station()
         self._check_estimator()
@@ -340,12 +336,10 @@ class CopterFence(Fence):
         self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
 
     def cleared(self) -> None:
-        """It says so in the air."""
         if not self._vehicle.is_landed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
     def refusal(self, mode: VehicleMode) -> tuple[int, str] | None:
-        """Only in the air."""
         if not self.forbids_modes() or not self._vehicle.is_armed or self._vehicle.is_landed:
             return None
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"

@@ -59,14 +59,12 @@ class Guided(Mode):
     # ------------------------------------------------------------------------------------ being told
 
     def enter(self, *, force: bool) -> bool:
-        """Stop; also what every nonsensical set-point does."""
         self._start(Submode.VELOCITY)
         self._is_paused = False
         self.velocity, self.acceleration = _STILL, _STILL
         return True
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb to metres above home."""
         self.submode = Submode.TAKE_OFF
         self._take_off = TakeOff(self.copter, altitude_m)
         self.copter.yaw.hold()
@@ -79,19 +77,16 @@ class Guided(Mode):
         self._updated_at = self.copter.now
 
     def follow(self, position: Ned, velocity: Ned, acceleration: Ned) -> None:
-        """Be at a point with this velocity."""
         self._enter_submode(Submode.POSITION_VELOCITY)
         self.position, self.velocity, self.acceleration = position, velocity, acceleration
         self._updated_at = self.copter.now
 
     def move(self, velocity: Ned, acceleration: Ned) -> None:
-        """Fly with this velocity."""
         self._enter_submode(Submode.VELOCITY)
         self.velocity, self.acceleration = velocity, acceleration
         self._updated_at = self.copter.now
 
     def accelerate(self, acceleration: Ned) -> None:
-        """Change the velocity like this."""
         self._enter_submode(Submode.ACCELERATION)
         self.acceleration = acceleration
         self._updated_at = self.copter.now
@@ -103,12 +98,10 @@ class Guided(Mode):
         self._updated_at = self.copter.now
 
     def pause(self) -> bool:
-        """Stop and stay until `resume`."""
         self._is_paused = True
         return True
 
     def resume(self) -> bool:
-        """Go on with the last target."""
         self._is_paused = False
         return True
 

@@ -26,7 +26,6 @@ class AutoYaw:
         self._rate = 0.0
 
     def hold(self) -> None:
-        """Keep the present heading."""
         self._apply = self._hold
         self._copter.motion.turn(0.0)
 
@@ -57,7 +56,6 @@ class AutoYaw:
 
     @property
     def has_region_of_interest(self) -> bool:
-        """Whether it looks at a place."""
         return self._apply == self._look_at_roi
 
     def turn(self, rate: float) -> None:
@@ -122,5 +120,4 @@ class CopterHost(ArduPilotVehicle):
         self.path.start()
 
     def look_at(self, place: Ned | None) -> None:
-        """See `AutoYaw.region_of_interest`."""
         self.yaw.region_of_interest(place)

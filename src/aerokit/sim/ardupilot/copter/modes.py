@@ -48,7 +48,6 @@ class TakeOff:
         self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:
-        """Climb on."""
         copter, motion = self._copter, self._copter.motion
         copter.motors.wanted = True
         if copter.is_landed:
@@ -68,7 +67,6 @@ class PilotedMode(Mode):
         self._take_off: TakeOff | None = None
 
     def enter(self, *, force: bool) -> bool:
-        """Forget an earlier take-off."""
         self._take_off = None
         self.is_taking_off = False
         return True
@@ -109,7 +107,6 @@ class PilotedMode(Mode):
         return not copter.is_landed
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
-        """Follow the sticks; here by attitude."""
         self.copter.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def start_take_off(self, altitude_m: float) -> bool:
@@ -154,11 +151,9 @@ class Loiter(PilotedMode):
     name = "LOITER"
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb, then hold."""
         return self.start_take_off(altitude_m)
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
-        """Sticks are velocities relative to the nose."""
         yaw = self.copter.motion.yaw
         forward, right = -pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S
         north = forward * math.cos(yaw) - right * math.sin(yaw)
@@ -182,7 +177,6 @@ class Circle(Loiter):
     can_arm = False
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Not in this mode."""
         return False
 
 
@@ -194,5 +188,4 @@ class Brake(Mode):
     can_arm = False
 
     def update(self, dt: float) -> None:
-        """Stop."""
         self.stay()

@@ -41,7 +41,6 @@ class Drift(AltHold):
     needs_position = True
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Not in this mode."""
         return False
 
 
@@ -56,7 +55,6 @@ class _Holding(Mode):
     """Stays where it is."""
 
     def update(self, dt: float) -> None:
-        """Stop."""
         self.stay()
 
 
@@ -91,7 +89,6 @@ class Follow(_Holding):
     can_arm = False
 
     def enter(self, *, force: bool) -> bool:
-        """Not without FOLL_ENABLE."""
         if self.copter.parameters["FOLL_ENABLE"]:
             return True
         self.copter.send_text(MavSeverity.WARNING, "Set FOLL_ENABLE = 1")
@@ -114,7 +111,6 @@ class _Refusing(Mode):
     TEXT: ClassVar[str] = ""
 
     def enter(self, *, force: bool) -> bool:
-        """No."""
         if self.TEXT:
             self.copter.send_text(MavSeverity.WARNING, self.TEXT)
         return False

@@ -28,17 +28,14 @@ class Land(Mode):
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
-        """Keep the heading."""
         self.copter.yaw.hold()
         return True
 
     def update(self, dt: float) -> None:
-        """Descend, then stop the motors."""
         descend(self.copter)
 
 
 def descend(copter: CopterHost) -> None:
-    """One step of a landing."""
     if not copter.is_landed:
         sink(copter)
         return
@@ -48,7 +45,6 @@ def descend(copter: CopterHost) -> None:
 
 
 def sink(copter: CopterHost) -> None:
-    """Straight down, slowly at last."""
     parameters = copter.parameters
     copter.motors.wanted = True
     speed = parameters["LAND_SPEED"] / 100.0
@@ -74,7 +70,6 @@ class Rtl(Mode):
         self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:
-        """Plan the way home."""
         self._phase, self.is_landing = "climb", False
         parameters = self.copter.parameters
         self.speed = (parameters["RTL_SPEED"] or parameters["WPNAV_SPEED"]) / 100.0
@@ -104,7 +99,6 @@ class Rtl(Mode):
         return (north, east, down if self._phase == "land" else self._altitude_down)
 
     def update(self, dt: float) -> None:
-        """One step of the present phase."""
         copter = self.copter
         if self._phase == "land":
             descend(copter)
@@ -154,7 +148,6 @@ class SmartRtl(Mode):
         self._way: list[Ned] = []
 
     def enter(self, *, force: bool) -> bool:
-        """Refused while there is no path."""
         if not self.copter.path.is_active:
             return False
         self._way, self.is_landing = self.copter.path.take_all(), False
@@ -172,11 +165,9 @@ class SmartRtl(Mode):
 
     @property
     def destination(self) -> Ned | None:
-        """The next point of the path."""
         return self._way[0] if self._way else None
 
     def update(self, dt: float) -> None:
-        """Fly to the next point, or land."""
         copter = self.copter
         if copter.is_landed or not self._way:
             self.is_landing: bool = True

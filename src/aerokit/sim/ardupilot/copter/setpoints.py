@@ -104,7 +104,6 @@ class Setpoints:
             yaw.default()
 
     def _local_point(self, target: SetPositionTargetLocalNed) -> Ned:
-        """The target's point in the world."""
         frame, motion = target.coordinate_frame, self._copter.motion
         if frame == MavFrame.LOCAL_NED:
             return self._copter.navigation.world((target.x, target.y, target.z))

@@ -102,7 +102,6 @@ class MotorTest:
 
 
 def copter_commands(copter: SimulatedCopter) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler."""
     flight = _Flight(copter)
     return {
         **common_commands(copter),
@@ -242,11 +241,9 @@ class SimulatedCopter(CopterHost):
     FENCE: ClassVar[type[Fence]] = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        """See `copter_commands`."""
         return copter_commands(self)
 
     def hear_setpoints(self) -> None:
-        """See `Setpoints`."""
         Setpoints(self)
 
     def reset_controllers(self) -> None:
@@ -257,12 +254,10 @@ class SimulatedCopter(CopterHost):
 
     @property
     def guided(self) -> Guided:
-        """GUIDED."""
         return self.mode_of(Guided)
 
     @property
     def auto(self) -> Auto:
-        """AUTO."""
         return self.mode_of(Auto)
 
     @property
@@ -281,7 +276,6 @@ class SimulatedCopter(CopterHost):
         return base | _ARMED if self.is_armed else base
 
     def move(self, dt: float) -> None:
-        """Motion and land detector."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)

@@ -97,7 +97,6 @@ class Auto(NavigatingMode):
     # --------------------------------------------------------------------------------------- running
 
     def update(self, dt: float) -> None:
-        """Mission, then what it is about."""
         plane = self.plane
         plane.mission.update()
         if plane.mode is not self:
@@ -136,7 +135,6 @@ class Auto(NavigatingMode):
     # ---------------------------------------------------------------------------------- MissionFlyer
 
     def start_command(self, index: int, item: MissionItem) -> bool:
-        """See `MissionFlyer`."""
         handler = self._handlers.get(item.command)
         if handler is None:
             return False
@@ -144,7 +142,6 @@ class Auto(NavigatingMode):
         return True
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """See `MissionFlyer`; everybody is told."""
         if self.plane.mode is not self or not self.plane.is_armed or not self._is_done(index, item):
             return False
         if item.command <= _C.NAV_LAST:

@@ -54,7 +54,6 @@ class PlaneFailsafes(Failsafes):
 
     @property
     def is_any_active(self) -> bool:
-        """Whether the vehicle reports a critical state."""
         return self.state != _NONE or self.battery_is_low
 
     @property
@@ -63,7 +62,6 @@ class PlaneFailsafes(Failsafes):
         return not (self.radio or self._is_radio_bad())
 
     def watch(self) -> None:
-        """Radio first: the others go by it."""
         self._watch_radio()
         self._watch_long()
         self._watch_short()
@@ -208,7 +206,6 @@ class PlaneFailsafes(Failsafes):
     # -------------------------------------------------------------------------------------- battery
 
     def act_on_battery(self, action: int) -> None:
-        """A landing goes on whatever the battery does."""
         if action == _TERMINATE:
             self.refuse_termination()
         elif action in (_LAND, _QLAND, _LOITER_QLAND):
@@ -275,7 +272,6 @@ class PlaneFence(Fence):
             self.caused_mode = False
 
     def act(self, new: int) -> None:
-        """Say it and turn back."""
         plane = self._plane
         if self.caused_mode:
             return
@@ -304,18 +300,15 @@ class PlaneFence(Fence):
         return (north, east, home[2] - height)
 
     def cleared(self) -> None:
-        """It says so unless it is returning."""
         if self._plane.is_armed and not self.caused_mode:
             self._plane.send_text(MavSeverity.NOTICE, "Fence breach cleared")
 
     def refusal(self, mode: VehicleMode) -> tuple[int, str] | None:
-        """FENCE_OPTIONS does so by default."""
         if not self.forbids_modes() or not self._plane.is_armed:
             return None
         return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
 
     def mode_changed(self) -> None:
-        """Ten seconds for the pilot."""
         super().mode_changed()
         self.recover_by_hand()
 

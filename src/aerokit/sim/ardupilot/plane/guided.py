@@ -45,7 +45,6 @@ class Guided(NavigatingMode):
     can_change_speed = True
 
     def enter(self, *, force: bool) -> bool:
-        """Circle here."""
         self._climb_limit = _AT_ONCE_M_S
         self._course: float | None = None
         self._bank = self._pitch = self._throttle = _Order(0.0, -math.inf)
@@ -78,7 +77,6 @@ class Guided(NavigatingMode):
             self._throttle = _Order(max(0.0, min(1.0, message.thrust)), now)
 
     def update(self, dt: float) -> None:
-        """Fly by what was ordered last."""
         wing, now = self.plane.wing, self.plane.now
         banks, pitches, throttles = (
             now - order.since < _PATIENCE_S for order in (self._bank, self._pitch, self._throttle)

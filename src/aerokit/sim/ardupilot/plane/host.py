@@ -38,7 +38,6 @@ class PlaneHost(ArduPilotVehicle):
         limits.bank_rad = math.radians(parameters["ROLL_LIMIT_DEG"])
 
     def reset_controllers(self) -> None:
-        """Forget the take-off."""
         self.take_off_yaw: float | None = None
         """Where it has taken off to, in radians; None before."""
         self._rests_since = math.nan
@@ -76,7 +75,6 @@ class Landing:
         self._stopped_at = math.nan
 
     def update(self, dt: float) -> None:
-        """One step."""
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
             self._wait()
@@ -143,7 +141,6 @@ class Landing:
             self._tell_distance()
 
     def _tell_distance(self) -> None:
-        """Once."""
         if not self._is_told:
             wing, self._is_told = self._plane.wing, True
             aside = math.hypot(self.point[0] - wing.north, self.point[1] - wing.east)

@@ -62,7 +62,6 @@ class Piloted(PlaneModeBase):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
-        """Follow the sticks."""
         plane, wing, throttle = self.plane, self.plane.wing, self.throttle()
         if plane.is_landed and self.plane.rc[2] <= _LOW_THROTTLE:
             wing.roll_out()
@@ -109,7 +108,6 @@ class FlyByWireB(PlaneModeBase):
         self._down = 0.0
 
     def enter(self, *, force: bool) -> bool:
-        """Keep this height."""
         self._down = self.plane.wing.down
         return True
 
@@ -123,7 +121,6 @@ class FlyByWireB(PlaneModeBase):
         self.steer(wing.climb_to(self._down))
 
     def steer(self, climb: float) -> None:
-        """Bank as the stick wants it."""
         wing = self.plane.wing
         wing.bank_and_climb(self.plane.cruise_m_s, self.stick(0) * wing.wing.bank_rad, climb)
 
@@ -158,12 +155,10 @@ class Circle(PlaneModeBase):
     flags: int = _NAVIGATES
 
     def enter(self, *, force: bool) -> bool:
-        """Keep this height."""
         self._down = self.plane.wing.down
         return True
 
     def update(self, dt: float) -> None:
-        """A third of the bank that is allowed."""
         wing = self.plane.wing
         if self.plane.is_landed:
             wing.roll_out()
@@ -186,7 +181,6 @@ class NavigatingMode(PlaneModeBase):
         self._place: Ned | None = None
 
     def enter(self, *, force: bool) -> bool:
-        """Circle here."""
         wing = self.plane.wing
         self.speed = 0.0
         self.radius = 0.0
@@ -195,16 +189,13 @@ class NavigatingMode(PlaneModeBase):
 
     @property
     def destination(self) -> Ned | None:
-        """The middle of the circle."""
         return self._place
 
     @property
     def airspeed(self) -> float:
-        """What it flies at."""
         return self.speed or self.plane.cruise_m_s
 
     def update(self, dt: float) -> None:
-        """Fly there and circle."""
         wing = self.plane.wing
         if self.plane.is_landed or self._place is None:
             wing.roll_out()
@@ -246,7 +237,6 @@ class TakeOff(NavigatingMode):
     name = "TAKEOFF"
 
     def enter(self, *, force: bool) -> bool:
-        """Begin once more."""
         super().enter(force=force)
         self._place = None
         self._climbs = False
@@ -254,11 +244,9 @@ class TakeOff(NavigatingMode):
 
     @property
     def is_taking_off(self) -> bool:  # type: ignore[override]
-        """Until it is at its height."""
         return self._climbs
 
     def update(self, dt: float) -> None:
-        """Climb straight on, then circle."""
         plane, wing = self.plane, self.plane.wing
         if self._place is None:
             self._begin()
@@ -294,7 +282,6 @@ class Autoland(NavigatingMode):
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
-        """Needs a flight, and the direction of its take-off."""
         plane = self.plane
         if plane.mode is self and plane.is_landed:  # armed again where it has landed
             return True
@@ -312,7 +299,6 @@ class Autoland(NavigatingMode):
         return True
 
     def update(self, dt: float) -> None:
-        """Approach and land."""
         self._landing.update(dt)
 
 

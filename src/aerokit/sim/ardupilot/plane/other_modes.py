@@ -31,7 +31,6 @@ class Autotune(FlyByWireA):
     name = "AUTOTUNE"
 
     def enter(self, *, force: bool) -> bool:
-        """Says that it begins."""
         self.plane.info("Started autotune")
         self.plane.info("Autotuning roll pitch yaw")
         return True
@@ -48,7 +47,6 @@ class _Refusing(PlaneModeBase):
     can_arm = False
 
     def enter(self, *, force: bool) -> bool:
-        """No."""
         return False
 
 

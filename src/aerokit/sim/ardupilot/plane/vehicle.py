@@ -60,7 +60,6 @@ class PlaneArming(Arming):
         self._plane = plane
 
     def own_reasons(self) -> list[str]:
-        """Failsafes, limits and mode."""
         mode = self._plane.mode
         return self._bad_limits() + ([] if mode.can_arm else [f"{mode.name} mode not armable"])
 
@@ -178,35 +177,28 @@ class SimulatedPlane(PlaneHost):
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_motors(self) -> Motors:
-        """One engine."""
         return _Engine()
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        """See `plane_commands`."""
         return plane_commands(self)
 
     def hear_setpoints(self) -> None:
-        """See `PlaneSetpoints`."""
         PlaneSetpoints(self)
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
-        """Those for lifting rotors need Q_ENABLE."""
         if number in _LIFTING_MODES:
             return MavSeverity.INFO, "Q_ENABLE 0"
         return super().unknown_mode(number)
 
     def refusal(self, mode: VehicleMode, reason: str) -> str:
-        """The same for every mode."""
         return "Flight mode change failed"
 
     @property
     def guided(self) -> Guided:
-        """GUIDED."""
         return self.mode_of(Guided)
 
     @property
     def auto(self) -> Auto:
-        """AUTO."""
         return self.mode_of(Auto)
 
     @property
@@ -218,7 +210,6 @@ class SimulatedPlane(PlaneHost):
         return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
 
     def move(self, dt: float) -> None:
-        """Motion, and whether it stands."""
         wing = self.wing
         was_on_ground = wing.is_on_ground
         wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
@@ -238,10 +229,8 @@ class _Engine(Motors):
 
     @property
     def current_a(self) -> float:
-        """What the battery gives."""
         return self.throttle * _FULL_AMPERES
 
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        """Follow the motion."""
         self.throttle = motion.throttle if self.is_armed and not landed else 0.0
         self.spool = self.throttle

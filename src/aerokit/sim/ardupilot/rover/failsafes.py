@@ -41,14 +41,12 @@ class RoverArming(Arming):
         return () if rover.navigation.has_position else ("Need Position Estimate",)
 
     def own_reasons(self) -> list[str]:
-        """Speed and mode."""
         reasons = []
         if self.is_checked(Check.PARAMETERS) and not self._rover.parameters["WP_SPEED"] > 0:
             reasons.append("WP_SPEED too low")
         return reasons + ([] if self._rover.mode.can_arm else ["Mode not armable"])
 
     def arm(self, *, force: bool = False) -> bool:
-        """The way back begins here."""
         done = super().arm(force=force)
         if done:
             self._rover.path.begin()
@@ -175,7 +173,6 @@ class RoverFailsafes(Failsafes):
             self.change_to(*modes_of_action(action))
 
     def act_on_battery(self, action: int) -> None:
-        """The same actions."""
         self._act(action)
 
     # ------------------------------------------------------------------------- estimator and wheels
@@ -240,6 +237,5 @@ class RoverFence(Fence):
             self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes_of_action(action))
 
     def mode_changed(self) -> None:
-        """Ten seconds for the pilot."""
         super().mode_changed()
         self.recover_by_hand()

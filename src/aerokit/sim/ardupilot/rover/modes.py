@@ -185,11 +185,9 @@ class RoverAuto(LevelAuto):
     vehicle: RoverHost
 
     def default_speed(self) -> float:
-        """WP_SPEED, or CRUISE_SPEED."""
         return self.vehicle.parameters["WP_SPEED"] or self.vehicle.parameters["CRUISE_SPEED"]
 
     def refuse(self) -> None:
-        """There is no mission."""
         self.vehicle.send_text(MavSeverity.NOTICE, "No Mission. Can't set AUTO.")
 
     def travel(self, place: Ned, *, stops: bool) -> None:
@@ -208,11 +206,9 @@ class RoverAuto(LevelAuto):
         return away <= self.vehicle.parameters["WP_RADIUS"]
 
     def stay(self) -> None:
-        """Stand."""
         self.vehicle.motion.stop()
 
     def reached_text(self, index: int, seconds: float) -> str:
-        """As the firmware says it."""
         text = f"Reached waypoint #{index}"
         return f"{text}. Loiter for {seconds:.0f} seconds" if seconds > 0 else text
 
@@ -237,21 +233,17 @@ class RoverGuided(_Mode):
 
     @property
     def can_change_speed(self) -> bool:  # type: ignore[override]
-        """On the way to a place only."""
         return self._place is not None and not self._is_there
 
     @property
     def destination(self) -> Ned | None:
-        """Where it is going."""
         return self._place
 
     def enter(self, *, force: bool) -> bool:
-        """Stand until there is a target."""
         self._place = self._target = None
         return True
 
     def go_to(self, position: Ned) -> None:
-        """Drive there and stand."""
         self._place, self._is_there, self._target = position, False, None
         self.speed = self.rover.parameters["WP_SPEED"] or self.rover.parameters["CRUISE_SPEED"]
 
@@ -263,7 +255,6 @@ class RoverGuided(_Mode):
         self._place, self._target, self._target_at = None, target, self.rover.now
 
     def update(self, dt: float) -> None:
-        """Drive."""
         if self._place is not None:
             self._go(self._place)
         elif self._target is None or self._is_stale():

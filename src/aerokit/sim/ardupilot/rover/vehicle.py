@@ -80,15 +80,12 @@ class SimulatedRover(RoverHost):
         return GroundMotion(self.rng, limits, wind)
 
     def make_motors(self) -> Motors:
-        """One motor."""
         return _Motors()
 
     def hear_setpoints(self) -> None:
-        """See `RoverTargets`."""
         RoverTargets(self, self.guided)
 
     def make_joystick(self) -> LevelJoystick:
-        """Two axes."""
         return LevelJoystick(self)
 
     @property
@@ -102,12 +99,10 @@ class SimulatedRover(RoverHost):
 
     @property
     def guided(self) -> RoverGuided:
-        """GUIDED."""
         return self.mode_of(RoverGuided)
 
     @property
     def auto(self) -> RoverAuto:
-        """AUTO."""
         return self.mode_of(RoverAuto)
 
     @property
@@ -122,11 +117,9 @@ class SimulatedRover(RoverHost):
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it stands."""
         return abs(self.motion.speed_m_s) < 0.01
 
     def refusal(self, mode: VehicleMode, reason: str) -> str:
-        """The same for every mode."""
         return "Flight mode change failed"
 
     def own_commands(self) -> dict[int, CommandHandler]:

@@ -30,13 +30,11 @@ class SubArming(Arming):
         self._sub = sub
 
     def reasons(self) -> list[str]:
-        """Without such a button nothing else is looked at."""
         if self._sub.is_initialised and not self._has_disarm_button():
             return ["Must assign a disarm or arm_toggle button or disarm aux function"]
         return super().reasons()
 
     def disarm(self, *, force: bool = True) -> bool:
-        """At any time."""
         return super().disarm(force=True)
 
     def _has_disarm_button(self) -> bool:
@@ -80,7 +78,6 @@ class SubFailsafes(Failsafes):
         return self.pilot or self.battery_is_low or self.ground_station or self.leak or hull
 
     def watch(self) -> None:
-        """Everything once."""
         self._watch_radio()
         self._watch_pilot()
         self._watch_ground_station()
@@ -148,7 +145,6 @@ class SubFailsafes(Failsafes):
     # ------------------------------------------------------------------------- battery and the hull
 
     def act_on_battery(self, action: int) -> None:
-        """Disarm (2) or surface (3)."""
         if action == _BATTERY_SURFACE:
             self._sub.set_mode(SubMode.SURFACE)
         elif action == _BATTERY_DISARM:
@@ -177,7 +173,6 @@ class _HullLimit:
         self._good_at = self._warned_at = 0.0
 
     def watch(self, sub: SubHost, value: float) -> None:
-        """Look at the value of now."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:

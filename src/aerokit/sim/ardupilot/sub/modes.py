@@ -132,7 +132,6 @@ class SubAuto(LevelAuto):
     vehicle: SubHost
 
     def default_speed(self) -> float:
-        """WPNAV_SPEED."""
         return self.vehicle.parameters["WPNAV_SPEED"] / 100.0
 
     def travel(self, place: Ned, *, stops: bool) -> None:
@@ -140,15 +139,12 @@ class SubAuto(LevelAuto):
         self.vehicle.travel(place, self.speed)
 
     def has_arrived(self, place: Ned) -> bool:
-        """Within WPNAV_RADIUS."""
         return self.vehicle.distance(place) <= self.vehicle.parameters["WPNAV_RADIUS"] / 100.0
 
     def stay(self) -> None:
-        """Keep still."""
         self.vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
 
     def reached_text(self, index: int, seconds: float) -> str:
-        """As the firmware says it."""
         return f"Reached command #{index}"
 
 
@@ -169,11 +165,9 @@ class SubGuided(_Mode):
 
     @property
     def destination(self) -> Ned | None:
-        """Where it is going."""
         return self._place
 
     def enter(self, *, force: bool) -> bool:
-        """Keep still."""
         self._place = self._target = self._heading = None
         self.speed = self.sub.parameters["WPNAV_SPEED"] / 100.0
         return True
@@ -197,7 +191,6 @@ class SubGuided(_Mode):
         self._heading = wrap_pi(heading)
 
     def update(self, dt: float) -> None:
-        """Move."""
         motion, target = self.sub.motion, self._target
         fresh = target is not None and self.sub.now - self._target_at <= target.patience_s
         if self._place is not None:

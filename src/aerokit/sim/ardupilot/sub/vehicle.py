@@ -81,15 +81,12 @@ class SimulatedSub(SubHost):
         return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
 
     def make_motors(self) -> Motors:
-        """Thrusters."""
         return _Motors(self)
 
     def hear_setpoints(self) -> None:
-        """See `SubTargets`."""
         SubTargets(self, self.guided)
 
     def make_joystick(self) -> SubJoystick:
-        """Six axes."""
         return SubJoystick(self)
 
     def reset_controllers(self) -> None:
@@ -100,7 +97,6 @@ class SimulatedSub(SubHost):
 
     @property
     def first_mode(self) -> int:
-        """It has no INITIAL_MODE."""
         return SubMode.MANUAL
 
     @property
@@ -114,12 +110,10 @@ class SimulatedSub(SubHost):
 
     @property
     def guided(self) -> SubGuided:
-        """GUIDED."""
         return self.mode_of(SubGuided)
 
     @property
     def auto(self) -> SubAuto:
-        """AUTO."""
         return self.mode_of(SubAuto)
 
     @property
@@ -132,7 +126,6 @@ class SimulatedSub(SubHost):
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether it floats."""
         return self.motion.is_still
 
     def refusal(self, mode: VehicleMode, reason: str) -> str:
