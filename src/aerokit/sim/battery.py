@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-__all__ = ["Battery"]
-
 _RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
 _RESTING_CELL_SLOPES = tuple(
     (low, volts, (high_volts - volts) / (high - low))

@@ -14,9 +14,6 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing
 from aerokit.sim.fitting import fitted
 
-__all__ = ["MOST_PEERS", "Channel", "Hearing", "SharedHearing", "Streams", "datagrams"]
-
-
 MOST_PEERS = 256
 
 

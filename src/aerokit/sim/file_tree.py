@@ -137,8 +137,6 @@ class FileTree:
         """Prefix (``"@PARAM"``) → the files below it."""
         self._root: _Folder = {}
 
-    # --------------------------------------------------------------------------------- for whoever sets it up
-
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
         """Make a file, and the folders it is in. A function makes the content when it is first read."""
         folder = self._root
@@ -165,8 +163,6 @@ class FileTree:
         except FileFault:
             return False
         return True
-
-    # ------------------------------------------------------------------------------------------ files
 
     def mounted(self, path: str) -> tuple[Mount, str] | None:
         """The mount that a path is in, and the rest of the path; None for one in the tree itself."""
@@ -238,8 +234,6 @@ class FileTree:
             raise FileFault(ENOSPC)
         self.free_bytes -= size
 
-    # ---------------------------------------------------------------------------------------- folders
-
     def entries(self, path: str) -> list[Entry]:
         """What is in a folder, in the order it came in."""
         if (inside := self.mounted(path)) is not None:
@@ -268,8 +262,6 @@ class FileTree:
         if node:
             raise FileFault(ENOTEMPTY)
         del folder[name]
-
-    # ---------------------------------------------------------------------------------------- finding
 
     def _find(self, path: str) -> _File | _Folder:
         node: _File | _Folder = self._root

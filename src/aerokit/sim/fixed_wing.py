@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 from aerokit.sim.motion import GRAVITY_M_S2, Motion, Wind, wrap_pi
 
-__all__ = ["FixedWing", "WingLimits"]
-
 _BANK_TIME_CONSTANT_S = 0.4
 _CLIMB_TIME_CONSTANT_S = 0.7
 _PITCH_TIME_CONSTANT_S = 0.3
@@ -65,8 +63,6 @@ class FixedWing(Motion):
         self._wanted_bank = 0.0
         self._wanted_climb = 0.0
 
-    # ------------------------------------------------------------------------------------ what to do
-
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
         """Keep an airspeed (m/s), a bank angle (rad, right is positive) and a climb (m/s)."""
         limit = self.wing.bank_rad
@@ -106,8 +102,6 @@ class FixedWing(Motion):
     def climb_to(self, down: float) -> float:
         """The climb in m/s that leads to a height."""
         return _HEIGHT_GAIN_PER_S * (self.down - down)
-
-    # ------------------------------------------------------------------------------------- and do it
 
     @property
     def is_at_rest(self) -> bool:

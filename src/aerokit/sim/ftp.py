@@ -18,8 +18,6 @@ from aerokit.sim.faults import Faults
 from aerokit.sim.file_tree import EEXIST, ENOENT, FileTree
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["FileHost", "FtpPacket", "FtpServer", "crc32", "path_in", "read_crc32"]
-
 
 class FtpPacket(FtpMessage):
     """What is in a FILE_TRANSFER_PROTOCOL, and whom it is from or for. A request's ``data`` are all 239 bytes."""

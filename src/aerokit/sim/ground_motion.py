@@ -8,9 +8,6 @@ from dataclasses import dataclass
 
 from aerokit.sim.motion import Motion, MotionLimits, Wind, approach_speed, wrap_pi
 
-__all__ = ["GroundLimits", "GroundMotion", "UnderwaterMotion"]
-
-
 _SPEED_TIME_CONSTANT_S = 0.3
 _HEADING_GAIN_PER_S = 2.0
 _SLOW_M_S = 1.0
@@ -48,8 +45,6 @@ class GroundMotion(Motion):
         self._rate = 0.0
         self._heading: float | None = None
 
-    # ------------------------------------------------------------------------------------ what to do
-
     def stop(self) -> None:
         self.drive(0.0, 0.0)
 
@@ -75,8 +70,6 @@ class GroundMotion(Motion):
             return
         off = abs(wrap_pi(course - self.yaw))
         self.head(min(speed, _SLOW_M_S) if off > _BESIDE_RAD else speed, course)
-
-    # ------------------------------------------------------------------------------------- and do it
 
     @property
     def airspeed_m_s(self) -> float:

@@ -91,15 +91,11 @@ class LogServer:
         self._transfer += 1
         self._outgoing.clear()
 
-    # ------------------------------------------------------------------------------------- what differs
-
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
         raise NotImplementedError
 
     def _on_data(self, request: LogRequestData, channel: Channel) -> None:
         raise NotImplementedError
-
-    # ------------------------------------------------------------------------------------ what does not
 
     def _on_erase(self, request: LogErase, channel: Channel) -> None:
         self.restart()

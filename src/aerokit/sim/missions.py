@@ -19,18 +19,6 @@ from aerokit.missions import MissionItem
 from aerokit.missions.pack import NO_CLEAR, pack_items, read_header, unpack_items
 from aerokit.sim.file_tree import EINVAL, ENFILE, ENOENT, FileFault, Mount, OpenFile
 
-__all__ = [
-    "INVALID_INDEX",
-    "AnyItem",
-    "AnyRequest",
-    "MissionMount",
-    "MissionStore",
-    "float32",
-    "item_from",
-    "item_message_float",
-]
-
-
 INVALID_INDEX = 0xFFFF
 """No item, where a message wants a number."""
 

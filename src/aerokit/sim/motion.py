@@ -136,8 +136,6 @@ class Motion:
         self._wanted_yaw: float | None = None
         self._wanted_yaw_rate = 0.0
 
-    # ------------------------------------------------------------------------------------ what to do
-
     def seek_velocity(self, north: float, east: float, down: float) -> None:
         """Fly at this velocity."""
         self._wanted, self._leaning, self._accelerating = (north, east, down), None, False
@@ -171,8 +169,6 @@ class Motion:
     def turn(self, rate: float) -> None:
         """Keep turning at this rate, in radians per second."""
         self._wanted_yaw, self._wanted_yaw_rate = None, rate
-
-    # ------------------------------------------------------------------------------------- and do it
 
     @property
     def is_on_ground(self) -> bool:

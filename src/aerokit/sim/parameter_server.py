@@ -16,8 +16,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
-__all__ = ["ArduPilotParameterServer", "ParameterServer", "Px4ParameterServer", "rounded"]
-
 
 class ParameterServer:
     """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; an autopilot's own class says how.
@@ -45,8 +43,6 @@ class ParameterServer:
     def restart(self) -> None:
         self._lists.clear()
 
-    # ------------------------------------------------------------------------------------------- list
-
     def start_list(self, channel: Channel) -> None:
         """Send all of them on a port; a list that runs there begins anew."""
         self._list_number += 1
@@ -70,8 +66,6 @@ class ParameterServer:
             self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number)
         )
 
-    # ------------------------------------------------------------------------------------- what differs
-
     def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
         raise NotImplementedError
 
@@ -85,8 +79,6 @@ class ParameterServer:
         """The PARAM_VALUE of a parameter."""
         parameters = self._parameters
         return ParamValue(name, parameters[name], parameters.type(name), len(parameters), index)
-
-    # ---------------------------------------------------------------------------------------- sending
 
     def send(self, name: str, index: int, channel: Channel | None) -> None:
         """Send a value on one port, or on all."""

@@ -82,9 +82,6 @@ def draw_svg(tracks: Sequence[Drawable]) -> str:
     return "\n".join([*lines, "</svg>\n"])
 
 
-# ------------------------------------------------------------------------------------------- shapes
-
-
 @dataclass(frozen=True)
 class _Line:
     places: Sequence[tuple[float, float]]
@@ -321,9 +318,6 @@ def _ticks(bounds: tuple[float, float], about: int) -> list[float]:
     step = next(factor * size for factor in (1.0, 2.0, 5.0, 10.0) if factor * size >= rough)
     first = math.ceil(bounds[0] / step)
     return [round(number * step, 6) for number in range(first, math.floor(bounds[1] / step) + 1)]
-
-
-# ---------------------------------------------------------------------------------------------- PNG
 
 
 def _save_png(shapes: Sequence[_Shape], path: str | PathLike[str]) -> None:

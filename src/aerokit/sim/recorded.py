@@ -157,8 +157,6 @@ class RecordedMissions:
                 found = plan.items
         return found
 
-    # ---------------------------------------------------------------------------------------- download
-
     def _on_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         items = self.items(request.mission_type)
         if items is None:
@@ -176,8 +174,6 @@ class RecordedMissions:
         self._vehicle.send(
             _item_message(items[request.seq], request.seq, sender_of(request), as_float), channel
         )
-
-    # ------------------------------------------------------------------------------------------ upload
 
     def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
         if message.mission_type not in self._vehicle.recording.uploads:
@@ -308,8 +304,6 @@ class RecordedVehicle(SimulatedVehicle):
         self.on(m.Timesync, self._on_timesync)
         self.on(m.Ping, self._on_ping)
 
-    # ----------------------------------------------------------------------------------------- playing
-
     @property
     def position_s(self) -> float:
         """Which second of the recording it is."""
@@ -356,8 +350,6 @@ class RecordedVehicle(SimulatedVehicle):
             self.boot()
         else:
             self._is_on = False
-
-    # --------------------------------------------------------------------------------------- answering
 
     def _on_command(self, command: Command) -> int | None:
         answer = self._answer_to(command)

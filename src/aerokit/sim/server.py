@@ -139,8 +139,6 @@ class SimulatorServer:
         if self.failure is not None and self.failure is not error:
             raise self.failure from self.failure.__cause__
 
-    # -------------------------------------------------------------------------------------- running
-
     def wake(self) -> None:
         """Let everything happen that is due; call it after a fault or a value was changed by hand.
 

@@ -11,8 +11,6 @@ from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["VehicleSigning"]
-
 
 class VehicleSigning:
     """What both makes do: take a key by SETUP_SIGNING while disarmed, sign and check on all ports, keep it.

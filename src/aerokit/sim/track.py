@@ -80,8 +80,6 @@ class Track(Sequence[TrackPoint]):
             self._catch_up()
         return self._points
 
-    # --------------------------------------------------------------------------------- what was flown
-
     @property
     def end(self) -> TrackPoint:
         """The latest point; AssertionError without any."""
@@ -146,8 +144,6 @@ class Track(Sequence[TrackPoint]):
     def nearest_m(self, place: Position) -> float:
         """How near it came to a place: along the ground, or in space if the place has an altitude above home."""
         return self._nearest(place)[0]
-
-    # ------------------------------------------------------------------------------------- assertions
 
     def assert_reached_altitude(self, altitude_m: float, *, within_m: float = 1.0) -> None:
         """It was at least ``altitude_m - within_m`` metres above home once."""
@@ -241,8 +237,6 @@ class Track(Sequence[TrackPoint]):
             assert name in modes, (
                 f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
             )
-
-    # -------------------------------------------------------------------------------------------------
 
     def _note(self, holds: bool, failure: Failure) -> None:
         """Keep what the assertion that comes next fails on, if it does."""

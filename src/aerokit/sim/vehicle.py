@@ -103,8 +103,6 @@ class SimulatedVehicle:
         for component in self.components:
             component.join(self)
 
-    # ---------------------------------------------------------------------------- bytes, time, bytes
-
     def open_channel(self, *, version: int = 2) -> Channel:
         """Another port with its own stream rates; ``version`` is the MAVLink version it speaks."""
         channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
@@ -175,8 +173,6 @@ class SimulatedVehicle:
         """For the messages."""
         return int((self.now - self.booted_at) * 1e6)
 
-    # ----------------------------------------------------------------------------- power and reboot
-
     def power_on(self) -> None:
         """Start booting now."""
         self.booted_at = self.now
@@ -217,8 +213,6 @@ class SimulatedVehicle:
     def tick(self, dt: float) -> None:
         """Move on by one tick."""
         raise NotImplementedError
-
-    # ----------------------------------------------------------------------------------------- time
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
         """Do something at a time; a reboot forgets it."""
@@ -276,8 +270,6 @@ class SimulatedVehicle:
         self._next_tick = self._ticks_from + self._ticks_done * TICK_S
         for channel in self.channels:
             channel.streams.postpone(late)
-
-    # ------------------------------------------------------------------------------- hearing, saying
 
     def on(self, message_class: type[Message], handler: Handler) -> None:
         """Hear such messages from now on, when they are for this vehicle."""

@@ -7,8 +7,6 @@ from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.commands import Command, whole
 
-__all__ = ["Accessories"]
-
 _SERVOS = 32
 _RELAYS = {"rover": 2}
 _FUNCTIONS = 320

@@ -10,8 +10,6 @@ from typing import ClassVar
 from aerokit.mavlink.enums import GpsFixType, MavSeverity
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
-__all__ = ["Arming", "Check"]
-
 _CHECK_PERIOD_S = 1.0
 _REPORT_PERIOD_S, _SOONEST_REPORT_S = 30.0, 4.0
 _CENTRED_STICKS = (("Roll", 1), ("Pitch", 2), ("Yaw", 4))
@@ -57,8 +55,6 @@ class Arming:
     def start(self) -> None:
         self._reported_at = self._vehicle.now
         self._vehicle.every(_CHECK_PERIOD_S, self._check)
-
-    # --------------------------------------------------------------------------------------- checks
 
     def is_checked(self, check: Check) -> bool:
         """Whether ARMING_CHECK wants it."""
@@ -119,8 +115,6 @@ class Arming:
         middle, dead_zone = parameters[f"RC{number}_TRIM"], parameters[f"RC{number}_DZ"]
         return abs(self._vehicle.rc[number - 1] - middle) > dead_zone
 
-    # ------------------------------------------------------------------------------ the single looks
-
     def ahrs_reasons(self) -> Sequence[str]:
         """The estimator."""
         nav = self._vehicle.navigation
@@ -157,8 +151,6 @@ class Arming:
         reason = self._vehicle.fence.reason_not_to_arm()
         return () if reason is None else (reason,)
 
-    # -------------------------------------------------------------------------------------- reports
-
     def _check(self) -> None:
         self._follow_requirement()
         vehicle = self._vehicle
@@ -183,8 +175,6 @@ class Arming:
     def _say(self, prefix: str, reasons: Sequence[str]) -> None:
         for reason in reasons:
             self._vehicle.send_text(MavSeverity.CRITICAL, f"{prefix}: {reason}"[:50])
-
-    # ------------------------------------------------------------------------------- arm and disarm
 
     @property
     def needs_arming(self) -> bool:

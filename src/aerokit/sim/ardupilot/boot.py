@@ -7,8 +7,6 @@ from dataclasses import dataclass, fields, replace
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.sim.ardupilot.parameter_tables import Kind
 
-__all__ = ["BOOT_TEXTS", "BOOT_TIMELINES", "BootTimeline"]
-
 
 @dataclass(frozen=True)
 class BootTimeline:

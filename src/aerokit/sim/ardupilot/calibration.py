@@ -17,9 +17,6 @@ from aerokit.mavlink.messages import CommandLong
 from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.commands import Command, CommandHandler, Progress, whole
 
-__all__ = ["AccelerometerCalibration", "Calibrations", "CompassCalibration"]
-
-
 _SAMPLE_S, _AGAIN_S = 1.3, 1.0
 _LAST = AccelcalVehiclePos.BACK
 
@@ -152,8 +149,6 @@ class CompassCalibration:
             return MavResult.FAILED
         self._mask &= ~(whole(command.param1) or _ALL)
         return MavResult.ACCEPTED
-
-    # ------------------------------------------------------------------------------------- messages
 
     def progress(self) -> m.MagCalProgress | None:
         """Of one compass after the other; None when nothing runs."""

@@ -11,8 +11,6 @@ from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.commands import Command, whole
 from aerokit.sim.motion import quaternion_from_euler
 
-__all__ = ["Camera"]
-
 _PERIOD_S, _SHUTTER_S = 0.02, 0.1
 _UNKNOWN_PLACE = 2**31 - 1
 _IDLE, _INTERVAL_SET = 0, 2
@@ -123,8 +121,6 @@ class Camera:
             return self.take()
         return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _FOR_EVER)
 
-    # ------------------------------------------------------------------------------------- commands
-
     def start_capture(self, command: Command) -> int:
         """MAV_CMD_IMAGE_START_CAPTURE; param1 is the camera, 0 for all."""
         if command.param1 < 0.0:
@@ -167,8 +163,6 @@ class Camera:
             return MavResult.FAILED
         by_itself = kind not in (SetFocusType.CONTINUOUS, SetFocusType.RANGE)
         return MavResult.UNSUPPORTED if by_itself else MavResult.ACCEPTED
-
-    # --------------------------------------------------------------------------------- what it tells
 
     def _take_feedback(self) -> m.CameraFeedback:
         motion, nav = self._vehicle.motion, self._vehicle.navigation

@@ -15,9 +15,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["HomeAndOrigin", "common_commands"]
-
-
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
 

@@ -9,9 +9,6 @@ from typing import ClassVar
 from aerokit.mavlink.enums import MavSeverity
 from aerokit.sim.ardupilot.host import Host
 
-__all__ = ["BatteryFailsafe", "Failsafes"]
-
-
 _OK, _LOW, _CRITICAL = 0, 1, 2
 _NAMES = {_LOW: "LOW", _CRITICAL: "CRT"}
 _WORDS = {_LOW: "low", _CRITICAL: "critical"}

@@ -22,9 +22,6 @@ from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.commands import Command, whole
 from aerokit.sim.local_frame import LocalFrame, Ned
 
-__all__ = ["CIRCLE", "MAX_ALT", "MIN_ALT", "POLYGON", "REPORT_ONLY", "Fence", "Zones"]
-
-
 _IN, _OUT = MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION
 _CIRCLE_IN, _CIRCLE_OUT = MavCmd.NAV_FENCE_CIRCLE_INCLUSION, MavCmd.NAV_FENCE_CIRCLE_EXCLUSION
 Point = tuple[float, float]
@@ -164,8 +161,6 @@ class Fence:
         self._zones = Zones((), vehicle.frame)
         self._zones_of: list[object] = []
 
-    # ---------------------------------------------------------------------------------------- state
-
     @property
     def configured(self) -> int:
         """FENCE_TYPE."""
@@ -194,8 +189,6 @@ class Fence:
         present = self.present != 0
         enforced = present and self.enabled != 0 and self._vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY
         return present, enforced, not (present and self.breached)
-
-    # ----------------------------------------------------------------------------------- on and off
 
     def enable(self, on: bool, kinds: int = _ALL, *, by_hand: bool = True) -> int:
         """Switch kinds on or off; those that changed. Only what is configured can be changed."""
@@ -239,8 +232,6 @@ class Fence:
             self._switch = switch
             self.enabled = self.configured & ~MIN_ALT if switch[0] else 0
         self._clear(_ALL & ~self.configured)
-
-    # --------------------------------------------------------------------------------------- checks
 
     def update(self) -> None:
         """Look where the vehicle is and act on a new breach."""
@@ -330,8 +321,6 @@ class Fence:
             if kinds & kind:
                 self._backup.pop(kind, None)
 
-    # --------------------------------------------------------------------------------- what follows
-
     def act(self, new: int) -> None:
         """A breach of these kinds has begun, and the vehicle is armed."""
 
@@ -370,8 +359,6 @@ class Fence:
         """Say what has happened to some kinds, if there are any."""
         if kinds:
             self._vehicle.send_text(MavSeverity.NOTICE, f"{names(kinds)} {what}")
-
-    # --------------------------------------------------------------------------------------- arming
 
     def reason_not_to_arm(self) -> str | None:
         """What the arming checks say of the fence."""

@@ -13,8 +13,6 @@ from aerokit.sim.file_tree import EISDIR, ENOENT, Entry, FileFault, FileTree, Op
 from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
 from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["ArduPilotFtp"]
-
 _SESSION_TIMEOUT_S = 3.0
 _QUEUE_DEPTH = 5
 _WORKER_PERIOD_S = 0.002
@@ -72,8 +70,6 @@ class ArduPilotFtp(FtpServer):
         if not self._is_awake:
             self._is_awake = True
             self._vehicle.call_later(_WORKER_PERIOD_S, self._work)
-
-    # ------------------------------------------------------------------------------------------ worker
 
     def _work(self) -> None:
         """Do what is queued; a burst goes on by itself and comes back here."""
@@ -134,8 +130,6 @@ class ArduPilotFtp(FtpServer):
         with suppress(FileFault):  # as in the firmware, nobody is told
             file.close()
 
-    # ---------------------------------------------------------------------------------------- sessions
-
     def _none(self, request: FtpPacket) -> FtpPacket:
         return request.acknowledge()
 
@@ -185,8 +179,6 @@ class ArduPilotFtp(FtpServer):
         self._file.write(request.offset, request.data[: request.size])
         return request.acknowledge(offset=request.offset)
 
-    # ------------------------------------------------------------------------------------------- burst
-
     def _start_burst(self, request: FtpPacket, channel: Channel) -> FtpPacket | None:
         if self._file is None:
             return request.refuse(MavFtpErr.FILENOTFOUND)
@@ -222,8 +214,6 @@ class ArduPilotFtp(FtpServer):
         else:
             again = lambda: self._burst(request, channel, number + 1)  # noqa: E731
             self._vehicle.call_later(self.burst_interval_s, again)
-
-    # ------------------------------------------------------------------------------------ whole files
 
     def _list(self, request: FtpPacket) -> FtpPacket:
         if not _is_path(request):

@@ -26,9 +26,6 @@ from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["Gimbal", "Target"]
-
-
 _DEVICE_ID = 1
 _Can = GimbalManagerCapFlags
 _CAPABILITIES = (
@@ -93,8 +90,6 @@ class Gimbal:
         parameters = self._vehicle.parameters
         return parameters[name] if name in parameters else DEFAULTS[name]
 
-    # ------------------------------------------------------------------------- where it points
-
     @property
     def angles(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw in degrees that the servos are to make, yaw from the nose."""
@@ -153,8 +148,6 @@ class Gimbal:
 
     def _middle(self, axis: str) -> float:
         return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
-
-    # -------------------------------------------------------------------------------- orders
 
     def set_mode(self, mode: int) -> None:
         """A MAV_MOUNT_MODE; others are ignored."""
@@ -216,8 +209,6 @@ class Gimbal:
         if status is not None:
             self._vehicle.send(status)
 
-    # ------------------------------------------------------------------------- GIMBAL_MANAGER
-
     def manage(
         self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]
     ) -> int:
@@ -240,8 +231,6 @@ class Gimbal:
     def warn(self) -> None:
         """Of angles that are none, in hundredths of degrees for example."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
-
-    # --------------------------------------------------------------------------------- what it tells
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:

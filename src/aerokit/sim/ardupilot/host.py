@@ -26,8 +26,6 @@ from aerokit.sim.missions import MissionStore
 from aerokit.sim.motion import Motion
 from aerokit.sim.parameters import Parameters
 
-__all__ = ["ArmingPart", "Host"]
-
 _RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
 _TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
 _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})

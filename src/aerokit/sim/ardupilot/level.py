@@ -14,16 +14,11 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["LevelAuto", "LevelVehicle"]
-
-
 _STICK_MIDDLE = 1500
 
 
 class LevelVehicle(ArduPilotVehicle):
     """Its arguments are those of `ArduPilotVehicle`."""
-
-    # ----------------------------------------------------------------------------- what a kind says
 
     def own_commands(self) -> dict[int, CommandHandler]:
         """Commands beside those of every ArduPilot."""
@@ -33,8 +28,6 @@ class LevelVehicle(ArduPilotVehicle):
     def is_at_rest(self) -> bool:
         """Whether nothing moves while it is disarmed."""
         raise NotImplementedError
-
-    # -------------------------------------------------------------------------------------- vehicle
 
     def reset_controllers(self) -> None:
         """The throttle stick rests in the middle."""
@@ -51,8 +44,6 @@ class LevelVehicle(ArduPilotVehicle):
 
     def move(self, dt: float) -> None:
         self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
-
-    # ------------------------------------------------------------------------------------- commands
 
     def make_commands(self) -> dict[int, CommandHandler]:
         return {
@@ -127,8 +118,6 @@ class LevelAuto(VehicleMode):
         self._reached_at: float | None = None
         self._wait_until = 0.0
 
-    # ----------------------------------------------------------------------------- what a kind says
-
     def default_speed(self) -> float:
         """In m/s, as parameters say it."""
         raise NotImplementedError
@@ -151,8 +140,6 @@ class LevelAuto(VehicleMode):
 
     def finish(self) -> None:
         """The mission is over."""
-
-    # ---------------------------------------------------------------------------------------- mode
 
     @property
     def destination(self) -> Ned | None:
@@ -193,8 +180,6 @@ class LevelAuto(VehicleMode):
             self.stay()
         else:
             self.travel(self._place, stops=self._stops)
-
-    # ---------------------------------------------------------------------------------- MissionFlyer
 
     def start_command(self, index: int, item: MissionItem) -> bool:
         command = item.command
@@ -251,8 +236,6 @@ class LevelAuto(VehicleMode):
             return 0.0
         motion = self.vehicle.motion
         return math.hypot(self._place[0] - motion.north, self._place[1] - motion.east)
-
-    # -------------------------------------------------------------------------------------- commands
 
     def _go(self, item: MissionItem) -> None:
         vehicle, motion = self.vehicle, self.vehicle.motion

@@ -14,8 +14,6 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.missions import float32
 
-__all__ = ["COMMAND_NAMES", "altitude_frame", "has_location", "is_place", "stored", "whole"]
-
 _HIGHEST_M = 83000.0
 _GIVEN_BACK: dict[int, int] = {
     MavFrame.MISSION: MavFrame.GLOBAL,

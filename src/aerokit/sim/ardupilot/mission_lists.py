@@ -15,9 +15,6 @@ from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.missions import float32
 
-__all__ = ["CommandList", "FenceList", "ItemList", "RallyList"]
-
-
 _LOWEST_RALLY_M, _HIGHEST_RALLY_M = -32768, 32767
 
 

@@ -15,8 +15,6 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.ardupilot.mission_items import COMMAND_NAMES
 
-__all__ = ["MissionFlyer", "MissionRun", "is_navigation"]
-
 _C = MavCmd
 _FIRST = 1
 _MOST_JUMPS, _MOST_STEPS = 64, 255
@@ -92,8 +90,6 @@ class MissionRun:
         self._do_index = 0
         self._jumps: dict[int, int] = {}
 
-    # ----------------------------------------------------------------------------------------- asking
-
     @property
     def is_present(self) -> bool:
         """Whether there is more than home."""
@@ -151,8 +147,6 @@ class MissionRun:
     @property
     def _restarts(self) -> bool:
         return self._vehicle.parameters["MIS_RESTART"] == 1
-
-    # -------------------------------------------------------------------------------------- directing
 
     def start_or_resume(self) -> None:
         """As MIS_RESTART wants it."""
@@ -214,8 +208,6 @@ class MissionRun:
                 self._do, self._do_index = found, found[0]
             index = found[0] + 1
 
-    # ---------------------------------------------------------------------------------------- running
-
     def update(self) -> None:
         """Look at what runs and start what comes next."""
         if not self.is_running or not self._list.count:
@@ -273,8 +265,6 @@ class MissionRun:
     def _complete(self) -> None:
         self._state = MissionState.COMPLETE
         self._flyer.end_mission()
-
-    # ------------------------------------------------------------------------------------------ jumps
 
     def _next(self, index: int, *, counts: bool) -> tuple[int, MissionItem] | None:
         """The first command at or after ``index`` that is no jump; jumps are followed, and counted when told so."""

@@ -21,8 +21,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["MissionServer"]
-
 _ASK_AGAIN_S, _GIVE_UP_S = 1.0, 8.0
 _DEGREE = 1e7
 _COMMANDS_IN_MEMORY, _RALLY_POINTS_IN_MEMORY = 650, 46
@@ -77,8 +75,6 @@ class MissionServer:
         on(m.MissionClearAll, self._on_clear_all)
         on(m.MissionSetCurrent, self._on_set_current)
 
-    # ---------------------------------------------------------------------- for others in the vehicle
-
     @property
     def transfer_is_open(self) -> bool:
         return bool(self._uploads)
@@ -121,8 +117,6 @@ class MissionServer:
             MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL, x=place.latitude_e7, y=place.longitude_e7, z=altitude
         )
 
-    # ---------------------------------------------------------------------------------------- answers
-
     def _warn(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.WARNING, text)
 
@@ -142,8 +136,6 @@ class MissionServer:
     def _capacity(self, items: ItemList) -> int:
         """The mission's memory is known only once the vehicle is initialised."""
         return 0 if items is self.commands and not self._vehicle.is_initialised else items.capacity
-
-    # --------------------------------------------------------------------------------------- download
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         mission_type = request.mission_type
@@ -201,8 +193,6 @@ class MissionServer:
     def _is_current(self, item: MissionItem, mission_type: int) -> bool:
         """As in the firmware, which compares the item's command with the number of the current item."""
         return mission_type == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
-
-    # ----------------------------------------------------------------------------------------- upload
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
         mission_type = count.mission_type

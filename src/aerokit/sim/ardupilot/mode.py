@@ -7,8 +7,6 @@ from typing import ClassVar, Protocol
 from aerokit.missions import MissionItem
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["AutoMode", "VehicleMode"]
-
 
 class VehicleMode:
     """One object per vehicle and mode; the answers here are "no" and "nothing"."""

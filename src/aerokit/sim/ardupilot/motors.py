@@ -6,8 +6,6 @@ import math
 
 from aerokit.sim.motion import GRAVITY_M_S2, Motion
 
-__all__ = ["Motors"]
-
 _ARMING_DELAY_S = 2.0
 _SPOOL_UP_S = 1.3
 _SPOOL_DOWN_S = 1.1

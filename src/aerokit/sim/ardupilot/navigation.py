@@ -10,9 +10,6 @@ from aerokit.mavlink.enums import GpsFixType, MavMissionType
 from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.local_frame import GlobalPoint, LocalFrame, Ned
 
-__all__ = ["Navigation", "best_return_place"]
-
-
 # plain numbers: the operators of flags are slow, and these are looked at all the time
 _ATTITUDE, _POS_HORIZ_ABS, _POS_VERT_ABS = map(int, (Ekf.ATTITUDE, Ekf.POS_HORIZ_ABS, Ekf.POS_VERT_ABS))
 _ATTITUDE_ONLY = int(
@@ -70,8 +67,6 @@ class Navigation:
         later(line.origin_set, self._set_origin)
         later(line.healthy, self._become_healthy)
         later(line.position_good, self._use_gps)
-
-    # -------------------------------------------------------------------------------------- answers
 
     @property
     def has_position(self) -> bool:
@@ -137,8 +132,6 @@ class Navigation:
         if self._vehicle.KIND != "sub":
             self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - self.origin[2]:.0f}m")
 
-    # ------------------------------------------------------------------------------------- timeline
-
     def _set_flags(self, flags: int) -> None:
         self.flags = flags
 
@@ -197,8 +190,6 @@ class Navigation:
         self._say_cores("is using GPS")
         if not self._vehicle.timeline.estimator_leads_early:
             self._vehicle.info("AHRS: EKF3 active")
-
-    # ----------------------------------------------------------------------------------- losing GPS
 
     def _watch_gps(self) -> None:
         now, lost = self._vehicle.now, self.gps_is_lost

@@ -7,8 +7,6 @@ from typing import Literal
 
 from aerokit.sim.parameters import Parameters
 
-__all__ = ["KINDS", "Kind", "parameters_of"]
-
 Kind = Literal["copter", "plane", "rover", "sub"]
 """Which of the firmwares."""
 

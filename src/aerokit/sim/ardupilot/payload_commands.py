@@ -18,9 +18,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.motion import euler_from_quaternion
 
-__all__ = ["GimbalCommands", "RegionOfInterest", "camera_commands", "equipment_commands"]
-
-
 _JUST_A_MODE = frozenset(
     {MavMountMode.RETRACT, MavMountMode.NEUTRAL, MavMountMode.RC_TARGETING, MavMountMode.HOME_LOCATION}
 )

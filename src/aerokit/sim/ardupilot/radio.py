@@ -12,9 +12,6 @@ from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["Joystick", "LevelJoystick", "Radio", "SubJoystick"]
-
-
 _AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
 _OVERRIDABLE, _CHANNELS = 16, 18
 _NO_PULSES, _LOW_THROTTLE = 1, 2

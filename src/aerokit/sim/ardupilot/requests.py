@@ -19,9 +19,6 @@ from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, whole
 
-__all__ = ["KNOWN_MESSAGES", "RATE_PARAMETERS", "STREAM_GROUPS", "Requests"]
-
-
 Groups = dict[int, tuple[int, ...]]
 
 _COMMON: Groups = {

@@ -9,8 +9,6 @@ from aerokit.mavlink.enums import MavSeverity
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["SmartPath", "prune", "simplify"]
-
 _PERIOD_S, _PATIENCE_S, _LOW_SPACE_PERIOD_S = 1.0 / 3.0, 15.0, 10.0
 _CLEAN_UP_EVERY = 50
 _LOW_SPACE = 9

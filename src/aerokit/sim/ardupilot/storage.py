@@ -17,8 +17,6 @@ from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
 from aerokit.sim.parameters import ParameterPackMount
 from aerokit.sim.signing import VehicleSigning
 
-__all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "ArduPilotSigning", "Storage"]
-
 LOG_FOLDER = "/APM/LOGS"
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
 

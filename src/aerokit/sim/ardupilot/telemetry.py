@@ -19,9 +19,6 @@ from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 
-__all__ = ["BUILDERS_OF_KIND", "Builders"]
-
-
 _MIDDLE = 1500
 _STICK_RANGE = 500
 _SURFACE_RANGE = 400

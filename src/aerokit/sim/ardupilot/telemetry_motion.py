@@ -14,8 +14,6 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 
-__all__ = ["ATTITUDE_BUILDERS", "POSITION_BUILDERS", "global_origin", "home_position"]
-
 
 def _attitude(vehicle: ArduPilotVehicle) -> m.Attitude:
     motion = vehicle.motion

@@ -24,9 +24,6 @@ from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
-__all__ = ["STATE_BUILDERS", "heartbeat", "sensor_status"]
-
-
 _FENCE = int(Sensor.MAV_SYS_STATUS_GEOFENCE)  # integers: arithmetic on flags takes ten times as long
 _PREARM = int(Sensor.MAV_SYS_STATUS_PREARM_CHECK)
 _AHRS = int(Sensor.MAV_SYS_STATUS_AHRS)

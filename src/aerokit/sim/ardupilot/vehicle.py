@@ -40,8 +40,6 @@ from aerokit.sim.motion import Motion, Wind
 from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import Component, sender_of
 
-__all__ = ["ArduPilotVehicle"]
-
 _REBOOT_SILENCE_S = 1.5
 _TIMESYNC_S = 10.0
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
@@ -182,8 +180,6 @@ class ArduPilotVehicle(Host):
         self.make_joystick()
         self.missions.listen()
 
-    # ------------------------------------------------------------------- what a kind of vehicle says
-
     def make_motion(self, wind: Wind | None) -> Motion:
         """What moves it."""
         return Motion(self.rng, wind=wind)
@@ -237,8 +233,6 @@ class ArduPilotVehicle(Host):
         """Move on by one tick, when it is not at rest; notices that it is, too."""
         raise NotImplementedError
 
-    # ---------------------------------------------------------------------------------------- state
-
     @property
     def ftp(self) -> ArduPilotFtp:
         """The server of the files."""
@@ -250,8 +244,6 @@ class ArduPilotVehicle(Host):
         return system in (0, self.system_id) and all(
             component != each.component_id for each in self.components
         )
-
-    # ------------------------------------------------------------------------------ boot and reboot
 
     def boot(self) -> None:
         """Say what a booting vehicle says, when it says it."""
@@ -304,8 +296,6 @@ class ArduPilotVehicle(Host):
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:
             super().send_text(severity, text)
-
-    # ---------------------------------------------------------------------------------------- modes
 
     def set_mode(self, number: int) -> bool:
         """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
@@ -364,8 +354,6 @@ class ArduPilotVehicle(Host):
             for index, mode in enumerate(modes, start=1)
         ]
 
-    # --------------------------------------------------------------------------------------- flying
-
     def build(self, message_id: int) -> Message | None:
         """What is to be streamed now."""
         builder = self.BUILDERS.get(message_id)
@@ -384,8 +372,6 @@ class ArduPilotVehicle(Host):
         self.battery.drain(self.motors.current_a, dt)
         if not self.motors.is_armed and self.is_landed and self.motors.is_idle:
             self.set_ticking(False)
-
-    # -------------------------------------------------------------------------------- other messages
 
     def _on_set_mode(self, request: m.SetMode, _: Channel) -> None:
         self.set_mode_from(request.base_mode, request.custom_mode)

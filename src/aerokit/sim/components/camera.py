@@ -14,8 +14,6 @@ from aerokit.sim.components.camera_commands import CameraParameters, camera_comm
 from aerokit.sim.components.camera_messages import camera_builders
 from aerokit.sim.components.component import Builder, serve_files
 
-__all__ = ["SimulatedCamera"]
-
 
 class SimulatedCamera(CameraBody):
     """Takes pictures, series and videos, and tells each picture with where it was taken, as the vehicle truly lies.

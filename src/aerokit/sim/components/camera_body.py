@@ -17,8 +17,6 @@ from aerokit.sim.components.gimbal import SimulatedGimbal
 from aerokit.sim.components.lens import Lens, Tracking
 from aerokit.sim.file_tree import FileTree
 
-__all__ = ["CAPABILITIES", "DEFINITION_PATH", "CameraBody"]
-
 DEFINITION_PATH = "/camera_definition.xml"
 """Where the camera serves its definition by MAVFTP."""
 CAPABILITIES = (

@@ -13,9 +13,6 @@ from aerokit.sim.components.camera_body import CameraBody
 from aerokit.sim.components.camera_messages import camera_settings
 from aerokit.sim.components.extended_parameters import ExtendedParameters
 
-__all__ = ["CameraParameters", "camera_commands"]
-
-
 MODE, EXPOSURE, ISO, SHUTTER = "CAM_MODE", "CAM_EXPMODE", "CAM_ISO", "CAM_SHUTTER"
 AUTO, AUTO_ISO, AUTO_SHUTTER_S = 0, 200, 0.002
 MOST_IN_VIDEO = 400

@@ -11,8 +11,6 @@ from aerokit.sim.components.camera_body import CameraBody
 from aerokit.sim.components.component import Builder
 from aerokit.sim.components.lens import FOCAL_LENGTH_MM
 
-__all__ = ["camera_builders", "camera_settings"]
-
 _FIRMWARE = 1 << 24
 _SENSOR_MM = (6.17, 4.63)
 _STREAM_HZ, _STREAM_SIZE, _STREAM_BITS_S = 30.0, (1920, 1080), 4_000_000

@@ -11,9 +11,6 @@ from aerokit.mavlink.messages import CameraCaptureStatus, CameraImageCaptured, S
 from aerokit.sim.components.component import SimulatedComponent, pose_of
 from aerokit.sim.motion import quaternion_from_euler
 
-__all__ = ["GREY_JPEG", "CameraHost", "Captures", "MemoryCard"]
-
-
 GREY_JPEG = base64.b85decode(
     "|JeWF01!$>Nk#wx0RR9200961|JwjV02B@n5)Ta&5)cv>6%-gAG9exu93DL^E+jHZKuk+VKt@GST61DhRc%&9Mr4R(ZFhTtf`Lw8jhBpl"
     "mUDiAeE+}z3kU!Z01yEI5di<h02KfM0RR910000000000000000{_GS6c7Ob00000000000000000030+5iXv0RR9$0DvF=*#"
@@ -127,8 +124,6 @@ class Captures:
         """Whether a video is."""
         return not math.isnan(self._recording_since)
 
-    # ------------------------------------------------------------------------------------- pictures
-
     def take(self) -> None:
         """One picture."""
         self.take_series(0.0, 1)
@@ -194,8 +189,6 @@ class Captures:
             file_url="",
         )
 
-    # ---------------------------------------------------------------------------------------- video
-
     def record(self, status_interval_s: float) -> None:
         """Begin a video; CAMERA_CAPTURE_STATUS every so many seconds, 0 is never."""
         self._recording_since = self._camera.now
@@ -219,8 +212,6 @@ class Captures:
                 self._tell_again(recording, interval_s)
 
         self._camera.call_later(interval_s, tell)
-
-    # --------------------------------------------------------------------------------------- status
 
     def status(self) -> CameraCaptureStatus:
         """CAMERA_CAPTURE_STATUS."""

@@ -17,8 +17,6 @@ from aerokit.sim.ftp import FtpServer
 from aerokit.sim.local_frame import GlobalPoint, true_place
 from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["Builder", "Pose", "SimulatedComponent", "pose_of", "serve_files"]
-
 
 class Pose(NamedTuple):
     """Angles in radians."""
@@ -85,8 +83,6 @@ class SimulatedComponent:
         self._builders: dict[int, Builder] = {}
         self._streams: dict[tuple[Channel | None, int], _Stream] = {}
 
-    # ------------------------------------------------------------------------------ what a kind says
-
     def commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler, besides those for messages."""
         return {}
@@ -100,8 +96,6 @@ class SimulatedComponent:
 
     def start(self) -> None:
         """The power comes on: begin anew, and say what is said without being asked."""
-
-    # ------------------------------------------------------------------------------- its own address
 
     @property
     def vehicle(self) -> SimulatedVehicle:
@@ -148,8 +142,6 @@ class SimulatedComponent:
 
     def _beat(self) -> None:
         self.send(Heartbeat(self.TYPE, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, _MAVLINK_VERSION))
-
-    # -------------------------------------------------------------------------------- hearing, saying
 
     def on(self, message_class: type[Message], handler: Callable[[Any, Channel], None]) -> None:
         """Hear such messages from now on, when they are for this component."""
@@ -224,8 +216,6 @@ class SimulatedComponent:
             faults.drop_outgoing -= 1
             return True
         return faults.loss > 0.0 and self.vehicle.rng.random() < faults.loss
-
-    # --------------------------------------------------------------------------- asking for messages
 
     def answer_with(self, message_id: int, command: Command) -> int:
         """Send what is asked for; a MAV_RESULT: DENIED of an unknown message, FAILED when there is nothing."""

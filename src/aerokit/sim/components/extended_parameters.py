@@ -13,8 +13,6 @@ from aerokit.parameters.setting import setting_bytes, setting_value, settings_eq
 from aerokit.sim.channel import Channel
 from aerokit.sim.components.component import SimulatedComponent
 
-__all__ = ["ExtendedParameters"]
-
 _LIST_S = 0.01
 _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "string": "", "custom": ""}
 
@@ -65,8 +63,6 @@ class ExtendedParameters:
     def _names(self) -> list[str]:
         return [name for name, each in self.definition.settings.items() if not each.write_only]
 
-    # ------------------------------------------------------------------------------------- telling
-
     def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:
         self._list_number += 1
         self._send_from(0, self._list_number, channel)
@@ -90,8 +86,6 @@ class ExtendedParameters:
         kind, names = self.definition.settings[name].wire_type, self._names
         data = setting_bytes(self.values[name], kind)
         self._component.send(m.ParamExtValue(name, data, kind, len(names), names.index(name)), channel)
-
-    # ------------------------------------------------------------------------------------- setting
 
     def _on_set(self, request: m.ParamExtSet, _: Channel) -> None:
         name, kind = request.param_id, request.param_type

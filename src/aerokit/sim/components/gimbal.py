@@ -26,9 +26,6 @@ from aerokit.sim.local_frame import GlobalPoint
 from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["SimulatedGimbal"]
-
-
 _Can = GimbalDeviceCapFlags
 _CAPABILITIES = (
     _Can.HAS_RETRACT | _Can.HAS_NEUTRAL
@@ -151,8 +148,6 @@ class _Orders:
     def _is_mine(self, device_id: float) -> bool:
         return whole(device_id) in (0, self._gimbal.component_id)
 
-    # ------------------------------------------------------------------------------------- commands
-
     def configure(self, command: Command) -> int:
         """Params 1 and 2 are who is in control, 3 and 4 who besides: ids, -1 unchanged, -2 who asks, -3 let go."""
         gimbal, sender = self._gimbal, command.sender
@@ -219,8 +214,6 @@ class _Orders:
         else:
             return False
         return True
-
-    # ------------------------------------------------------------------------------------- messages
 
     def on_attitude(self, order: m.GimbalManagerSetAttitude, _: Channel) -> None:
         if self._is_mine(order.gimbal_device_id) and self._gimbal.obeys(sender_of(order)):
@@ -333,8 +326,6 @@ class SimulatedGimbal(SimulatedComponent):
     def listen(self) -> None:
         hear_gimbal_orders(self)
 
-    # -------------------------------------------------------------------------------- where it looks
-
     @property
     def is_yaw_locked(self) -> bool:
         """Whether its yaw keeps its direction while the vehicle turns."""
@@ -381,8 +372,6 @@ class SimulatedGimbal(SimulatedComponent):
     def _limited(self, axis: int, angle: float) -> float:
         low, high = self.limits[axis]
         return max(low, min(high, angle))
-
-    # ----------------------------------------------------------------------------------------- orders
 
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
         """Turn to angles in radians; ``locked``: yaw is from north and stays so, else from the nose."""

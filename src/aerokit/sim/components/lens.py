@@ -14,9 +14,6 @@ from aerokit.sim.components.captures import CameraHost
 from aerokit.sim.components.component import pose_of
 from aerokit.sim.local_frame import LocalFrame
 
-__all__ = ["FOCAL_LENGTH_MM", "Axis", "Lens", "Tracking"]
-
-
 FOCAL_LENGTH_MM = 4.5
 """Zoomed out."""
 _TIMES = 10.0
@@ -116,8 +113,6 @@ class Tracking:
         """What is tracked has gone out of the picture."""
         self.is_lost = True
 
-    # ------------------------------------------------------------------------------------- commands
-
     def track_point(self, command: Command) -> int:
         """MAV_CMD_CAMERA_TRACK_POINT."""
         place = (command.param1, command.param2, command.param3)
@@ -144,8 +139,6 @@ class Tracking:
             return MavResult.UNSUPPORTED
         self.reset()
         return MavResult.ACCEPTED
-
-    # ------------------------------------------------------------------------------------- messages
 
     @property
     def _flags(self) -> int:

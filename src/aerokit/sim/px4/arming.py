@@ -23,9 +23,6 @@ from aerokit.sim.px4.modes import (
     TAKEOFF,
 )
 
-__all__ = ["Arming", "Calibration"]
-
-
 _BY_ITSELF: dict[str, tuple[Sequence[int], float]] = {
     "gyro": (range(0, 101, 10), 0.3),
     "baro": ((), 0.5),
@@ -132,8 +129,6 @@ class Arming:
         """Whether DO_FLIGHTTERMINATION has stopped the motors; only a restart ends that."""
         self._is_logging = False
 
-    # ---------------------------------------------------------------------------------------- checks
-
     def reasons(self) -> list[str]:
         """Why it cannot be armed, as the texts that tell it."""
         px4 = self._px4
@@ -160,8 +155,6 @@ class Arming:
         """RETURN, LAND, ORBIT cannot be armed in, nor a mode that lacks sticks, set-points or a mission."""
         mode = self._px4.mode
         return KNOWN[mode].can_arm and self._px4.can_run(mode)
-
-    # ----------------------------------------------------------------------------------------- doing
 
     def arm(self, by: str = "external command") -> bool:
         """Arm if the checks allow it."""
@@ -217,8 +210,6 @@ class Arming:
         px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
         px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
         px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, 2.0, *(0.0,) * 6))
-
-    # ------------------------------------------------------------------------------------------- log
 
     def start_first_log(self) -> None:
         """A log begins at boot already; the first flight is written into it."""

@@ -48,8 +48,6 @@ from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage
 from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
 from aerokit.sim.vehicle import Component, sender_of
 
-__all__ = ["Px4Vehicle"]
-
 _FIRST_HEARTBEAT_SHARE = 0.15
 _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
@@ -179,8 +177,6 @@ class Px4Vehicle(Px4Host):
         self.missions.listen()
         self.failsafes.listen()
 
-    # ----------------------------------------------------------------------------------------- state
-
     @property
     def ftp(self) -> Px4Ftp:
         """The server of the files."""
@@ -200,8 +196,6 @@ class Px4Vehicle(Px4Host):
         """Sequence number of the next PING."""
         self._pings += 1
         return self._pings - 1
-
-    # ------------------------------------------------------------------------------- boot and reboot
 
     def boot(self) -> None:
         self.storage.restart()
@@ -247,8 +241,6 @@ class Px4Vehicle(Px4Host):
 
     def send_parts(self, chunks: list[m.Statustext]) -> None:
         self.text_links.tell(chunks)
-
-    # ------------------------------------------------------------------------------ arming and modes
 
     def armed(self) -> None:
         self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
@@ -307,8 +299,6 @@ class Px4Vehicle(Px4Host):
         self.flight.enter(mode)
         if mode == RTL and self.is_armed:  # tells its own parts
             self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
-
-    # ---------------------------------------------------------------------------------------- flying
 
     def leave_ground(self) -> None:
         self.is_landed, self._has_flown, self._touched_at = False, True, math.nan
@@ -373,8 +363,6 @@ class Px4Vehicle(Px4Host):
             self.arming.disarm("landing")
         elif not self._has_flown and 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.since:
             self.arming.disarm("auto preflight disarming")
-
-    # -------------------------------------------------------------------------------- other messages
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
         """Only one to everybody is a question."""

@@ -11,8 +11,6 @@ from aerokit.sim.components.component import pose_of
 from aerokit.sim.motion import quaternion_from_euler
 from aerokit.sim.px4.host import Px4Host
 
-__all__ = ["CameraTrigger"]
-
 _FIRST_CAMERA = 1
 _MIN_INTERVAL_S = 0.04
 _TO_GEOTAG_S = 0.02

@@ -27,9 +27,6 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.telemetry import available_modes
 
-__all__ = ["other_commands", "px4_commands", "refusal_by_place", "set_mode"]
-
-
 _C = MavCmd
 _ACCEPTED = (
     _C.NAV_ROI,

@@ -21,9 +21,6 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
 from aerokit.sim.px4.texts import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 
-__all__ = ["FailsafeAction", "Failsafes", "Fence"]
-
-
 _C = MavCmd
 _POLYGONS = {_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
 _CIRCLES = {_C.NAV_FENCE_CIRCLE_INCLUSION: True, _C.NAV_FENCE_CIRCLE_EXCLUSION: False}
@@ -177,8 +174,6 @@ class Failsafes:
         """Whether it does more than warn."""
         return self.action > _A.WARN
 
-    # ----------------------------------------------------------------------------------------- links
-
     def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
         if beat.type != MavType.GCS:
             return
@@ -194,8 +189,6 @@ class Failsafes:
             self._px4.info("Connection to ground station lost")
             if round(self._px4.parameters["NAV_DLL_ACT"]):
                 self._px4.send_text(MavSeverity.WARNING, NO_STATION)
-
-    # --------------------------------------------------------------------------------------- battery
 
     def _watch_battery(self) -> None:
         state = self._battery_level()
@@ -221,8 +214,6 @@ class Failsafes:
             return _A.WARN
         lands = action == 2 or state == MavBatteryChargeState.EMERGENCY
         return _A.LAND if lands else _A.RETURN
-
-    # ----------------------------------------------------------------------------------- what fails
 
     def arming_reasons(self) -> list[str]:
         """The texts of what keeps it from being armed."""
@@ -290,8 +281,6 @@ class Failsafes:
                 self._px4.send_text(MavSeverity.CRITICAL, text)
         self._breaches = breaches
         return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), _A.WARN) if breaches else _A.NONE
-
-    # ------------------------------------------------------------------------------------ what is done
 
     def check(self) -> None:
         """Look at everything, and do what is to be done; a terminated flight is beyond that."""

@@ -25,9 +25,6 @@ from aerokit.sim.px4.modes import (
     Px4Mode,
 )
 
-__all__ = ["Flight", "Orbit", "return_destination"]
-
-
 _RADII_M = (1.0, 100.0)
 _BACK_TO_CIRCLE_PER_S = 0.5
 

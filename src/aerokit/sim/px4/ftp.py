@@ -12,8 +12,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.file_tree import EEXIST, FileFault, FileTree, OpenFile
 from aerokit.sim.ftp import FileHost, FtpPacket, FtpServer, path_in, read_crc32
 
-__all__ = ["Px4Ftp"]
-
 _SESSION_TIMEOUT_S = 10.0
 _REPLY_KEPT = 4
 _BURST_BYTES = 35_000
@@ -96,8 +94,6 @@ class Px4Ftp(FtpServer):
             port.reply = answer
         self._vehicle.send(answer.message(), port.channel)
 
-    # ---------------------------------------------------------------------------------------- sessions
-
     def _none(self, port: _Port, request: FtpPacket) -> FtpPacket:
         return request.acknowledge(request.data[: request.size], offset=request.offset)
 
@@ -166,8 +162,6 @@ class Px4Ftp(FtpServer):
         port.file.write(request.offset, request.data[: request.size])
         return request.acknowledge(request.size.to_bytes(4, "little"), offset=request.offset)
 
-    # ------------------------------------------------------------------------------------------- burst
-
     def _start_burst(self, port: _Port, request: FtpPacket) -> FtpPacket | None:
         if request.session != 0 or port.file is None:
             return request.refuse(MavFtpErr.INVALIDSESSION)
@@ -203,8 +197,6 @@ class Px4Ftp(FtpServer):
         self._reply(port, answer.replace(data=data, size=len(data), burst_complete=complete))
         following = burst.replace(sequence=burst.sequence + 1 & 0xFFFF, offset=burst.offset + len(data))
         port.burst = None if complete else following
-
-    # ------------------------------------------------------------------------------------ whole files
 
     def _list(self, port: _Port, request: FtpPacket) -> FtpPacket:
         path = path_in(request.data[: request.size])

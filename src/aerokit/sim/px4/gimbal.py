@@ -18,8 +18,6 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import RTL
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["Gimbal"]
-
 _FITTED_BY = frozenset({0, 4})
 """MNT_MODE_IN: the radio and MAVLink, MAVLink alone."""
 _DEVICE_ID = 1
@@ -98,8 +96,6 @@ class Gimbal:
         here = self._px4.frame.to_global(motion.north, motion.east, motion.down)
         pitch = math.atan2(place[2] - here.altitude_m, math.hypot(north, east))
         return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
-
-    # ----------------------------------------------------------------------------------------- orders
 
     def obey(self, flags: int, angles: Angles, rates: Angles) -> None:
         """Angles if there are any, and rates besides; an order to retract is taken, and nothing done."""

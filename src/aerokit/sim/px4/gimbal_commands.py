@@ -11,8 +11,6 @@ from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.gimbal import Gimbal
 
-__all__ = ["gimbal_commands"]
-
 _ITSELF, _RELEASE = -2, -3
 
 

@@ -18,8 +18,6 @@ from aerokit.sim.motion import Motion
 from aerokit.sim.parameters import Parameters
 from aerokit.sim.px4.modes import Px4Mode
 
-__all__ = ["Px4Host"]
-
 
 class SticksPart(Protocol):
     """The pilot's sticks."""

@@ -12,9 +12,6 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavResult
 from aerokit.sim.channel import Channel
 
-__all__ = ["LINK_MODES", "LinkRates"]
-
-
 LINK_MODES = ("normal", "onboard", "config", "minimal")
 """What MAV_n_MODE calls Normal, Onboard, Config and Minimal."""
 

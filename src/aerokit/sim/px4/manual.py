@@ -10,9 +10,6 @@ from aerokit.sim.motion import GRAVITY_M_S2
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW, STICK_MODES
 
-__all__ = ["ManualFlight", "Sticks", "curved"]
-
-
 _NO_MANUAL_CONTROL = 4
 _UNUSED = 65535
 _CHANNELS = 18
@@ -140,8 +137,6 @@ class ManualFlight:
         tilt = math.radians(px4.parameters["MPC_MAN_TILT_MAX"])
         px4.motion.seek_attitude(tilt * sticks.roll, -tilt * sticks.pitch, down)
 
-    # ------------------------------------------------------------------------------------- by velocity
-
     def _fly_velocity(self) -> None:
         px4, sticks, motion = self._px4, self._px4.sticks, self._px4.motion
         fastest = px4.parameters["MPC_VEL_MANUAL"] * (_SLOW_SHARE if px4.mode == POSITION_SLOW else 1.0)
@@ -182,8 +177,6 @@ class ManualFlight:
                 return 0.0
             self._down = motion.down
         return self._down - motion.down
-
-    # --------------------------------------------------------------------------------------- by thrust
 
     @property
     def _thrust(self) -> float:

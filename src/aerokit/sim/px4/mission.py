@@ -15,9 +15,6 @@ from aerokit.missions import MissionItem
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, RTL, TAKEOFF
 
-__all__ = ["Mission", "outside_fence", "rejection", "warning"]
-
-
 _C = MavCmd
 _TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
 _LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
@@ -154,8 +151,6 @@ class Mission:
         self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None
         self._px4.every(1.0, self._repeat_reached)
 
-    # ----------------------------------------------------------------------------------------- asking
-
     @property
     def count(self) -> int:
         """How many items there are."""
@@ -188,8 +183,6 @@ class Mission:
     @property
     def wants_up(self) -> bool:
         return self._item is not None and not self.is_finished and self._phase != "land"
-
-    # -------------------------------------------------------------------------------------- directing
 
     def replaced(self, current: int) -> None:
         """There is another mission; if one is being flown, begin with the new one."""
@@ -241,8 +234,6 @@ class Mission:
         if self._px4.is_armed:
             self._px4.info("Executing Mission")
         self._begin_item()
-
-    # ----------------------------------------------------------------------------------------- flying
 
     def _begin_item(self) -> None:
         """Make the item the target; what needs no flying is done at once, and the next one begun."""
@@ -392,8 +383,6 @@ class Mission:
         """What the commander does when a mission has ended and nobody wanted anything else."""
         if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
             self._px4.change_mode(HOLD)
-
-    # ---------------------------------------------------------------------------------------- telling
 
     def _reach(self) -> None:
         """Told at once; of several at the same time only the last."""

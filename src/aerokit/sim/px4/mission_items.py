@@ -11,8 +11,6 @@ from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMission
 from aerokit.missions import MissionItem
 from aerokit.sim.missions import float32
 
-__all__ = ["checksum", "given_back", "stored"]
-
 _C, _F = MavCmd, MavFrame
 _PLACES: dict[int, str] = {
     _C.NAV_WAYPOINT: "ff-y",

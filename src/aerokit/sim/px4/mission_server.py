@@ -20,9 +20,6 @@ from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.mission_items import checksum, given_back, stored
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["MissionLink", "MissionServer"]
-
-
 _ASK_AGAIN_S, _GIVE_UP_S = 0.26, 5.0
 _R = MavMissionResult
 _NOBODY = (0, 0)
@@ -55,8 +52,6 @@ class MissionLink:
     @property
     def is_idle(self) -> bool:
         return self._state is State.IDLE
-
-    # ---------------------------------------------------------------------------------------- sending
 
     def _complain(self, text: str) -> None:
         self._px4.send_text(MavSeverity.CRITICAL, text)
@@ -102,8 +97,6 @@ class MissionLink:
             message = item_message_float(given, place, seq, self._partner, self._type, current)
         self._px4.send(message, self._channel)
 
-    # ------------------------------------------------------------------------------------------- time
-
     def _begin(self, state: State, message: Message, mission_type: int, count: int) -> None:
         self._state, self._partner, self._type = state, sender_of(message), mission_type
         self._seq, self._count = 0, count
@@ -138,8 +131,6 @@ class MissionLink:
             else:
                 self._send_count()
         self._watch(number)
-
-    # --------------------------------------------------------------------------------------- download
 
     def on_request_list(self, request: m.MissionRequestList) -> None:
         """Somebody wants a list: begin, or begin again.
@@ -197,8 +188,6 @@ class MissionLink:
             self._ask()
         elif self._state is State.GETTING and ack.type == _R.OPERATION_CANCELLED:
             self._end_upload()
-
-    # ----------------------------------------------------------------------------------------- upload
 
     def on_count(self, count: m.MissionCount) -> None:
         """Somebody has a new list."""
@@ -284,8 +273,6 @@ class MissionLink:
         self._end_upload()
         self._acknowledge(self._partner, _R.ACCEPTED, self._id)
 
-    # ---------------------------------------------------------------------------------------- at once
-
     def on_clear_all(self, request: m.MissionClearAll) -> None:
         """Only while nothing else goes on; else there is no answer but a text."""
         if self._state is not State.IDLE:
@@ -357,8 +344,6 @@ class MissionServer:
         self._links.clear()
         self.uploading = None
 
-    # ---------------------------------------------------------------------- for others in the vehicle
-
     @property
     def transfer_is_open(self) -> bool:
         """Whether an upload or a download is going on, on any link."""
@@ -381,8 +366,6 @@ class MissionServer:
         good = [item for item in kept if not isinstance(item, int)]
         self.store(mission_type, good, checksum(items))
         return MavMissionResult.ACCEPTED
-
-    # ----------------------------------------------------------------------------------- for the links
 
     def capacity(self, mission_type: int) -> int:
         """How many fit; 0 of an unknown type."""

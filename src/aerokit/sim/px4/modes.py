@@ -7,37 +7,6 @@ from typing import Final
 
 from aerokit.mavlink.enums import MavModeFlag
 
-__all__ = [
-    "ACRO",
-    "ALTITUDE",
-    "ALTITUDE_CRUISE",
-    "AUTO",
-    "EXTERNAL_1",
-    "FOLLOW_TARGET",
-    "HOLD",
-    "KNOWN",
-    "LAND",
-    "MANUAL",
-    "MISSION",
-    "OFFBOARD",
-    "ORBIT",
-    "POSITION",
-    "POSITION_SLOW",
-    "PRECISION_LAND",
-    "RTL",
-    "SELECTABLE",
-    "STABILIZED",
-    "STANDARD_MODES",
-    "STICK_MODES",
-    "TAKEOFF",
-    "TERMINATION",
-    "VTOL_TAKEOFF",
-    "ModeTraits",
-    "Px4Mode",
-    "custom_mode",
-    "mode_from_custom",
-]
-
 Px4Mode = tuple[int, int]
 
 AUTO: Final = 4

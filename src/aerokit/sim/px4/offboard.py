@@ -17,8 +17,6 @@ from aerokit.sim.px4.flight import velocity_towards
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
 
-__all__ = ["Offboard"]
-
 _NAN3: Ned = (math.nan, math.nan, math.nan)
 _POSITION = (Mask.X_IGNORE, Mask.Y_IGNORE, Mask.Z_IGNORE)
 _VELOCITY = (Mask.VX_IGNORE, Mask.VY_IGNORE, Mask.VZ_IGNORE)
@@ -58,8 +56,6 @@ class Offboard:
             return self._thrust > 0.5
         down = self._position[2] - self._vehicle.motion.down
         return down < -0.1 or self._velocity[2] < -0.1 or self._acceleration[2] < -0.1
-
-    # --------------------------------------------------------------------------------------- hearing
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
         frame = target.coordinate_frame
@@ -135,8 +131,6 @@ class Offboard:
         elif vehicle.is_in_failsafe and self.is_fresh:
             vehicle.is_in_failsafe = False
             vehicle.switch_to(OFFBOARD)
-
-    # ---------------------------------------------------------------------------------------- flying
 
     def fly(self) -> None:
         motion = self._vehicle.motion

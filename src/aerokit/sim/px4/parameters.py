@@ -6,8 +6,6 @@ import pkgutil
 
 from aerokit.sim.parameters import Parameters
 
-__all__ = ["px4_parameters"]
-
 _USED = """
 BAT1_CAPACITY BAT1_N_CELLS BAT1_SOURCE BAT_CRIT_THR BAT_EMERGEN_THR BAT_LOW_THR CAL_ACC0_ID
 CBRK_SUPPLY_CHK COM_ARM_WO_GPS COM_DISARM_LAND COM_DISARM_PRFLT COM_DL_LOSS_T COM_FAIL_ACT_T

@@ -16,9 +16,6 @@ from aerokit.sim.px4.mission import Mission
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, RTL, STICK_MODES, TAKEOFF, Px4Mode
 from aerokit.sim.px4.vehicle import SimulatedPx4
 
-__all__ = ["PlaneFlight", "PlaneMission", "SimulatedPx4Plane"]
-
-
 _FLARE_M = 3.0
 _AHEAD_S = 2.5
 _FLARE_SINK_M_S = 0.5
@@ -139,8 +136,6 @@ class PlaneFlight(Flight):
         climb = min(0.0, motion.climb_to(motion.ground_down - height))
         course = math.atan2(self.target[1] - motion.east, self.target[0] - motion.north)
         motion.head(course, self._plane.parameters["FW_AIRSPD_MIN"] * 1.3, climb)
-
-    # ---------------------------------------------------------------------------------------- return
 
     def _return(self) -> None:
         """Climb where it is, fly home, circle down to RTL_DESCEND_ALT; land only if RTL_LAND_DELAY is not negative."""

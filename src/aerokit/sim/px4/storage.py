@@ -20,8 +20,6 @@ from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.signing import VehicleSigning
 
-__all__ = ["DEFAULT_LOGS", "LOG_FOLDER", "Px4ParameterMount", "Storage"]
-
 
 class Px4ParameterMount(ParameterPackMount):
     """As ArduPilot's, but: an open tells the exact size, neither a value nor its default lies across two blocks of

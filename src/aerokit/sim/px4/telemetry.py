@@ -48,8 +48,6 @@ from aerokit.sim.px4.modes import (
 )
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
-__all__ = ["BUILDERS", "GIMBAL_MESSAGES", "available_modes"]
-
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)

@@ -12,9 +12,6 @@ from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.modes import ORBIT, custom_mode
 
-__all__ = ["IDENTITY_BUILDERS", "SENSOR_BUILDERS"]
-
-
 _LIBRARY_HASH = b"\xa4C\x87s\xec\x08o="
 _METADATA_URI, _METADATA_CRC = "mftp://etc/extras/component_general.json.xz", 2472443404
 _CAPACITY_MIB, _USED_MIB = 258_019.6, 192_146.9

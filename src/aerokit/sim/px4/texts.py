@@ -15,9 +15,6 @@ from aerokit.mavlink.messages import CurrentEventSequence, Event, Statustext
 from aerokit.sim.channel import Channel
 from aerokit.sim.px4.host import Px4Host
 
-__all__ = ["NO_STATION", "OUTSIDE", "TOO_FAR", "TOO_HIGH", "Events", "TextLinks", "on_the_wire"]
-
-
 _FIRST_SEQUENCE = 65526
 _INFO_LEVELS = 102
 _ARMED_BY = {"external command": 4, "mission start": 5}

@@ -13,8 +13,6 @@ from aerokit.sim.px4.modes import mode_from_custom
 from aerokit.sim.px4.telemetry import BUILDERS, GIMBAL_MESSAGES
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["SimulatedPx4"]
-
 
 class SimulatedPx4(Px4Vehicle):
     """Speaks as PX4 v1.16/v1.17 does where a client can see it; flies as `Motion` does.

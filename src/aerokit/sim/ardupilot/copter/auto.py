@@ -20,8 +20,6 @@ from aerokit.sim.ardupilot.copter.modes import Mode
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
 
-__all__ = ["Auto"]
-
 _C = MavCmd
 _ALLOW_ARMING = 1
 _CONTINUE_AFTER_LAND = 4
@@ -93,8 +91,6 @@ class Auto(Mode):
         }
         self._handlers = handlers
 
-    # --------------------------------------------------------------------------------- what is asked
-
     @property
     def can_arm(self) -> bool:  # type: ignore[override]
         """AUTO_OPTIONS says so."""
@@ -153,8 +149,6 @@ class Auto(Mode):
         self._is_waiting = False
         self.copter.mission.stop()
 
-    # --------------------------------------------------------------------------------------- running
-
     def _start_if_waiting(self) -> None:
         """As soon as there is an origin; also while disarmed."""
         if self._is_waiting and self.copter.mode is self and self.copter.navigation.origin is not None:
@@ -196,8 +190,6 @@ class Auto(Mode):
         done = run.set_current(run.nav_index)
         text = "restarted command" if done else "but failed to restart command"
         self.copter.send_text(MavSeverity.CRITICAL, f"Auto mission changed{',' if done else ''} {text}")
-
-    # ---------------------------------------------------------------------------------- MissionFlyer
 
     def start_command(self, index: int, item: MissionItem) -> bool:
         handler = self._handlers.get(item.command)
@@ -282,8 +274,6 @@ class Auto(Mode):
         if destination is None:
             return 0.0
         return math.hypot(destination[0] - motion.north, destination[1] - motion.east)
-
-    # -------------------------------------------------------------------------------------- commands
 
     def _place(self, item: MissionItem) -> Ned:
         """Where an item leads; what is 0 in it stays as it is."""

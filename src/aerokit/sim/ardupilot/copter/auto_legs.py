@@ -10,8 +10,6 @@ from aerokit.sim.ardupilot.copter.modes import TakeOff
 from aerokit.sim.ardupilot.copter.returning import Rtl, sink
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["Circle", "Climb", "Descent", "Leg", "Limits", "Return", "Stay", "Way"]
-
 _STOPPED_M = 0.3
 _TO_EDGE_M = 3.0
 _TAKE_OFF_WITHOUT_THROTTLE = 2
@@ -31,8 +29,7 @@ class Limits(Protocol):
 class Leg(Protocol):
     """``update`` tells the motion what to do for the next ``dt`` seconds."""
 
-    def update(self, dt: float) -> None:
-        ...
+    def update(self, dt: float) -> None: ...
 
     @property
     def is_complete(self) -> bool:

@@ -13,9 +13,6 @@ from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
 from aerokit.sim.ardupilot.mode import VehicleMode
 
-__all__ = ["CopterArming", "CopterFailsafes", "CopterFence"]
-
-
 _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
@@ -129,8 +126,6 @@ class CopterFailsafes(Failsafes):
         self._check_radio()
         self._copter.fence.update()
 
-    # ---------------------------------------------------------------------------------------- radio
-
     def _check_radio(self) -> None:
         """No pulses for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
         copter, parameters = self._copter, self._copter.parameters
@@ -177,8 +172,6 @@ class CopterFailsafes(Failsafes):
         self.say("Radio Failsafe")
         return action
 
-    # ------------------------------------------------------------------------------- ground station
-
     def _check_ground_station(self) -> None:
         copter, parameters = self._copter, self._copter.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
@@ -209,8 +202,6 @@ class CopterFailsafes(Failsafes):
             return self._goes_on("GCS", "Continuing Pilot Control")
         self.say("GCS Failsafe")
         return action
-
-    # ------------------------------------------------------------------------- battery and estimator
 
     def act_on_battery(self, action: int) -> None:
         """On the ground it is disarmed whatever the action; a landing may go on."""
@@ -261,8 +252,6 @@ class CopterFailsafes(Failsafes):
             self._idle_since = copter.now
         elif copter.now - self._idle_since >= delay:
             copter.arming.disarm()
-
-    # ------------------------------------------------------------------------------ what all share
 
     def _option(self, bit: int) -> bool:
         return bool(int(self._copter.parameters["FS_OPTIONS"]) & bit)

@@ -11,8 +11,6 @@ from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import Mode, TakeOff
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["Guided", "Submode"]
-
 _STILL: Ned = (0.0, 0.0, 0.0)
 
 
@@ -55,8 +53,6 @@ class Guided(Mode):
         self._updated_at = -math.inf
         self._take_off: TakeOff | None = None
         self._is_paused = False
-
-    # ------------------------------------------------------------------------------------ being told
 
     def enter(self, *, force: bool) -> bool:
         self._start(Submode.VELOCITY)
@@ -122,8 +118,6 @@ class Guided(Mode):
         self.climb = parameters["WPNAV_SPEED_UP"] / 100.0
         self.descent = parameters["WPNAV_SPEED_DN"] / 100.0
         self.copter.yaw.default()
-
-    # ---------------------------------------------------------------------------------------- doing
 
     def update(self, dt: float) -> None:
         """Run the controller of the submode."""

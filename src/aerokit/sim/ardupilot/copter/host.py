@@ -10,8 +10,6 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
 
-__all__ = ["AutoYaw", "CopterHost"]
-
 _LOOK_AHEAD_FROM_M_S = 0.5
 
 

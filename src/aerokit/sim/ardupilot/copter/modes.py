@@ -15,9 +15,6 @@ from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["AltHold", "Brake", "Circle", "Loiter", "Mode", "PosHold", "Stabilize", "TakeOff"]
-
-
 _MID_STICK, _STICK_RANGE, _THROTTLE_DEADZONE = 1500, 500, 100
 _FULL_STICK_LEAN_RAD = math.radians(30.0)
 _FULL_STICK_TURN_RAD_S = math.radians(200.0)

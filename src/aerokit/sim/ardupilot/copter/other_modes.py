@@ -9,22 +9,6 @@ from aerokit.mavlink.enums import CopterMode, MavSeverity
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.copter.modes import AltHold, Loiter, Mode, Stabilize
 
-__all__ = [
-    "Acro",
-    "AutoRtl",
-    "Autotune",
-    "AvoidAdsb",
-    "Drift",
-    "Flip",
-    "FlowHold",
-    "Follow",
-    "GuidedNoGps",
-    "SystemId",
-    "Throw",
-    "Turtle",
-    "ZigZag",
-]
-
 
 class Acro(Stabilize):
     """Turn rates by stick; here as STABILIZE."""

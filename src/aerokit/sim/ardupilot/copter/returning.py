@@ -11,8 +11,6 @@ from aerokit.sim.ardupilot.copter.modes import Mode
 from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["Land", "Rtl", "SmartRtl", "sink"]
-
 _RTL_LOWEST_M = 2.0
 _ARRIVED_M = 0.5
 _SMART_RTL_HIGHER_M = 2.0

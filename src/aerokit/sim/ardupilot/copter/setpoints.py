@@ -18,8 +18,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
 
-__all__ = ["Setpoints"]
-
 _POSITION = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE
 _VELOCITY = Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE
 _ACCELERATION = Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE

@@ -49,9 +49,6 @@ from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
 
-__all__ = ["MotorTest", "SimulatedCopter", "copter_commands"]
-
-
 _MAX_S = 600.0
 _PAUSE_SHARE = 0.5
 """Between two motors, of the time for each."""

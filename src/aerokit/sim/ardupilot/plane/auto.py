@@ -18,8 +18,6 @@ from aerokit.sim.ardupilot.plane.modes import NavigatingMode, climb_out
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
 
-__all__ = ["Auto"]
-
 _C = MavCmd
 _WAY, _LOITER, _CLIMB, _LAND = range(4)
 _REACHED_HEIGHT_M = 5.0
@@ -61,8 +59,6 @@ class Auto(NavigatingMode):
             **dict.fromkeys((_C.DO_LAND_START, _C.DO_RETURN_PATH_START, _C.DO_FENCE_ENABLE), self._ignore),
         }
 
-    # --------------------------------------------------------------------------------- what is asked
-
     @property
     def is_taking_off(self) -> bool:  # type: ignore[override]
         """Climbing by a take-off command."""
@@ -93,8 +89,6 @@ class Auto(NavigatingMode):
     def leave(self) -> None:
         """The mission stops where it is."""
         self.plane.mission.stop()
-
-    # --------------------------------------------------------------------------------------- running
 
     def update(self, dt: float) -> None:
         plane = self.plane
@@ -131,8 +125,6 @@ class Auto(NavigatingMode):
     def _distance(self) -> float:
         wing, place = self.plane.wing, self._place
         return 0.0 if place is None else math.hypot(place[0] - wing.north, place[1] - wing.east)
-
-    # ---------------------------------------------------------------------------------- MissionFlyer
 
     def start_command(self, index: int, item: MissionItem) -> bool:
         handler = self._handlers.get(item.command)
@@ -200,8 +192,6 @@ class Auto(NavigatingMode):
             return self._say(f"Reached waypoint #{index} dist {int(distance)}m")
         along = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
         return along > 0 and self._say(f"Passed waypoint #{index} dist {int(distance)}m")
-
-    # -------------------------------------------------------------------------------------- commands
 
     def _go(self, item: MissionItem, does: int) -> None:
         wing, before = self.plane.wing, self._place

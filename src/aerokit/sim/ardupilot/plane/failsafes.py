@@ -13,9 +13,6 @@ from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.plane.host import PlaneHost
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["PlaneFailsafes", "PlaneFence"]
-
-
 _NONE, _SHORT, _LONG, _GCS = range(4)
 """What goes on, as the texts call it."""
 _SILENT_S, _COUNT_S = 1.0, 0.2
@@ -68,8 +65,6 @@ class PlaneFailsafes(Failsafes):
         self._resume_pending()
         super().watch()
 
-    # ---------------------------------------------------------------------------------------- radio
-
     def _is_radio_bad(self) -> bool:
         plane = self._plane
         low = plane.parameters["THR_FAILSAFE"] != 0 and plane.rc[2] <= plane.parameters["THR_FS_VALUE"]
@@ -92,8 +87,6 @@ class PlaneFailsafes(Failsafes):
         if lost != self.radio:
             self.radio = lost
             self.say(f"Throttle failsafe {'on' if lost else 'off'}")
-
-    # ---------------------------------------------------------------------------------------- short
 
     def _watch_short(self) -> None:
         action = int(self._plane.parameters["FS_SHORT_ACTN"])
@@ -125,8 +118,6 @@ class PlaneFailsafes(Failsafes):
         if self._mode_after != self._mode_before and plane.mode.number == self._mode_after:
             plane.set_mode(self._mode_before)
             self.say(f"Flight mode {plane.mode.name} restored", MavSeverity.INFO)
-
-    # ----------------------------------------------------------------------------------------- long
 
     def _watch_long(self) -> None:
         if self.state in (_LONG, _GCS):
@@ -202,8 +193,6 @@ class PlaneFailsafes(Failsafes):
 
     def _is_landing(self) -> bool:
         return self._plane.mode.is_landing
-
-    # -------------------------------------------------------------------------------------- battery
 
     def act_on_battery(self, action: int) -> None:
         if action == _TERMINATE:

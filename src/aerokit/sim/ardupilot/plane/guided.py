@@ -17,8 +17,6 @@ from aerokit.sim.commands import Command, CommandHandler, whole
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
 
-__all__ = ["Guided", "PlaneSetpoints", "guided_commands"]
-
 _PATIENCE_S = 3.0
 _AT_ONCE_M_S = 1000.0
 _RATES = Mask.BODY_ROLL_RATE_IGNORE | Mask.BODY_PITCH_RATE_IGNORE | Mask.BODY_YAW_RATE_IGNORE

@@ -9,8 +9,6 @@ from aerokit.sim.fixed_wing import FixedWing
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import Motion, Wind
 
-__all__ = ["Landing", "PlaneHost"]
-
 _FLARE_SINK_M_S = 0.5
 _APPROACH_SHARE = 0.85
 _NEAR_M = 60.0

@@ -14,22 +14,6 @@ from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.plane.host import Landing, PlaneHost
 from aerokit.sim.local_frame import Ned
 
-__all__ = [
-    "Autoland",
-    "Circle",
-    "Cruise",
-    "FlyByWireA",
-    "FlyByWireB",
-    "Loiter",
-    "Manual",
-    "NavigatingMode",
-    "PlaneModeBase",
-    "Rtl",
-    "Stabilize",
-    "TakeOff",
-    "climb_out",
-]
-
 _MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
 _CIRCLE_BANK_SHARE = 1 / 3
 _TAKE_OFF_DONE_M = 5.0

@@ -7,8 +7,6 @@ from typing import ClassVar
 from aerokit.mavlink.enums import PlaneMode
 from aerokit.sim.ardupilot.plane.modes import FlyByWireA, Loiter, PlaneModeBase, Stabilize
 
-__all__ = ["Acro", "Autotune", "AvoidAdsb", "Initialising", "Thermal", "Training"]
-
 
 class Training(Stabilize):
     """Limits bank and pitch only; here as STABILIZE."""

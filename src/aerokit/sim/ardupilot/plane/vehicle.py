@@ -45,9 +45,6 @@ from aerokit.sim.ardupilot.plane.other_modes import Acro, Autotune, AvoidAdsb, I
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
 
-__all__ = ["PlaneArming", "SimulatedPlane", "plane_commands"]
-
-
 _SHORT_DISABLED = 3
 _SMALLEST_ANGLE_DEG, _SLOWEST_M_S = 3.0, 5
 

@@ -12,9 +12,6 @@ from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, Fence
 from aerokit.sim.ardupilot.rover.host import RoverHost
 
-__all__ = ["RoverArming", "RoverFailsafes", "RoverFence", "modes_of_action"]
-
-
 _NEEDS_LOCATION = 1
 
 
@@ -120,8 +117,6 @@ class RoverFailsafes(Failsafes):
         self._watch_wheels()
         super().watch()
 
-    # -------------------------------------------------------------------- radio and ground station
-
     def _watch_radio(self) -> None:
         rover, parameters = self._rover, self._rover.parameters
         if rover.rc.is_heard:
@@ -174,8 +169,6 @@ class RoverFailsafes(Failsafes):
 
     def act_on_battery(self, action: int) -> None:
         self._act(action)
-
-    # ------------------------------------------------------------------------- estimator and wheels
 
     def _watch_estimator(self) -> None:
         rover = self._rover

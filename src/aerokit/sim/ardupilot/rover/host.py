@@ -9,8 +9,6 @@ from aerokit.sim.ardupilot.smart_path import SmartPath
 from aerokit.sim.ground_motion import GroundMotion
 from aerokit.sim.motion import wrap_pi
 
-__all__ = ["RoverHost"]
-
 _ARRIVED_M, _STANDING_M_S = 0.3, 0.1
 
 

@@ -14,8 +14,6 @@ from aerokit.sim.ardupilot.rover.host import RoverHost
 from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["ROVER_MODES", "RoverAuto", "RoverGuided"]
-
 _MIDDLE, _RANGE = 1500.0, 500.0
 _FULL_STEERING_RAD_S = math.radians(90.0)
 _STANDING_M = 0.5

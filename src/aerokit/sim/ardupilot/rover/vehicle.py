@@ -23,8 +23,6 @@ from aerokit.sim.commands import CommandHandler
 from aerokit.sim.ground_motion import GroundLimits, GroundMotion
 from aerokit.sim.motion import Motion, Wind
 
-__all__ = ["SimulatedRover"]
-
 _GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
 _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 _AMPERES_AT_FULL = 16.0

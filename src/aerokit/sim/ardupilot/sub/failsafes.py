@@ -10,9 +10,6 @@ from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.sub.host import SubHost
 
-__all__ = ["SubArming", "SubFailsafes"]
-
-
 _BUTTONS = range(16)
 _SHIFT, _ARM_TOGGLE, _DISARM = 1, 2, 4
 """BTNn_FUNCTION."""
@@ -87,8 +84,6 @@ class SubFailsafes(Failsafes):
             limit.watch(self._sub, value)
         super().watch()
 
-    # ------------------------------------------------------------------------------- who steers it
-
     def _watch_radio(self) -> None:
         """FS_THR_ENABLE: 1 warns, 2 surfaces."""
         sub, enabled = self._sub, int(self._sub.parameters["FS_THR_ENABLE"])
@@ -141,8 +136,6 @@ class SubFailsafes(Failsafes):
         modes = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
         if action == _FAILSAFE_DISARM or (action in modes and not sub.set_mode(modes[action])):
             sub.arming.disarm()
-
-    # ------------------------------------------------------------------------- battery and the hull
 
     def act_on_battery(self, action: int) -> None:
         if action == _BATTERY_SURFACE:

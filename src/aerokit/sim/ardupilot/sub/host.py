@@ -9,8 +9,6 @@ from aerokit.sim.ardupilot.level import LevelVehicle
 from aerokit.sim.ground_motion import UnderwaterMotion
 from aerokit.sim.local_frame import Ned
 
-__all__ = ["SubHost"]
-
 _LOOK_AHEAD_M = 1.0
 
 

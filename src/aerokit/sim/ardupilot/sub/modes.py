@@ -13,8 +13,6 @@ from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
 
-__all__ = ["SUB_MODES", "SubAuto", "SubGuided"]
-
 _MIDDLE, _RANGE, _DEADZONE = 1500.0, 500.0, 0.06
 _FULL_STICK_M_S = 1.0
 _FULL_STICK_TURN_RAD_S = math.radians(90.0)

@@ -24,8 +24,6 @@ from aerokit.sim.commands import Command, CommandHandler
 from aerokit.sim.ground_motion import UnderwaterMotion
 from aerokit.sim.motion import Motion, Wind
 
-__all__ = ["SimulatedSub"]
-
 _GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
 _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
 _HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
