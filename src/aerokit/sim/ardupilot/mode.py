@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
 
 from aerokit.missions import MissionItem
 from aerokit.sim.local_frame import Ned
@@ -11,19 +12,19 @@ from aerokit.sim.local_frame import Ned
 class VehicleMode:
     """One object per vehicle and mode; the answers here are "no" and "nothing"."""
 
-    number: ClassVar[int]
-    name: ClassVar[str]
-    needs_position: ClassVar[bool] = True
-    needs_mission: ClassVar[bool] = False
-    has_manual_throttle: ClassVar[bool] = False
+    number: int
+    name: str
+    needs_position: bool = True
+    needs_mission: bool = False
+    has_manual_throttle: bool = False
     can_arm: bool = True
-    arms_with_raised_throttle: ClassVar[bool] = False
-    can_change_speed: ClassVar[bool] = False
-    refused_because: ClassVar[str] = "init failed"
+    arms_with_raised_throttle: bool = False
+    can_change_speed: bool = False
+    refused_because: str = "init failed"
     """What is said when `enter` refuses."""
-    returns_on_path: ClassVar[bool] = False
+    returns_on_path: bool = False
     """Whether it drives back on the path that is recorded otherwise."""
-    notices_landing: ClassVar[bool] = True
+    notices_landing: bool = True
     """Whether it leaves a vehicle on the ground still enough to be taken for landed."""
     is_landing: bool = False
     is_taking_off: bool = False
@@ -79,3 +80,22 @@ class AutoMode(Protocol):
     def end_mission(self) -> None:
         """There is nothing more to do."""
         ...
+
+
+HostT = TypeVar("HostT")
+
+
+def variant(
+    make: Callable[[HostT], VehicleMode], number: int, name: str, **traits: Any
+) -> Callable[[HostT], VehicleMode]:
+    """A row of a table of modes: one that behaves as another, under a name and with traits of its own."""
+
+    def build(host: HostT) -> VehicleMode:
+        mode = make(host)
+        mode.number, mode.name = number, name
+        for trait, value in traits.items():
+            assert hasattr(mode, trait), trait
+            setattr(mode, trait, value)
+        return mode
+
+    return build

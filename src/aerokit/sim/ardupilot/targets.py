@@ -44,7 +44,7 @@ class Target:
 class TargetMode(Protocol):
     """The mode that follows targets."""
 
-    number: ClassVar[int]
+    number: int
     """The vehicle's number for it."""
 
     def take(self, target: Target) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavSeverity, SpeedType
 from aerokit.mavlink.messages import MissionItemReached
@@ -44,7 +43,7 @@ _NOTHING_TO_DO = frozenset(
 class Auto(Mode):
     """What it does now is a leg; the mission run says which command comes when."""
 
-    number: ClassVar[int] = CopterMode.AUTO
+    number: int = CopterMode.AUTO
     name = "AUTO"
     needs_mission = True
     arms_with_raised_throttle = True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode
 from aerokit.sim.ardupilot.copter.host import CopterHost
@@ -32,7 +31,7 @@ class Guided(Mode):
     ArduCopter does: DO_CHANGE_SPEED is for the flight to the present kind of target.
     """
 
-    number: ClassVar[int] = CopterMode.GUIDED
+    number: int = CopterMode.GUIDED
     name = "GUIDED"
     arms_with_raised_throttle = True
     can_change_speed = True

@@ -1,16 +1,14 @@
 """ArduCopter's flight modes: what each needs and what it makes the vehicle do.
 
-A mode is one object per vehicle. `Mode` gives the answers of a mode that cannot do something; the simple
-modes are here; GUIDED, the ways home and the rare ones have files of their own. SPORT and AUTOROTATE are unknown, as in
-the firmware for quadrotors.
+A mode is one object per vehicle. The simple ones are here; GUIDED and the ways home have files of their own, and the
+table of all is beside `SimulatedCopter`. SPORT and AUTOROTATE are unknown, as in the firmware for quadrotors.
 """
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
-from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.enums import CopterMode, MavSeverity
 from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.local_frame import Ned
@@ -116,7 +114,7 @@ class PilotedMode(Mode):
 class Stabilize(PilotedMode):
     """Attitude and throttle by stick; with the throttle stick low it comes down fast."""
 
-    number: ClassVar[int] = CopterMode.STABILIZE
+    number: int = CopterMode.STABILIZE
     name = "STABILIZE"
     needs_position = False
     has_manual_throttle = True
@@ -132,23 +130,28 @@ class Stabilize(PilotedMode):
 class AltHold(PilotedMode):
     """Attitude by stick, height held."""
 
-    number: ClassVar[int] = CopterMode.ALT_HOLD
+    takes_off = True
+
+    number: int = CopterMode.ALT_HOLD
     name = "ALT_HOLD"
     needs_position = False
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
         """Only when the command leaves the horizontal part to the pilot."""
-        return not must_navigate and self.start_take_off(altitude_m)
+        return self.takes_off and not must_navigate and self.start_take_off(altitude_m)
 
 
 class Loiter(PilotedMode):
     """Position and height held, sticks move them. A low throttle stick descends, and lands."""
 
-    number: ClassVar[int] = CopterMode.LOITER
+    takes_off = True
+    """By command."""
+
+    number: int = CopterMode.LOITER
     name = "LOITER"
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        return self.start_take_off(altitude_m)
+        return self.takes_off and self.start_take_off(altitude_m)
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
         yaw = self.copter.motion.yaw
@@ -158,31 +161,50 @@ class Loiter(PilotedMode):
         self.copter.motion.seek_velocity(north, east, -climb)
 
 
-class PosHold(Loiter):
-    """As LOITER here."""
-
-    number: ClassVar[int] = CopterMode.POSHOLD
-    name = "POSHOLD"
-
-
-class Circle(Loiter):
-    """Holds like LOITER here instead of circling. On the ground it pulls at its circle, and notices no landing."""
-
-    notices_landing = False
-    number: ClassVar[int] = CopterMode.CIRCLE
-    name = "CIRCLE"
-    can_arm = False
-
-    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        return False
-
-
-class Brake(Mode):
-    """Stops and stays, whatever the sticks do."""
-
-    number: ClassVar[int] = CopterMode.BRAKE
-    name = "BRAKE"
-    can_arm = False
+class Holding(Mode):
+    """Stays where it is."""
 
     def update(self, dt: float) -> None:
         self.stay()
+
+
+class Throw(Holding):
+    """Waits to be thrown, with motors that stand still; thrown it would hold, as it does here in the air."""
+
+    number: int = CopterMode.THROW
+    name = "THROW"
+    _told_at = -math.inf
+
+    def update(self, dt: float) -> None:
+        """Says so once after each arming."""
+        if self._told_at < self.copter.motors.armed_at:
+            self._told_at = self.copter.now
+            self.copter.info("waiting for throw")
+        super().update(dt)
+
+
+class Follow(Holding):
+    """FOLL_ENABLE lets it in; it holds, as the real one does without somebody to follow."""
+
+    number: int = CopterMode.FOLLOW
+    name = "FOLLOW"
+    can_arm = False
+
+    def enter(self, *, force: bool) -> bool:
+        if self.copter.parameters["FOLL_ENABLE"]:
+            return True
+        self.copter.send_text(MavSeverity.WARNING, "Set FOLL_ENABLE = 1")
+        return False
+
+
+class Refusing(Mode):
+    """What it needs is never there; says what."""
+
+    needs_position = False
+    can_arm = False
+    text: str = ""
+
+    def enter(self, *, force: bool) -> bool:
+        if self.text:
+            self.copter.send_text(MavSeverity.WARNING, self.text)
+        return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode
 from aerokit.sim.ardupilot.copter.host import CopterHost
@@ -19,7 +18,7 @@ _SMART_RTL_HIGHER_M = 2.0
 class Land(Mode):
     """Comes straight down: WPNAV_SPEED_DN to LAND_ALT_LOW, then LAND_SPEED; disarms when it is down."""
 
-    number: ClassVar[int] = CopterMode.LAND
+    number: int = CopterMode.LAND
     name = "LAND"
     needs_position = False
     can_arm = False
@@ -54,7 +53,7 @@ def sink(copter: CopterHost) -> None:
 class Rtl(Mode):
     """Climbs to RTL_ALT (less when it is close), flies home or to a rally point, waits RTL_LOIT_TIME and lands."""
 
-    number: ClassVar[int] = CopterMode.RTL
+    number: int = CopterMode.RTL
     name = "RTL"
     can_arm = False
     can_change_speed = True
@@ -136,7 +135,7 @@ class Rtl(Mode):
 class SmartRtl(Mode):
     """Back on the path it has come on, without its loops; above the beginning it lands. See `SmartPath`."""
 
-    number: ClassVar[int] = CopterMode.SMART_RTL
+    number: int = CopterMode.SMART_RTL
     name = "SMARTRTL"
     can_arm = False
     returns_on_path = True

@@ -24,27 +24,12 @@ from aerokit.sim.ardupilot.copter.auto import Auto
 from aerokit.sim.ardupilot.copter.failsafes import CopterArming, CopterFailsafes, CopterFence
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.copter.host import CopterHost
-from aerokit.sim.ardupilot.copter.modes import AltHold, Brake, Circle, Loiter, PosHold, Stabilize
-from aerokit.sim.ardupilot.copter.other_modes import (
-    Acro,
-    AutoRtl,
-    Autotune,
-    AvoidAdsb,
-    Drift,
-    Flip,
-    FlowHold,
-    Follow,
-    GuidedNoGps,
-    SystemId,
-    Throw,
-    Turtle,
-    ZigZag,
-)
+from aerokit.sim.ardupilot.copter.modes import AltHold, Follow, Holding, Loiter, Refusing, Stabilize, Throw
 from aerokit.sim.ardupilot.copter.returning import Land, Rtl, SmartRtl
 from aerokit.sim.ardupilot.copter.setpoints import Setpoints
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
-from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
@@ -214,6 +199,39 @@ _GUIDED_MODES = frozenset((
 ))  # fmt: skip
 
 
+_MODES: tuple[Callable[[Any], VehicleMode], ...] = (
+    variant(
+        Refusing, CopterMode.AUTO_RTL, "AUTO RTL", text="Unable to start landing sequence",
+        refused_because="No return path or landing sequence found",
+    ),
+    Auto,
+    variant(Stabilize, CopterMode.ACRO, "ACRO"),
+    Stabilize,
+    AltHold,
+    # it pulls at its circle on the ground, and notices no landing
+    variant(Loiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False),
+    Loiter,
+    Guided,
+    Land,
+    Rtl,
+    variant(AltHold, CopterMode.DRIFT, "DRIFT", takes_off=False, needs_position=True),
+    variant(Refusing, CopterMode.FLIP, "FLIP"),
+    variant(Refusing, CopterMode.AUTOTUNE, "AUTOTUNE"),
+    variant(Loiter, CopterMode.POSHOLD, "POSHOLD"),
+    variant(Holding, CopterMode.BRAKE, "BRAKE", can_arm=False),
+    Throw,
+    variant(Holding, CopterMode.AVOID_ADSB, "AVOID_ADSB", can_arm=False),
+    variant(Guided, CopterMode.GUIDED_NOGPS, "GUIDED_NOGPS", needs_position=False),
+    SmartRtl,
+    variant(Refusing, CopterMode.FLOWHOLD, "FLOWHOLD"),
+    Follow,
+    variant(Loiter, CopterMode.ZIGZAG, "ZIGZAG"),
+    variant(Refusing, CopterMode.SYSTEMID, "SYSTEMID", text="No axis selected, SID_AXIS = 0"),
+    variant(Refusing, CopterMode.TURTLE, "TURTLE"),
+)  # fmt: skip
+"""In the order in which they are listed; the rarer ones hold, fly by the sticks, or refuse."""
+
+
 class SimulatedCopter(CopterHost):
     """Speaks and behaves as ArduCopter does where a client can see it; flies as `Motion` does.
 
@@ -229,10 +247,7 @@ class SimulatedCopter(CopterHost):
     MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
     CAPABILITIES: ClassVar[int] = 0xFBEF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
-    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = (
-        AutoRtl, Auto, Acro, Stabilize, AltHold, Circle, Loiter, Guided, Land, Rtl, Drift, Flip, Autotune, PosHold,
-        Brake, Throw, AvoidAdsb, GuidedNoGps, SmartRtl, FlowHold, Follow, ZigZag, SystemId, Turtle,
-    )  # fmt: skip
+    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = _MODES
     ARMING: ClassVar[type[Arming]] = CopterArming
     FAILSAFES: ClassVar[type[Failsafes]] = CopterFailsafes
     FENCE: ClassVar[type[Fence]] = CopterFence

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavSeverity, PlaneMode
 from aerokit.mavlink.messages import MissionItemReached
@@ -27,7 +26,7 @@ _ON_CIRCLE = 1.3
 class Auto(NavigatingMode):
     """The mission run says which command comes when; past the end it returns to launch."""
 
-    number: ClassVar[int] = PlaneMode.AUTO
+    number: int = PlaneMode.AUTO
     name = "AUTO"
     needs_mission = True
     can_change_speed = True

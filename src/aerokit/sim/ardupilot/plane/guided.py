@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import AttitudeTargetTypemask as Mask
@@ -38,7 +37,7 @@ class Guided(NavigatingMode):
     for three seconds each.
     """
 
-    number: ClassVar[int] = PlaneMode.GUIDED
+    number: int = PlaneMode.GUIDED
     name = "GUIDED"
     can_change_speed = True
 

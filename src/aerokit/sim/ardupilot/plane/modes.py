@@ -6,7 +6,6 @@ The modes of lifting rotors are refused, as without Q_ENABLE.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 from aerokit.mavlink.enums import MavModeFlag, MavSeverity, PlaneMode
 from aerokit.sim.ardupilot.mode import VehicleMode
@@ -59,32 +58,10 @@ class Piloted(PlaneModeBase):
         )
 
 
-class Manual(Piloted):
-    """Sticks straight to the rudders; here as `FlyByWireA`."""
-
-    number: ClassVar[int] = PlaneMode.MANUAL
-    name = "MANUAL"
-    flags: int = MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED
-
-
-class Stabilize(Piloted):
-    """Level when the sticks are let go."""
-
-    number: ClassVar[int] = PlaneMode.STABILIZE
-    name = "STABILIZE"
-
-
-class FlyByWireA(Piloted):
-    """Bank and pitch by stick."""
-
-    number: ClassVar[int] = PlaneMode.FLY_BY_WIRE_A
-    name = "FLY_BY_WIRE_A"
-
-
 class FlyByWireB(PlaneModeBase):
     """Bank by stick, height and speed held."""
 
-    number: ClassVar[int] = PlaneMode.FLY_BY_WIRE_B
+    number: int = PlaneMode.FLY_BY_WIRE_B
     name = "FLY_BY_WIRE_B"
 
     def __init__(self, plane: PlaneHost) -> None:
@@ -112,7 +89,7 @@ class FlyByWireB(PlaneModeBase):
 class Cruise(FlyByWireB):
     """As FBWB, and without the stick on the same course over the ground."""
 
-    number: ClassVar[int] = PlaneMode.CRUISE
+    number: int = PlaneMode.CRUISE
     name = "CRUISE"
 
     def __init__(self, plane: PlaneHost) -> None:
@@ -134,7 +111,7 @@ class Cruise(FlyByWireB):
 class Circle(PlaneModeBase):
     """Keeps turning gently without GPS, and keeps its height."""
 
-    number: ClassVar[int] = PlaneMode.CIRCLE
+    number: int = PlaneMode.CIRCLE
     name = "CIRCLE"
     flags: int = _NAVIGATES
 
@@ -188,17 +165,10 @@ class NavigatingMode(PlaneModeBase):
         wing.circle(*self._place, radius=radius, airspeed=self.airspeed)
 
 
-class Loiter(NavigatingMode):
-    """Circles where it was switched on."""
-
-    number: ClassVar[int] = PlaneMode.LOITER
-    name = "LOITER"
-
-
 class Rtl(NavigatingMode):
     """Home at RTL_ALTITUDE, or to a rally point, to circle there with RTL_RADIUS."""
 
-    number: ClassVar[int] = PlaneMode.RTL
+    number: int = PlaneMode.RTL
     name = "RTL"
     can_arm = False
 
@@ -217,7 +187,7 @@ class Rtl(NavigatingMode):
 class TakeOff(NavigatingMode):
     """Takes off when it is armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead."""
 
-    number: ClassVar[int] = PlaneMode.TAKEOFF
+    number: int = PlaneMode.TAKEOFF
     name = "TAKEOFF"
 
     def enter(self, *, force: bool) -> bool:
@@ -261,7 +231,7 @@ class TakeOff(NavigatingMode):
 class Autoland(NavigatingMode):
     """Lands where it has taken off and in that direction; only in flight. Armed after that, it disarms at once."""
 
-    number: ClassVar[int] = PlaneMode.AUTOLAND
+    number: int = PlaneMode.AUTOLAND
     name = "AUTOLAND"
     is_landing = True
 
@@ -295,3 +265,22 @@ def climb_out(plane: PlaneHost) -> None:
     else:
         yaw = wing.yaw if plane.take_off_yaw is None else plane.take_off_yaw
         wing.head(yaw, plane.cruise_m_s, wing.wing.climb_m_s)
+
+
+class Autotune(Piloted):
+    """As FBWA; nothing is tuned."""
+
+    number: int = PlaneMode.AUTOTUNE
+    name = "AUTOTUNE"
+
+    def enter(self, *, force: bool) -> bool:
+        self.plane.info("Started autotune")
+        self.plane.info("Autotuning roll pitch yaw")
+        return True
+
+
+class Refusing(PlaneModeBase):
+    can_arm = False
+
+    def enter(self, *, force: bool) -> bool:
+        return False

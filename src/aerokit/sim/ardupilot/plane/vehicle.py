@@ -20,7 +20,7 @@ from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
-from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.plane.auto import Auto
@@ -29,19 +29,17 @@ from aerokit.sim.ardupilot.plane.guided import Guided, PlaneSetpoints, guided_co
 from aerokit.sim.ardupilot.plane.host import PlaneHost
 from aerokit.sim.ardupilot.plane.modes import (
     Autoland,
+    Autotune,
     Circle,
     Cruise,
-    FlyByWireA,
     FlyByWireB,
-    Loiter,
-    Manual,
     NavigatingMode,
+    Piloted,
     PlaneModeBase,
+    Refusing,
     Rtl,
-    Stabilize,
     TakeOff,
 )
-from aerokit.sim.ardupilot.plane.other_modes import Acro, Autotune, AvoidAdsb, Initialising, Thermal, Training
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
 
@@ -149,6 +147,32 @@ _STANDS_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
 
+_MODES: tuple[Callable[[Any], VehicleMode], ...] = (
+    variant(
+        Piloted, PlaneMode.MANUAL, "MANUAL",
+        flags=MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED,
+    ),
+    Circle,
+    variant(Piloted, PlaneMode.STABILIZE, "STABILIZE"),
+    variant(Piloted, PlaneMode.TRAINING, "TRAINING"),
+    variant(Piloted, PlaneMode.ACRO, "ACRO"),
+    variant(Piloted, PlaneMode.FLY_BY_WIRE_A, "FLY_BY_WIRE_A"),
+    FlyByWireB,
+    Cruise,
+    Autotune,
+    Auto,
+    Rtl,
+    variant(NavigatingMode, PlaneMode.LOITER, "LOITER"),
+    variant(NavigatingMode, PlaneMode.AVOID_ADSB, "AVOID_ADSB"),
+    Guided,
+    variant(Refusing, PlaneMode.INITIALIZING, "INITIALISING"),
+    TakeOff,
+    variant(Refusing, PlaneMode.THERMAL, "THERMAL"),
+    Autoland,
+)  # fmt: skip
+"""In the order in which they are listed; the rarer ones fly by the sticks, circle, or refuse."""
+
+
 class SimulatedPlane(PlaneHost):
     """Speaks and behaves as ArduPlane does where a client can see it; flies as `FixedWing` does.
 
@@ -162,10 +186,7 @@ class SimulatedPlane(PlaneHost):
     HOME_NEEDS_ORIGIN: ClassVar[bool] = False
     CAPABILITIES: ClassVar[int] = 0xF36F
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
-    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = (
-        Manual, Circle, Stabilize, Training, Acro, FlyByWireA, FlyByWireB, Cruise, Autotune, Auto, Rtl, Loiter,
-        AvoidAdsb, Guided, Initialising, TakeOff, Thermal, Autoland,
-    )  # fmt: skip
+    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = _MODES
     ARMING: ClassVar[type[Arming]] = PlaneArming
     FAILSAFES: ClassVar[type[Failsafes]] = PlaneFailsafes
     FENCE: ClassVar[type[Fence]] = PlaneFence

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from collections.abc import Callable
 
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
 from aerokit.sim.ardupilot.level import LevelAuto
-from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.rover.host import RoverHost
 from aerokit.sim.ardupilot.targets import Target
@@ -32,7 +32,7 @@ class _Mode(VehicleMode):
 
 
 class _Manual(_Mode):
-    number = RoverMode.MANUAL
+    number: int = RoverMode.MANUAL
     name = "MANU"
     needs_position = False
     has_manual_throttle = True
@@ -42,76 +42,26 @@ class _Manual(_Mode):
         self.rover.motion.drive(throttle * self.rover.top_speed, steering * _FULL_STEERING_RAD_S)
 
 
-class _Acro(_Manual):
-    number = RoverMode.ACRO
-    name = "ACRO"
-
-
-class _Steering(_Manual):
-    number = RoverMode.STEERING
-    name = "STER"
-    needs_position = True
-
-
-class _Simple(_Manual):
-    number = RoverMode.SIMPLE
-    name = "SMPL"
-
-
-class _Hold(_Mode):
-    number = RoverMode.HOLD
-    name = "HOLD"
-    needs_position = False
-
-    def update(self, dt: float) -> None:
-        self.rover.motion.stop()
-
-
-class _Loiter(_Mode):
+class _Standing(_Mode):
     """Where it stands it stays; a boat would drive back."""
 
-    number = RoverMode.LOITER
-    name = "LOIT"
-
     def update(self, dt: float) -> None:
         self.rover.motion.stop()
-
-
-class _Circle(_Loiter):
-    """Stands here instead of circling."""
-
-    number = RoverMode.CIRCLE
-    name = "CIRC"
 
 
 class _Refused(_Mode):
-    def enter(self, *, force: bool) -> bool:
-        return False
-
-
-class _Follow(_Refused):
-    number = RoverMode.FOLLOW
-    name = "FOLL"
-
-
-class _Initialising(_Refused):
-    number = RoverMode.INITIALIZING
-    name = "INIT"
-
-
-class _Dock(_Refused):
-    number = RoverMode.DOCK
-    name = "DOCK"
+    text: str = ""
 
     def enter(self, *, force: bool) -> bool:
-        self.rover.send_text(MavSeverity.NOTICE, "Dock: target not acquired")
+        if self.text:
+            self.rover.send_text(MavSeverity.NOTICE, self.text)
         return False
 
 
 class _Rtl(_Mode):
     """Straight home or to a rally point with RTL_SPEED, or WP_SPEED; there it stands and stays armed."""
 
-    number = RoverMode.RTL
+    number: int = RoverMode.RTL
     name = "RTL"
     can_arm = False
     can_change_speed = True
@@ -160,7 +110,7 @@ class _Rtl(_Mode):
 class _SmartRtl(_Rtl):
     """Back on the path it has come on, without its loops; refused while there is none. See `SmartPath`."""
 
-    number = RoverMode.SMART_RTL
+    number: int = RoverMode.SMART_RTL
     name = "SRTL"
     returns_on_path = True
 
@@ -177,7 +127,7 @@ class _SmartRtl(_Rtl):
 class RoverAuto(LevelAuto):
     """AUTO: see `LevelAuto`."""
 
-    number: ClassVar[int] = RoverMode.AUTO
+    number: int = RoverMode.AUTO
     name = "AUTO"
 
     vehicle: RoverHost
@@ -218,7 +168,7 @@ class RoverAuto(LevelAuto):
 class RoverGuided(_Mode):
     """GUIDED: a place to drive to, or a velocity, with or without a turn rate, for three seconds."""
 
-    number: ClassVar[int] = RoverMode.GUIDED
+    number: int = RoverMode.GUIDED
     name = "GUID"
 
     def __init__(self, rover: RoverHost) -> None:
@@ -290,8 +240,20 @@ class RoverGuided(_Mode):
             motion.head(speed, course if target.yaw is None else target.yaw)
 
 
-ROVER_MODES = (
-    _Manual, _Acro, _Steering, _Hold, _Loiter, _Follow, _Simple, _Circle, RoverAuto, _Rtl, _SmartRtl, RoverGuided,
-    _Initialising, _Dock,
-)  # fmt: skip
+ROVER_MODES: tuple[Callable[[RoverHost], VehicleMode], ...] = (
+    _Manual,
+    variant(_Manual, RoverMode.ACRO, "ACRO"),
+    variant(_Manual, RoverMode.STEERING, "STER", needs_position=True),
+    variant(_Standing, RoverMode.HOLD, "HOLD", needs_position=False),
+    variant(_Standing, RoverMode.LOITER, "LOIT"),
+    variant(_Refused, RoverMode.FOLLOW, "FOLL"),
+    variant(_Manual, RoverMode.SIMPLE, "SMPL"),
+    variant(_Standing, RoverMode.CIRCLE, "CIRC"),
+    RoverAuto,
+    _Rtl,
+    _SmartRtl,
+    RoverGuided,
+    variant(_Refused, RoverMode.INITIALIZING, "INIT"),
+    variant(_Refused, RoverMode.DOCK, "DOCK", text="Dock: target not acquired"),
+)
 """In the order in which AVAILABLE_MODES lists them, with the names that it tells."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from collections.abc import Callable
 
 from aerokit.mavlink.enums import SubMode
 from aerokit.sim.ardupilot.level import LevelAuto
-from aerokit.sim.ardupilot.mode import VehicleMode
+from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.local_frame import Ned
@@ -42,7 +42,7 @@ class _Mode(VehicleMode):
 class _Manual(_Mode):
     """Thrusters by the sticks; with the throttle in the middle it drifts up."""
 
-    number = SubMode.MANUAL
+    number: int = SubMode.MANUAL
     name = "MANUAL"
     needs_position = False
     has_manual_throttle = True
@@ -55,20 +55,10 @@ class _Manual(_Mode):
             self.sub.motion.seek_velocity(*self.sideways(), -climb)
 
 
-class _Stabilize(_Manual):
-    number = SubMode.STABILIZE
-    name = "STABILIZE"
-
-
-class _Acro(_Manual):
-    number = SubMode.ACRO
-    name = "ACRO"
-
-
 class _AltHold(_Mode):
     """Depth held; the throttle stick changes it."""
 
-    number = SubMode.ALT_HOLD
+    number: int = SubMode.ALT_HOLD
     name = "ALT_HOLD"
     needs_position = False
 
@@ -76,15 +66,10 @@ class _AltHold(_Mode):
         self.sub.motion.seek_velocity(*self.sideways(), -self.stick(_THROTTLE) * self.sub.climb_speed)
 
 
-class _MotorDetect(_AltHold):
-    number = SubMode.MOTORDETECT
-    name = "MOTORDETECT"
-
-
 class _Surftrak(_AltHold):
     """Without a range finder it holds the depth."""
 
-    number = SubMode.SURFTRAK
+    number: int = SubMode.SURFTRAK
     name = "SURFTRAK"
 
     def enter(self, *, force: bool) -> bool:
@@ -92,25 +77,10 @@ class _Surftrak(_AltHold):
         return True
 
 
-class _PosHold(_AltHold):
-    """Depth and place held."""
-
-    number = SubMode.POSHOLD
-    name = "POSHOLD"
-    needs_position = True
-
-
-class _Circle(_PosHold):
-    """Holds still here instead of circling."""
-
-    number = SubMode.CIRCLE
-    name = "CIRCLE"
-
-
 class _Surface(_AltHold):
     """Up with WPNAV_SPEED_UP; at the surface it goes into ALT_HOLD."""
 
-    number = SubMode.SURFACE
+    number: int = SubMode.SURFACE
     name = "SURFACE"
     is_landing = True
 
@@ -124,7 +94,7 @@ class _Surface(_AltHold):
 class SubAuto(LevelAuto):
     """AUTO: see `LevelAuto`. After the last command it stays."""
 
-    number: ClassVar[int] = SubMode.AUTO
+    number: int = SubMode.AUTO
     name = "AUTO"
 
     vehicle: SubHost
@@ -149,7 +119,7 @@ class SubAuto(LevelAuto):
 class SubGuided(_Mode):
     """GUIDED: a place that stays, or a velocity for three seconds; first it keeps still."""
 
-    number: ClassVar[int] = SubMode.GUIDED
+    number: int = SubMode.GUIDED
     name = "GUIDED"
     can_change_speed = True
 
@@ -203,7 +173,17 @@ class SubGuided(_Mode):
             motion.turn(target.yaw_rate or 0.0 if target is not None and fresh else 0.0)
 
 
-SUB_MODES = (
-    _Manual, _Stabilize, _Acro, _AltHold, SubAuto, SubGuided, _Circle, _Surface, _PosHold, _MotorDetect, _Surftrak,
-)  # fmt: skip
+SUB_MODES: tuple[Callable[[SubHost], VehicleMode], ...] = (
+    _Manual,
+    variant(_Manual, SubMode.STABILIZE, "STABILIZE"),
+    variant(_Manual, SubMode.ACRO, "ACRO"),
+    _AltHold,
+    SubAuto,
+    SubGuided,
+    variant(_AltHold, SubMode.CIRCLE, "CIRCLE", needs_position=True),
+    _Surface,
+    variant(_AltHold, SubMode.POSHOLD, "POSHOLD", needs_position=True),
+    variant(_AltHold, SubMode.MOTORDETECT, "MOTORDETECT"),
+    _Surftrak,
+)
 """All eleven."""
