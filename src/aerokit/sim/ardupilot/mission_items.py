@@ -5,9 +5,12 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import pkgutil
 import struct
 from collections.abc import Callable
+from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
@@ -26,106 +29,34 @@ _GIVEN_BACK: dict[int, int] = {
 }
 
 _C = MavCmd
-_LAYOUTS: dict[int, str] = {
-    _C.NAV_WAYPOINT: "H---",
-    _C.NAV_LOITER_UNLIM: "--r-",
-    _C.NAV_LOITER_TURNS: "----",
-    _C.NAV_LOITER_TIME: "H-s+",
-    _C.NAV_RETURN_TO_LAUNCH: "----",
-    _C.NAV_LAND: "H--s",
-    _C.NAV_TAKEOFF: "H---",
-    _C.NAV_CONTINUE_AND_CHANGE_ALT: "H---",
-    _C.NAV_LOITER_TO_ALT: "-r-+",
-    _C.NAV_SPLINE_WAYPOINT: "H---",
-    _C.NAV_ALTITUDE_WAIT: "ffB-",
-    _C.NAV_VTOL_TAKEOFF: "----",
-    _C.NAV_VTOL_LAND: "H---",
-    _C.NAV_GUIDED_ENABLE: "H---",
-    _C.NAV_DELAY: "fbbb",
-    _C.NAV_PAYLOAD_PLACE: "c---",
-    _C.CONDITION_DELAY: "f---",
-    _C.CONDITION_DISTANCE: "f---",
-    _C.CONDITION_YAW: "ffbB",
-    _C.DO_JUMP: "Hh--",
-    _C.DO_CHANGE_SPEED: "Bff-",
-    _C.DO_SET_HOME: "H---",
-    _C.DO_SET_RELAY: "BB--",
-    _C.DO_REPEAT_RELAY: "Bhf-",
-    _C.DO_SET_SERVO: "BH--",
-    _C.DO_REPEAT_SERVO: "BHhf",
-    _C.DO_RETURN_PATH_START: "----",
-    _C.DO_LAND_START: "----",
-    _C.DO_GO_AROUND: "----",
-    _C.DO_SET_REVERSE: "H---",
-    _C.DO_SET_ROI_LOCATION: "H---",
-    _C.DO_SET_ROI_NONE: "H---",
-    _C.DO_SET_ROI: "H---",
-    _C.DO_DIGICAM_CONFIGURE: "BHBHBBf",
-    _C.DO_DIGICAM_CONTROL: "BBbBBB-",
-    _C.DO_MOUNT_CONTROL: "fff---2",
-    _C.DO_SET_CAM_TRIGG_DIST: "f-B-",
-    _C.DO_FENCE_ENABLE: "H---",
-    _C.DO_PARACHUTE: "H---",
-    _C.DO_INVERTED_FLIGHT: "H---",
-    _C.DO_GRIPPER: "BB--",
-    _C.DO_AUTOTUNE_ENABLE: "H---",
-    _C.DO_SET_RESUME_REPEAT_DIST: "H---",
-    _C.DO_SPRAYER: "H---",
-    _C.DO_SEND_SCRIPT_MESSAGE: "Hfff",
-    _C.DO_AUX_FUNCTION: "HB--",
-    _C.DO_GUIDED_LIMITS: "Hfff",
-    _C.DO_ENGINE_CONTROL: "++c1",
-    _C.DO_PAUSE_CONTINUE: "H---",
-    _C.NAV_SET_YAW_SPEED: "ffB-",
-    _C.SET_CAMERA_ZOOM: "Bf--",
-    _C.SET_CAMERA_FOCUS: "Bf--",
-    _C.SET_CAMERA_SOURCE: "BBB-",
-    _C.JUMP_TAG: "H---",
-    _C.DO_JUMP_TAG: "Hh--",
-    _C.DO_GIMBAL_MANAGER_PITCHYAW: "bhbbB-B",
-    _C.IMAGE_START_CAPTURE: "BfHH",
-    _C.IMAGE_STOP_CAPTURE: "H---",
-    _C.VIDEO_START_CAPTURE: "B---",
-    _C.VIDEO_STOP_CAPTURE: "B---",
-    _C.DO_VTOL_TRANSITION: "B---",
-    _C.DO_WINCH: "BBff",
-    _C.NAV_SCRIPT_TIME: "BBeehh-",
-    _C.NAV_ATTITUDE_TIME: "tapwh--",
-}
-"""Command → how each of params 1 to 4 (and x, y, z where they are no place) is kept; see `_KEEPERS`."""
+
+
+class StoredCommand(NamedTuple):
+    """How a command is kept."""
+
+    name: str
+    """What status texts call it; empty for one that no mission has."""
+    parameters: str
+    """How each of params 1 to 4 (and x, y, z where they are no place) is kept; see `_KEEPERS`. Empty: not at all."""
+    has_place: bool
+    """Whether ``x``, ``y`` and ``z`` are a place, and not plain numbers or nothing."""
+
+
+def _read_commands() -> dict[int, StoredCommand]:
+    data = pkgutil.get_data(__name__, "mission_commands.csv")
+    assert data is not None
+    return {
+        MavCmd[row["command"]]: StoredCommand(row["name"], row["parameters"], row["has_place"] == "1")
+        for row in csv.DictReader(data.decode().splitlines())
+    }
+
+
+STORED_COMMANDS: dict[int, StoredCommand] = _read_commands()
+_UNKNOWN = StoredCommand("?", "", has_place=False)
 
 _OF_A_PLANE: dict[int, str] = {_C.NAV_WAYPOINT: "-BB-", _C.NAV_SPLINE_WAYPOINT: ""}
 """What it keeps otherwise: the radius within which it arrives and the distance at which it passes; no splines."""
 
-_WITH_LOCATION = frozenset(
-    {
-        _C.NAV_WAYPOINT,
-        _C.NAV_LOITER_UNLIM,
-        _C.NAV_LOITER_TURNS,
-        _C.NAV_LOITER_TIME,
-        _C.NAV_LAND,
-        _C.NAV_TAKEOFF,
-        _C.NAV_CONTINUE_AND_CHANGE_ALT,
-        _C.NAV_LOITER_TO_ALT,
-        _C.NAV_SPLINE_WAYPOINT,
-        _C.NAV_GUIDED_ENABLE,
-        _C.NAV_VTOL_TAKEOFF,
-        _C.NAV_VTOL_LAND,
-        _C.NAV_PAYLOAD_PLACE,
-        _C.DO_SET_HOME,
-        _C.DO_RETURN_PATH_START,
-        _C.DO_LAND_START,
-        _C.DO_GO_AROUND,
-        _C.DO_SET_ROI_LOCATION,
-        _C.DO_SET_ROI,
-        _C.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
-        _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
-        _C.NAV_FENCE_CIRCLE_INCLUSION,
-        _C.NAV_FENCE_CIRCLE_EXCLUSION,
-        _C.NAV_FENCE_RETURN_POINT,
-        _C.NAV_RALLY_POINT,
-    }
-)
 _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
     _C.NAV_WAYPOINT: (3,),
     _C.NAV_LOITER_UNLIM: (3,),
@@ -135,68 +66,15 @@ _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
     _C.NAV_VTOL_LAND: (2, 3),
 }
 
-COMMAND_NAMES: dict[int, str] = {
-    _C.NAV_WAYPOINT: "WP",
-    _C.NAV_SPLINE_WAYPOINT: "SplineWP",
-    _C.NAV_RETURN_TO_LAUNCH: "RTL",
-    _C.NAV_LOITER_UNLIM: "LoitUnlim",
-    _C.NAV_LOITER_TIME: "LoitTime",
-    _C.NAV_LOITER_TURNS: "LoitTurns",
-    _C.NAV_LOITER_TO_ALT: "LoitAltitude",
-    _C.NAV_GUIDED_ENABLE: "GuidedEnable",
-    _C.NAV_TAKEOFF: "Takeoff",
-    _C.NAV_LAND: "Land",
-    _C.NAV_VTOL_TAKEOFF: "VTOLTakeoff",
-    _C.NAV_VTOL_LAND: "VTOLLand",
-    _C.NAV_DELAY: "Delay",
-    _C.NAV_PAYLOAD_PLACE: "PayloadPlace",
-    _C.NAV_CONTINUE_AND_CHANGE_ALT: "ContinueAndChangeAlt",
-    _C.NAV_SET_YAW_SPEED: "SetYawSpd",
-    _C.NAV_SCRIPT_TIME: "NavScriptTime",
-    _C.NAV_ATTITUDE_TIME: "NavAttitudeTime",
-    _C.CONDITION_DELAY: "CondDelay",
-    _C.CONDITION_DISTANCE: "CondDist",
-    _C.CONDITION_YAW: "CondYaw",
-    _C.DO_CHANGE_SPEED: "ChangeSpeed",
-    _C.DO_SET_HOME: "SetHome",
-    _C.DO_SET_SERVO: "SetServo",
-    _C.DO_SET_RELAY: "SetRelay",
-    _C.DO_REPEAT_SERVO: "RepeatServo",
-    _C.DO_REPEAT_RELAY: "RepeatRelay",
-    _C.DO_DIGICAM_CONFIGURE: "DigiCamCfg",
-    _C.DO_DIGICAM_CONTROL: "DigiCamCtrl",
-    _C.DO_SET_CAM_TRIGG_DIST: "SetCamTrigDst",
-    _C.DO_SET_ROI_LOCATION: "SetROILocation",
-    _C.DO_SET_ROI_NONE: "SetROINone",
-    _C.DO_SET_ROI: "SetROI",
-    _C.DO_SET_REVERSE: "SetReverse",
-    _C.DO_SET_RESUME_REPEAT_DIST: "SetRepeatDist",
-    _C.DO_GUIDED_LIMITS: "GuidedLimits",
-    _C.DO_FENCE_ENABLE: "FenceEnable",
-    _C.DO_AUTOTUNE_ENABLE: "AutoTuneEnable",
-    _C.DO_VTOL_TRANSITION: "VTOLTransition",
-    _C.DO_ENGINE_CONTROL: "EngineControl",
-    _C.DO_RETURN_PATH_START: "ReturnPathStart",
-    _C.DO_LAND_START: "LandStart",
-    _C.DO_GO_AROUND: "Go Around",
-    _C.DO_GRIPPER: "Gripper",
-    _C.DO_PARACHUTE: "Parachute",
-    _C.DO_SPRAYER: "Sprayer",
-    _C.DO_AUX_FUNCTION: "AuxFunction",
-    _C.DO_MOUNT_CONTROL: "MountControl",
-    _C.DO_WINCH: "Winch",
-    _C.DO_SEND_SCRIPT_MESSAGE: "Scripting",
-    _C.DO_JUMP: "Jump",
-    _C.DO_JUMP_TAG: "JumpToTag",
-    _C.JUMP_TAG: "Tag",
-    _C.DO_PAUSE_CONTINUE: "PauseContinue",
-}
-"""What status texts call a command."""
+
+def command_name(command: int) -> str:
+    """What status texts call a command."""
+    return STORED_COMMANDS.get(command, _UNKNOWN).name or _UNKNOWN.name
 
 
 def has_location(command: int) -> bool:
     """Whether ``x``, ``y`` and ``z`` are a place, and not plain numbers or nothing."""
-    return command in _WITH_LOCATION
+    return STORED_COMMANDS.get(command, _UNKNOWN).has_place
 
 
 def is_place(latitude_e7: float, longitude_e7: float) -> int:
@@ -218,7 +96,7 @@ def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
     layout = _OF_A_PLANE.get(item.command) if kind == "plane" else None
-    layout = _LAYOUTS.get(item.command) if layout is None else layout
+    layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters if layout is None else layout
     if result == MavMissionResult.ACCEPTED and not layout:
         result = MavMissionResult.UNSUPPORTED
     if result != MavMissionResult.ACCEPTED:

@@ -13,7 +13,7 @@ from aerokit.mavlink.enums import MavCmd, MissionState
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import Host
-from aerokit.sim.ardupilot.mission_items import COMMAND_NAMES
+from aerokit.sim.ardupilot.mission_items import command_name
 
 _C = MavCmd
 _FIRST = 1
@@ -253,7 +253,7 @@ class MissionRun:
         self._begin(*found)
 
     def _begin(self, index: int, item: MissionItem) -> bool:
-        name = COMMAND_NAMES.get(item.command, "?")
+        name = command_name(item.command)
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
         self._vehicle.info(f"Mission: {index} {name}{target}")
         self._vehicle.camera.run(item)

@@ -11,20 +11,15 @@ from typing import ClassVar, Protocol
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
-from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
+from aerokit.sim.setpoints import PositionTarget, Setpoint, is_finite, rotated
 
-_POSITION = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE
-_VELOCITY = Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE
-_ACCELERATION = Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE
 _BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
 _FIXED = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED})
-
-PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
 
 
 @dataclass(frozen=True)
@@ -94,26 +89,26 @@ class Targets:
     def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
         frame = message.coordinate_frame
         point = self.vehicle.point(message.lat_int, message.lon_int, message.alt, frame)
-        if point is not None or message.type_mask & _POSITION:
+        if point is not None or not Setpoint.of(message).has_position:
             self._take(message, point, has_yaw=self.GLOBAL_YAW)
 
     def _take(self, message: PositionTarget, point: Ned | None, *, has_yaw: bool) -> None:
-        mask, frame = message.type_mask, message.coordinate_frame
+        asked, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
-        if not mask & _ACCELERATION:
+        if asked.has_acceleration:
             self.refuse_acceleration(message)
             return
-        position = None if mask & _POSITION else point
-        velocity = None if mask & _VELOCITY else (message.vx, message.vy, message.vz)
-        if not all(map(math.isfinite, (*(position or ()), *(velocity or ())))):
+        position = point if asked.has_position else None
+        velocity = asked.velocity if asked.has_velocity else None
+        if not is_finite(position, velocity):
             return
         here = self.vehicle.motion.yaw if frame in self.RELATIVE_YAW_FRAMES else 0.0
-        yaw = None if mask & Mask.YAW_IGNORE or not has_yaw else message.yaw + here
-        rate = None if mask & Mask.YAW_RATE_IGNORE or not has_yaw else message.yaw_rate
+        yaw = None if asked.yaw is None or not has_yaw else asked.yaw + here
+        rate = asked.yaw_rate if has_yaw else None
         backwards = message.vx < 0 and not (yaw is None and rate is None)
         if velocity is not None and frame in self.BODY_FRAMES:
-            velocity = self._rotated(velocity)
+            velocity = rotated(velocity, self.vehicle.motion.yaw)
         target = Target(position, velocity, backwards, yaw, rate)
         if self.is_complete(target):
             self.mode.take(target)
@@ -123,13 +118,8 @@ class Targets:
         if message.coordinate_frame == MavFrame.LOCAL_NED:
             return self.vehicle.navigation.world(offset)
         if message.coordinate_frame in self.BODY_FRAMES:
-            offset = self._rotated(offset)
+            offset = rotated(offset, motion.yaw)
         return (motion.north + offset[0], motion.east + offset[1], motion.down + offset[2])
-
-    def _rotated(self, vector: Ned) -> Ned:
-        cos_yaw, sin_yaw = math.cos(self.vehicle.motion.yaw), math.sin(self.vehicle.motion.yaw)
-        forward, right, down = vector
-        return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)
 
 
 class RoverTargets(Targets):

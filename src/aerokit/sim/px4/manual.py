@@ -9,6 +9,7 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.motion import GRAVITY_M_S2
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW, STICK_MODES
+from aerokit.sim.setpoints import rotated
 
 _NO_MANUAL_CONTROL = 4
 _UNUSED = 65535
@@ -145,10 +146,7 @@ class ManualFlight:
         down = self._height_velocity()
         if forward or right:
             self._place = None
-            cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
-            motion.seek_velocity(
-                forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down
-            )
+            motion.seek_velocity(*rotated((forward, right, down), motion.yaw))
         else:
             self._stay(down)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import pkgutil
 import struct
 import zlib
 from collections.abc import Callable, Sequence
@@ -12,69 +14,12 @@ from aerokit.missions import MissionItem
 from aerokit.sim.missions import float32
 
 _C, _F = MavCmd, MavFrame
-_PLACES: dict[int, str] = {
-    _C.NAV_WAYPOINT: "ff-y",
-    _C.NAV_LOITER_UNLIM: "--fy",
-    _C.NAV_LOITER_TIME: "f?f?",
-    _C.NAV_LAND: "-u-y",
-    _C.NAV_TAKEOFF: "---y",
-    _C.NAV_LOITER_TO_ALT: "?f-?",
-    _C.NAV_ROI: "----",
-    _C.DO_SET_ROI: "----",
-    _C.DO_SET_ROI_LOCATION: "----",
-    _C.NAV_VTOL_TAKEOFF: "---y",
-    _C.NAV_VTOL_LAND: "---y",
-    _C.CONDITION_GATE: "----",
-    _C.NAV_FENCE_RETURN_POINT: "----",
-    _C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: "v---",
-    _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: "v---",
-    _C.NAV_FENCE_CIRCLE_INCLUSION: "f---",
-    _C.NAV_FENCE_CIRCLE_EXCLUSION: "f---",
-    _C.NAV_RALLY_POINT: "----",
-    _C.COMPONENT_ARM_DISARM: "----",
-    _C.DO_AUTOTUNE_ENABLE: "----",
-}
+_DATA = pkgutil.get_data(__name__, "mission_commands.csv")
+assert _DATA is not None
+_ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
+_PLACES = {int(MavCmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
 """In a global frame: command → how params 1 to 4 are kept; see `_KEEPERS`."""
-
-_WITHOUT_PLACE: frozenset[int] = frozenset(
-    {
-        _C.DO_JUMP,
-        _C.NAV_ROI,
-        _C.DO_SET_ROI,
-        _C.DO_WINCH,
-        _C.DO_GRIPPER,
-        _C.DO_CHANGE_SPEED,
-        _C.DO_SET_HOME,
-        _C.DO_LAND_START,
-        _C.DO_TRIGGER_CONTROL,
-        _C.DO_DIGICAM_CONTROL,
-        _C.DO_MOUNT_CONFIGURE,
-        _C.DO_MOUNT_CONTROL,
-        _C.DO_GIMBAL_MANAGER_PITCHYAW,
-        _C.DO_GIMBAL_MANAGER_CONFIGURE,
-        _C.SET_CAMERA_FOCUS,
-        _C.SET_CAMERA_MODE,
-        _C.SET_CAMERA_SOURCE,
-        _C.IMAGE_START_CAPTURE,
-        _C.IMAGE_STOP_CAPTURE,
-        _C.VIDEO_START_CAPTURE,
-        _C.VIDEO_STOP_CAPTURE,
-        _C.DO_CONTROL_VIDEO,
-        _C.DO_SET_CAM_TRIGG_DIST,
-        _C.DO_SET_CAM_TRIGG_INTERVAL,
-        _C.OBLIQUE_SURVEY,
-        _C.DO_VTOL_TRANSITION,
-        _C.NAV_DELAY,
-        _C.NAV_RETURN_TO_LAUNCH,
-        _C.DO_SET_ROI_WPNEXT_OFFSET,
-        _C.DO_SET_ROI_NONE,
-        _C.CONDITION_DELAY,
-        _C.CONDITION_DISTANCE,
-        _C.DO_SET_ACTUATOR,
-        _C.DO_AUTOTUNE_ENABLE,
-        _C.COMPONENT_ARM_DISARM,
-    }
-)
+_WITHOUT_PLACE = frozenset(int(MavCmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
 """In MAV_FRAME_MISSION; all seven numbers are kept."""
 
 _ROI_COMMANDS = (_C.NAV_ROI, _C.DO_SET_ROI)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
-from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.channel import Channel
 from aerokit.sim.local_frame import Ned
@@ -16,11 +15,9 @@ from aerokit.sim.motion import euler_from_quaternion
 from aerokit.sim.px4.flight import velocity_towards
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
+from aerokit.sim.setpoints import PositionTarget, Setpoint, rotated
 
 _NAN3: Ned = (math.nan, math.nan, math.nan)
-_POSITION = (Mask.X_IGNORE, Mask.Y_IGNORE, Mask.Z_IGNORE)
-_VELOCITY = (Mask.VX_IGNORE, Mask.VY_IGNORE, Mask.VZ_IGNORE)
-_ACCELERATION = (Mask.AX_IGNORE, Mask.AY_IGNORE, Mask.AZ_IGNORE)
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 """Where the ground is level, an altitude above it is one above home."""
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
@@ -82,33 +79,20 @@ class Offboard:
     def _complain(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
-    def _take(
-        self, target: SetPositionTargetLocalNed | SetPositionTargetGlobalInt, position: Ned, *, body: bool
-    ) -> bool:
+    def _take(self, target: PositionTarget, position: Ned, *, body: bool) -> bool:
         """Whether it says anything; a set-point without a position, a velocity or an acceleration is none."""
-        mask = target.type_mask
-        position = _masked(position, mask, _POSITION)
-        velocity = _masked((target.vx, target.vy, target.vz), mask, _VELOCITY)
-        acceleration = _masked((target.afx, target.afy, target.afz), mask, _ACCELERATION)
+        asked = Setpoint.of(target)
+        position, velocity, acceleration = asked.axes(position)
         if all(math.isnan(part) for part in (*position, *velocity, *acceleration)):
             return False
-        self._position = position
-        self._velocity, self._acceleration = self._rotated(velocity, body), self._rotated(acceleration, body)
-        self._yaw = math.nan if mask & Mask.YAW_IGNORE else target.yaw
-        self._yaw_rate = math.nan if mask & Mask.YAW_RATE_IGNORE else target.yaw_rate
+        if body:
+            yaw = self._vehicle.motion.yaw
+            velocity, acceleration = rotated(velocity, yaw), rotated(acceleration, yaw)
+        self._position, self._velocity, self._acceleration = position, velocity, acceleration
+        self._yaw = math.nan if asked.yaw is None else asked.yaw
+        self._yaw_rate = math.nan if asked.yaw_rate is None else asked.yaw_rate
         self._attitude, self.updated_at = None, self._vehicle.now
         return True
-
-    def _rotated(self, vector: Ned, body: bool) -> Ned:
-        if not body:
-            return vector
-        yaw = self._vehicle.motion.yaw
-        forward, right, down = vector
-        return (
-            forward * math.cos(yaw) - right * math.sin(yaw),
-            forward * math.sin(yaw) + right * math.cos(yaw),
-            down,
-        )
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
@@ -162,11 +146,3 @@ class Offboard:
                 speed += velocity_towards(offset, fastest[axis], accelerations[axis])
             wanted.append(max(-fastest[axis], min(fastest[axis], speed)))
         return (wanted[0], wanted[1], wanted[2])
-
-
-def _masked(vector: Ned, mask: int, bits: tuple[int, int, int]) -> Ned:
-    one, two, three = (
-        math.nan if mask & bit or not math.isfinite(value) else value
-        for value, bit in zip(vector, bits, strict=True)
-    )
-    return (one, two, three)

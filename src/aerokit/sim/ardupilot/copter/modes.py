@@ -12,6 +12,7 @@ from aerokit.mavlink.enums import CopterMode, MavSeverity
 from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.local_frame import Ned
+from aerokit.sim.setpoints import rotated
 
 _MID_STICK, _STICK_RANGE, _THROTTLE_DEADZONE = 1500, 500, 100
 _FULL_STICK_LEAN_RAD = math.radians(30.0)
@@ -154,11 +155,8 @@ class Loiter(PilotedMode):
         return self.takes_off and self.start_take_off(altitude_m)
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
-        yaw = self.copter.motion.yaw
-        forward, right = -pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S
-        north = forward * math.cos(yaw) - right * math.sin(yaw)
-        east = forward * math.sin(yaw) + right * math.cos(yaw)
-        self.copter.motion.seek_velocity(north, east, -climb)
+        wanted = (-pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S, -climb)
+        self.copter.motion.seek_velocity(*rotated(wanted, self.copter.motion.yaw))
 
 
 class Holding(Mode):

@@ -10,17 +10,14 @@ import math
 
 from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
 from aerokit.mavlink.enums import MavFrame
-from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.copter.guided import Guided
 from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.channel import Channel
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import euler_from_quaternion
+from aerokit.sim.setpoints import PositionTarget, Setpoint, is_finite, rotated
 
-_POSITION = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE
-_VELOCITY = Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE
-_ACCELERATION = Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE
 _BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
 _LOCAL = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED}) | _BODY
 _ALL_RATES = (
@@ -29,8 +26,7 @@ _ALL_RATES = (
     | AttitudeMask.BODY_YAW_RATE_IGNORE
 )
 _FASTEST = 1000.0
-
-PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
+_STILL: Ned = (0.0, 0.0, 0.0)
 
 
 class Setpoints:
@@ -62,58 +58,52 @@ class Setpoints:
         if not self._is_guided:
             return
         point = self._copter.point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
-        if point is None and not target.type_mask & _POSITION:
+        if point is None and Setpoint.of(target).has_position:
             self._guided.enter(force=False)
             return
         self._apply(target, (0.0, 0.0, 0.0) if point is None else point, rotate=False)
 
     def _apply(self, target: PositionTarget, point: Ned, *, rotate: bool) -> None:
-        guided, mask = self._guided, target.type_mask
-        velocity, acceleration = (target.vx, target.vy, target.vz), (target.afx, target.afy, target.afz)
-        no_position, no_velocity = bool(mask & _POSITION), bool(mask & _VELOCITY)
-        no_acceleration = bool(mask & _ACCELERATION)
-        force_not_supported = bool(mask & Mask.FORCE_SET) and not no_acceleration
-        is_sane = (no_velocity or _is_sane(velocity)) and (no_acceleration or _is_number(acceleration))
-        if force_not_supported or not is_sane or not _is_number(point):
+        guided, asked = self._guided, Setpoint.of(target)
+        velocity = asked.velocity if asked.has_velocity else _STILL
+        acceleration = asked.acceleration if asked.has_acceleration else _STILL
+        is_sane = all(abs(part) <= _FASTEST for part in velocity)
+        if asked.is_force or not is_sane or not is_finite(acceleration, point):
             guided.enter(force=False)
             return
-        velocity = (0.0, 0.0, 0.0) if no_velocity else self._rotated(velocity, rotate=rotate)
-        acceleration = (0.0, 0.0, 0.0) if no_acceleration else self._rotated(acceleration, rotate=rotate)
-        if not no_position and not no_velocity:
+        if rotate:
+            yaw = self._copter.motion.yaw
+            velocity, acceleration = rotated(velocity, yaw), rotated(acceleration, yaw)
+        if asked.has_position and asked.has_velocity:
             guided.follow(point, velocity, acceleration)
-        elif no_position and not no_velocity:
+        elif asked.has_velocity:
             guided.move(velocity, acceleration)
-        elif no_position and not no_acceleration:
+        elif asked.has_acceleration and not asked.has_position:
             guided.accelerate(acceleration)
-        elif not no_position and no_acceleration:
+        elif asked.has_position and not asked.has_acceleration:
             guided.go_to(point)
         else:
             guided.enter(force=False)
             return
-        self._set_yaw(target, relative=rotate)
+        self._set_yaw(asked, relative=rotate)
 
-    def _set_yaw(self, target: PositionTarget, *, relative: bool) -> None:
-        yaw, mask = self._copter.yaw, target.type_mask
-        if not mask & Mask.YAW_IGNORE:
-            yaw.fixed(target.yaw + (self._copter.motion.yaw if relative else 0.0))
-        elif not mask & Mask.YAW_RATE_IGNORE:
-            yaw.turn(target.yaw_rate)
+    def _set_yaw(self, asked: Setpoint, *, relative: bool) -> None:
+        yaw = self._copter.yaw
+        if asked.yaw is not None:
+            yaw.fixed(asked.yaw + (self._copter.motion.yaw if relative else 0.0))
+        elif asked.yaw_rate is not None:
+            yaw.turn(asked.yaw_rate)
         else:
             yaw.default()
 
     def _local_point(self, target: SetPositionTargetLocalNed) -> Ned:
-        frame, motion = target.coordinate_frame, self._copter.motion
+        """The target's point in the world."""
+        frame, motion, offset = target.coordinate_frame, self._copter.motion, (target.x, target.y, target.z)
         if frame == MavFrame.LOCAL_NED:
-            return self._copter.navigation.world((target.x, target.y, target.z))
-        offset = self._rotated((target.x, target.y, target.z), rotate=frame in _BODY)
+            return self._copter.navigation.world(offset)
+        if frame in _BODY:
+            offset = rotated(offset, motion.yaw)
         return (motion.north + offset[0], motion.east + offset[1], motion.down + offset[2])
-
-    def _rotated(self, vector: Ned, *, rotate: bool) -> Ned:
-        if not rotate:
-            return vector
-        cos_yaw, sin_yaw = math.cos(self._copter.motion.yaw), math.sin(self._copter.motion.yaw)
-        forward, right, down = vector
-        return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
         copter, mask = self._copter, target.type_mask
@@ -139,11 +129,3 @@ class Setpoints:
         share = (max(0.0, min(1.0, thrust)) - 0.5) * 2.0
         parameters = self._copter.parameters
         return share * parameters["WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"] / 100.0
-
-
-def _is_sane(vector: Ned) -> bool:
-    return all(abs(part) <= _FASTEST for part in vector)
-
-
-def _is_number(vector: Ned) -> bool:
-    return all(math.isfinite(part) for part in vector)

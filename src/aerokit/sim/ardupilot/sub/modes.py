@@ -12,6 +12,7 @@ from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
+from aerokit.sim.setpoints import rotated
 
 _MIDDLE, _RANGE, _DEADZONE = 1500.0, 500.0, 0.06
 _FULL_STICK_M_S = 1.0
@@ -35,8 +36,8 @@ class _Mode(VehicleMode):
         motion = self.sub.motion
         motion.turn(self.stick(_YAW) * _FULL_STICK_TURN_RAD_S)
         forward, right = self.stick(_FORWARD) * _FULL_STICK_M_S, self.stick(_LATERAL) * _FULL_STICK_M_S
-        cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
-        return forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw
+        north, east, _ = rotated((forward, right, 0.0), motion.yaw)
+        return north, east
 
 
 class _Manual(_Mode):
