@@ -24,7 +24,6 @@ SET_CAMERA_SOURCE 0 1              | D D D D
 VIDEO_START_CAPTURE 0              | F F F F
 VIDEO_STOP_CAPTURE 0               | F F F F
 CAMERA_TRACK_POINT 0.5 0.5 0.1     | U U U U
-STORAGE_FORMAT 1 1                 | F F F F
 SET_CAMERA_MODE 0 1                | U U U U
 DO_CONTROL_VIDEO                   | U U U U
 DO_MOUNT_CONFIGURE 3               | A A A A
@@ -55,8 +54,6 @@ DO_WINCH 1 0                       | F U U U
 DO_SPRAYER 0                       | A F A F
 DO_AUX_FUNCTION 7 0                | A F A F
 DO_LAND_START                      | F F U U
-DO_GO_AROUND                       | U F U U
-DO_AUTOTUNE_ENABLE 1               | U A U U
 DO_VTOL_TRANSITION 4               | U F U U
 NAV_TAKEOFF 0 0 0 0 0 0 10         | F F U U
 NAV_VTOL_TAKEOFF 0 0 0 0 0 0 10    | F U U U
@@ -64,21 +61,14 @@ PREFLIGHT_STORAGE 0                | D D D D
 PREFLIGHT_SET_SENSOR_OFFSETS 2     | U U U U
 BATTERY_RESET 1 80                 | A A A A
 SET_EKF_SOURCE_SET 1               | A A A A
-EXTERNAL_POSITION_ESTIMATE         | U U U U
-EXTERNAL_WIND_ESTIMATE 5 0 90      | A A A A
-SET_HAGL                           | U A U U
 LOGGING_START                      | U U U U
-START_RX_PAIR                      | A A A A
 FLASH_BOOTLOADER                   | U U U U
-DEBUG_TRAP                         | D D D D
-SCRIPTING                          | D D D D
 DO_SET_SAFETY_SWITCH_STATE 0       | A A A A
 DO_FOLLOW                          | D D D U
 OVERRIDE_GOTO 0 2                  | U U U U
 DO_START_MAG_CAL 0                 | A A A A
 DO_ACCEPT_MAG_CAL 0                | F F F F
 DO_CANCEL_MAG_CAL 0                | A A A A
-FIXED_MAG_CAL_YAW 0                | A A A A
 ACCELCAL_VEHICLE_POS 1             | F F F F
 REQUEST_PROTOCOL_VERSION 1         | U U U U
 REQUEST_FLIGHT_INFORMATION 1       | U U U U

@@ -15,9 +15,6 @@ from aerokit.sim import BootTimeline, SimulatedCopter
 REAL_TIME_S = BootTimeline().position_good
 REAL_EKF_FLAGS = [1024, 0, 167, 831]
 REAL_TEXTS = [
-    "Calibrating barometer",
-    "Barometer 1 calibration complete",
-    "Barometer 2 calibration complete",
     "ArduPilot Ready",
     "AHRS: DCM active",
     "EKF3 IMU0 initialised",

@@ -374,14 +374,8 @@ def test_modes_named_by_the_standard_have_no_name() -> None:
     assert all(bool(mode.mode_name) == (mode.standard_mode == 0) for mode in modes)
 
 
-def test_autotune_reports_progress_and_calibration_texts() -> None:
+def test_calibration_texts() -> None:
     _, client = ready_px4()
-    client.command(MavCmd.DO_AUTOTUNE_ENABLE, 1)
-    client.run(15.0)
-    acks = client.all(m.CommandAck)
-    assert [ack.result for ack in acks] == [MavResult.IN_PROGRESS] * 6 + [MavResult.ACCEPTED]
-    assert acks[3].progress == 60
-    client.forget()
     assert client.command(MavCmd.PREFLIGHT_CALIBRATION, 1) == MavResult.ACCEPTED
     client.run(5.0)
     assert client.texts[:2] == ["[cal] calibration started: 2 gyro", "[cal] progress <0>"]

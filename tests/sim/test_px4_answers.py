@@ -49,7 +49,6 @@ def flying() -> tuple[SimulatedPx4, Client]:
         (MavCmd.DO_MOTOR_TEST, 0, MavResult.UNSUPPORTED),
         (MavCmd.CONTROL_HIGH_LATENCY, 0, MavResult.FAILED),
         (MavCmd.DO_FLIGHTTERMINATION, 1, MavResult.DENIED),
-        (MavCmd.DO_AUTOTUNE_ENABLE, 0, MavResult.DENIED),
         (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 0, MavResult.ACCEPTED),
         (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 2, MavResult.DENIED),
         (MavCmd.DO_SET_STANDARD_MODE, 3, MavResult.FAILED),
@@ -251,14 +250,9 @@ REQUESTED = (
     m.Timesync,
     m.DistanceSensor,
     m.Odometry,
-    m.ActuatorOutputStatus,
-    m.AutopilotStateForGimbalDevice,
     m.StorageInformation,
     m.FlightInformation,
     m.MagCalReport,
-    m.OpenDroneIdBasicId,
-    m.OpenDroneIdLocation,
-    m.OpenDroneIdSystem,
     m.CurrentMode,
 )
 
@@ -275,8 +269,6 @@ def test_what_only_others_can_send_is_denied() -> None:
     _, client = ready()
     for kind in (m.MissionCurrent, m.ParamValue, m.GimbalManagerInformation, m.RcChannels):
         assert client.command(MavCmd.REQUEST_MESSAGE, kind.ID) == MavResult.DENIED
-    assert client.command(MavCmd.REQUEST_MESSAGE, m.HighLatency2.ID) == MavResult.ACCEPTED
-    assert client.last(m.HighLatency2).custom_mode == 772
 
 
 def test_the_modes_are_listed_with_places_for_modes_of_others() -> None:
@@ -301,7 +293,7 @@ def test_events_are_counted_from_just_before_the_overflow() -> None:
 def test_all_that_it_can_tell_can_be_sent() -> None:
     px4, _ = ready()
     built = [message for message in map(px4.build, BUILDERS) if message is not None]
-    assert len(built) > 40
+    assert len(built) > 30
     assert all(len(message.encode()) == message.LENGTH for message in built)
 
 
@@ -309,8 +301,6 @@ def test_messages_that_pymavlink_has_not_are_read_by_their_names() -> None:
     px4, client = ready()
     client.command(MavCmd.REQUEST_MESSAGE, m.ComponentMetadata.ID)
     assert client.last(m.ComponentMetadata).uri == "mftp://etc/extras/component_general.json.xz"
-    client.command(MavCmd.REQUEST_MESSAGE, m.ComponentInformation.ID)
-    assert client.last(m.ComponentInformation).peripherals_metadata_uri == ""
     client.command(MavCmd.REQUEST_PROTOCOL_VERSION)
     assert client.last(m.ProtocolVersion).max_version == 203
     assert px4.build(m.TimeEstimateToTarget.ID) == m.TimeEstimateToTarget(-1, -1, -1, -1, -1)

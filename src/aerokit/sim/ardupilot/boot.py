@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-from aerokit.mavlink.enums import MavSeverity
 from aerokit.sim.ardupilot.parameter_tables import Kind
 
 
@@ -78,48 +77,3 @@ BOOT_TIMELINES: dict[Kind, BootTimeline] = {
     ),
 }
 """What each kind was seen to need, with the parameters that its simulation starts with."""
-
-_INFO, _DEBUG = MavSeverity.INFO, MavSeverity.DEBUG
-_BAROMETERS = tuple((1.83, _INFO, f"Barometer {number} calibration complete") for number in (1, 2))
-_STICKS = "RCInput: decoding UDP (Pulses)"
-
-
-def _both(seconds: float, text: str) -> tuple[tuple[float, int, str], ...]:
-    return tuple((seconds, _INFO, f"EKF2 IMU{core} {text}") for core in (0, 1))
-
-
-BOOT_TEXTS: dict[Kind, tuple[tuple[float, int, str], ...]] = {
-    "copter": (
-        (0.10, _DEBUG, _STICKS),
-        (0.12, _INFO, "Calibrating barometer"),
-        *_BAROMETERS,
-        (2.37, _INFO, "RC7: SaveWaypoint LOW"),
-    ),
-    "plane": (
-        (0.10, _INFO, "Ground start"),
-        (0.10, MavSeverity.ALERT, "Skipping INS calibration"),
-        (0.12, _INFO, "Calibrating barometer"),
-        (0.92, _DEBUG, _STICKS),
-        *_BAROMETERS,
-        (1.84, _INFO, "Airspeed 1 calibration started"),
-        (2.05, MavSeverity.WARNING, "Throttle failsafe off"),
-        (3.40, _INFO, "Airspeed 1 calibrated"),
-        *_both(9.19, "MAG0 initial yaw alignment complete"),
-        *_both(14.43, "tilt alignment complete"),
-        *_both(19.11, "origin set"),
-        *_both(45.18, "is using GPS"),
-    ),
-    "rover": (
-        (0.12, _INFO, "Calibrating barometer"),
-        *_BAROMETERS,
-        (1.84, _INFO, "Beginning INS calibration. Do not move vehicle"),
-        (1.84, _DEBUG, "INS: alloc 6144 bytes for ISB (free=524288)"),
-        (3.06, _DEBUG, _STICKS),
-    ),
-    "sub": (
-        (0.12, _INFO, "Calibrating barometer"),
-        *((1.50, severity, text) for _, severity, text in _BAROMETERS),
-        (1.81, _DEBUG, _STICKS),
-    ),
-}
-"""Second, severity, text: what is said beside that which comes with an event of the timeline."""

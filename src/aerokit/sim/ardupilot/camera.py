@@ -9,10 +9,8 @@ from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFoc
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import Host
 from aerokit.sim.commands import Command, whole
-from aerokit.sim.motion import quaternion_from_euler
 
 _PERIOD_S, _SHUTTER_S = 0.02, 0.1
-_UNKNOWN_PLACE = 2**31 - 1
 _IDLE, _INTERVAL_SET = 0, 2
 _FOR_EVER = -1
 
@@ -223,28 +221,4 @@ class Camera:
             recording_time_ms=0,
             available_capacity=math.nan,
             image_count=self.image_count,
-        )
-
-    def video_stream(self) -> m.VideoStreamInformation | None:
-        if not self.is_fitted:
-            return None
-        return m.VideoStreamInformation(0, 0, 0, 0, 0.0, 0, 0, 0, 0, 0, "", "")
-
-    def field_of_view(self) -> m.CameraFovStatus | None:
-        """Where the camera is when the vehicle knows, and how it lies; nobody knows what it sees."""
-        if not self.is_fitted:
-            return None
-        motion = self._vehicle.motion
-        place = self._vehicle.navigation.position if self._vehicle.navigation.has_position else None
-        return m.CameraFovStatus(
-            time_boot_ms=self._vehicle.time_boot_ms,
-            lat_camera=_UNKNOWN_PLACE if place is None else place.latitude_e7,
-            lon_camera=_UNKNOWN_PLACE if place is None else place.longitude_e7,
-            alt_camera=_UNKNOWN_PLACE if place is None else round(place.altitude_m * 1000),
-            lat_image=_UNKNOWN_PLACE,
-            lon_image=_UNKNOWN_PLACE,
-            alt_image=_UNKNOWN_PLACE,
-            q=quaternion_from_euler(motion.roll, motion.pitch, motion.yaw),
-            hfov=math.nan,
-            vfov=math.nan,
         )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import GpsFixType, HlFailureFlag, MavAutopilot, PlaneMode
+from aerokit.mavlink.enums import PlaneMode
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.plane.host import PlaneHost
@@ -17,7 +17,6 @@ from aerokit.sim.ardupilot.sub.host import SubHost
 from aerokit.sim.ardupilot.telemetry_motion import ATTITUDE_BUILDERS, POSITION_BUILDERS
 from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 
 _MIDDLE = 1500
 _STICK_RANGE = 500
@@ -103,14 +102,6 @@ Builders = Mapping[int, Callable[[Any], "Message | None"]]
 _NOTHING_REACHED = 0xFFFF
 _NO_TEMPERATURE = 32767
 _AIR_DENSITY = 1.225
-_GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
-_ALWAYS_FAILING: dict[Kind, int] = {
-    "copter": HlFailureFlag.DIFFERENTIAL_PRESSURE,
-    "plane": HlFailureFlag.TERRAIN,
-    "rover": HlFailureFlag.DIFFERENTIAL_PRESSURE | HlFailureFlag.TERRAIN,
-    "sub": HlFailureFlag.DIFFERENTIAL_PRESSURE | HlFailureFlag.TERRAIN,
-}
-"""What HIGH_LATENCY2 says of sensors that are not there."""
 
 
 def _hwstatus(_: ArduPilotVehicle) -> m.Hwstatus:
@@ -121,121 +112,16 @@ def _reached(_: ArduPilotVehicle) -> m.MissionItemReached:
     return m.MissionItemReached(_NOTHING_REACHED)
 
 
-def _relays(vehicle: ArduPilotVehicle) -> m.RelayStatus:
-    accessories = vehicle.accessories
-    return m.RelayStatus(vehicle.time_boot_ms, accessories.relays, (1 << accessories.relay_count) - 1)
-
-
 def _flight(vehicle: ArduPilotVehicle) -> m.FlightInformation:
     return m.FlightInformation(vehicle.time_boot_ms, 0, 0, 0)
 
 
-def _quaternion(vehicle: ArduPilotVehicle) -> tuple[float, float, float, float]:
-    motion = vehicle.motion
-    return quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+_GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 
 
-def _for_gimbal(vehicle: ArduPilotVehicle) -> m.AutopilotStateForGimbalDevice:
-    motion, flags = vehicle.motion, vehicle.navigation.flags
-    return m.AutopilotStateForGimbalDevice(
-        vehicle.system_id,
-        0,
-        vehicle.time_boot_us,
-        _quaternion(vehicle),
-        0,
-        motion.velocity_north,
-        motion.velocity_east,
-        motion.velocity_down,
-        0,
-        0.0,
-        0 if flags is None else flags,
-        0,
-        motion.yaw_rate,
-    )
-
-
-def _sim_state(vehicle: ArduPilotVehicle) -> m.SimState:
-    motion = vehicle.motion
-    place = vehicle.navigation.frame.to_global(motion.north, motion.east, motion.down)
-    return m.SimState(
-        *_quaternion(vehicle),
-        motion.roll,
-        motion.pitch,
-        motion.yaw,
-        0.0,
-        0.0,
-        -GRAVITY_M_S2,
-        motion.roll_rate,
-        motion.pitch_rate,
-        motion.yaw_rate,
-        float(place.latitude_e7),
-        float(place.longitude_e7),
-        place.altitude_m,
-        0.0,
-        0.0,
-        motion.velocity_north,
-        motion.velocity_east,
-        motion.velocity_down,
-        place.latitude_e7,
-        place.longitude_e7,
-    )
-
-
-def _failures(vehicle: ArduPilotVehicle) -> int:
-    lost = HlFailureFlag.GPS if vehicle.navigation.fix_type < GpsFixType.TYPE_3D_FIX else 0
-    return _ALWAYS_FAILING[vehicle.KIND] | lost
-
-
-def _high_latency(vehicle: ArduPilotVehicle) -> m.HighLatency2 | None:
-    motion, place = vehicle.motion, vehicle.navigation.position
-    flies = vehicle.KIND in ("copter", "plane")
-    altitude = 0 if place is None else max(-32768, min(32767, int(place.altitude_m)))
-    return m.HighLatency2(
-        timestamp=vehicle.time_boot_ms,
-        type=vehicle.MAV_TYPE,
-        autopilot=MavAutopilot.ARDUPILOTMEGA,
-        custom_mode=vehicle.mode.number,
-        latitude=0 if place is None else place.latitude_e7,
-        longitude=0 if place is None else place.longitude_e7,
-        altitude=altitude,
-        target_altitude=altitude if flies else 0,
-        heading=int(math.degrees(motion.yaw) % 360.0 / 2.0),
-        target_heading=0,
-        target_distance=0,
-        throttle=round(abs(vehicle.motors.throttle) * 100),
-        airspeed=min(255, round(motion.airspeed_m_s * 5.0)) if flies else 0,
-        airspeed_sp=0,
-        groundspeed=min(255, round(motion.ground_speed_m_s * 5.0)),
-        windspeed=0,
-        wind_heading=0,
-        eph=0,
-        epv=0,
-        temperature_air=-128,
-        climb_rate=max(-128, min(127, round(-motion.velocity_down * 10.0))),
-        battery=int(vehicle.battery.percent),
-        wp_num=vehicle.mission.nav_index,
-        failure_flags=_failures(vehicle),
-        custom0=(vehicle.base_mode ^ 0x80) - 0x80,
-        custom1=0,
-        custom2=0,
-    )
-
-
-EXTRA_BUILDERS: Builders = {
-    m.Hwstatus.ID: _hwstatus,
-    m.MissionItemReached.ID: _reached,
-    m.RelayStatus.ID: _relays,
-    m.FlightInformation.ID: _flight,
-    m.AutopilotStateForGimbalDevice.ID: _for_gimbal,
-    m.SimState.ID: _sim_state,
-    m.HighLatency2.ID: _high_latency,
-}
-"""Message id → what every kind sends when it is asked for it."""
-
-
-def airspeed(plane: PlaneHost) -> m.Airspeed:
-    speed = plane.motion.airspeed_m_s
-    return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
+def _relays(vehicle: ArduPilotVehicle) -> m.RelayStatus:
+    accessories = vehicle.accessories
+    return m.RelayStatus(vehicle.time_boot_ms, accessories.relays, (1 << accessories.relay_count) - 1)
 
 
 def angles_of_flow(plane: PlaneHost) -> m.AoaSsa:
@@ -255,15 +141,29 @@ def terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
     return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
 
 
+def outside_pressure(sub: SubHost) -> m.ScaledPressure3:
+    """The third barometer, a thermometer only."""
+    return m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0)
+
+
+EXTRA_BUILDERS: Builders = {
+    m.Hwstatus.ID: _hwstatus,
+    m.MissionItemReached.ID: _reached,
+    m.RelayStatus.ID: _relays,
+    m.FlightInformation.ID: _flight,
+}
+"""Message id → what every kind sends when it is asked for it."""
+
+
+def airspeed(plane: PlaneHost) -> m.Airspeed:
+    speed = plane.motion.airspeed_m_s
+    return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
+
+
 def display_value(sub: SubHost) -> m.NamedValueFloat:
     """The next of `DISPLAY_VALUES`."""
     name = next(sub.display_names)
     return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
-
-
-def outside_pressure(sub: SubHost) -> m.ScaledPressure3:
-    """The third barometer, a thermometer only."""
-    return m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0)
 
 
 def scaled_channels(rover: ArduPilotVehicle) -> m.RcChannelsScaled:
@@ -295,8 +195,6 @@ _ALL: Builders = {
     m.CameraSettings.ID: lambda vehicle: vehicle.camera.settings(),
     m.CameraCaptureStatus.ID: lambda vehicle: vehicle.camera.capture_status(),
     m.CameraFeedback.ID: lambda vehicle: vehicle.camera.last_feedback(),
-    m.VideoStreamInformation.ID: lambda vehicle: vehicle.camera.video_stream(),
-    m.CameraFovStatus.ID: lambda vehicle: vehicle.camera.field_of_view(),
     **EXTRA_BUILDERS,
     m.FenceStatus.ID: lambda vehicle: vehicle.fence.status(),
     m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 from aerokit.mavlink import messages as m
@@ -13,7 +12,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.accessories import Accessories
-from aerokit.sim.ardupilot.boot import BOOT_TEXTS, BOOT_TIMELINES, BootTimeline
+from aerokit.sim.ardupilot.boot import BOOT_TIMELINES, BootTimeline
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
@@ -256,8 +255,6 @@ class ArduPilotVehicle(Host):
                     f"\r\n\r\nInit {self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})\r\n".encode()
                 )
                 channel.write(b"\r\nFree RAM: 524288\r\nBooting 0/0\r\n")
-        for seconds, severity, text in BOOT_TEXTS[self.KIND]:
-            later(seconds * line.factor, partial(self.send_text, severity, text))
         later(line.ready, self._become_ready)
         self.navigation.start()
 

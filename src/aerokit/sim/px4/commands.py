@@ -32,14 +32,11 @@ _ACCEPTED = (
     _C.NAV_ROI,
     _C.NAV_VTOL_TAKEOFF,
     _C.DO_SET_ACTUATOR,
-    _C.DO_GO_AROUND,
     _C.DO_SET_ROI_LOCATION,
     _C.DO_SET_ROI_WPNEXT_OFFSET,
     _C.DO_SET_ROI_NONE,
     _C.DO_SET_ROI,
     _C.DO_SET_SAFETY_SWITCH_STATE,
-    _C.EXTERNAL_POSITION_ESTIMATE,
-    _C.LOGGING_START,
 )
 """Taken, with nothing to be seen of it."""
 
@@ -50,13 +47,7 @@ _SILENT = (
     _C.DO_MOUNT_CONTROL,
     _C.DO_SET_CAM_TRIGG_DIST,
     _C.DO_SET_CAM_TRIGG_INTERVAL,
-    _C.DO_MOUNT_CONTROL_QUAT,
-    _C.PREFLIGHT_SET_SENSOR_OFFSETS,
     _C.PREFLIGHT_UAVCAN,
-    _C.OBLIQUE_SURVEY,
-    _C.CONFIGURE_ACTUATOR,
-    _C.INJECT_FAILURE,
-    _C.START_RX_PAIR,
     _C.REQUEST_CAMERA_INFORMATION,
     _C.SET_CAMERA_MODE,
     _C.SET_CAMERA_ZOOM,
@@ -66,14 +57,10 @@ _SILENT = (
     _C.DO_TRIGGER_CONTROL,
     _C.DO_VTOL_TRANSITION,
     _C.DO_WINCH,
-    _C.PAYLOAD_PREPARE_DEPLOY,
-    _C.PAYLOAD_CONTROL_DEPLOY,
 )
 """Left to a part of the vehicle that does not run here: nobody answers."""
 
-_NO_FIGURE_EIGHT = "Figure 8 command only available for fixed wing and vtol vehicles."
 _GRIPS_FOR_S = 1.3
-_LOG_STOPS_AFTER_S = 2.0
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
 _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
@@ -83,14 +70,10 @@ def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_SILENT, lambda _: None)
     handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
-    handlers[_C.DO_FIGURE_EIGHT] = lambda _: px4.send_text(MavSeverity.CRITICAL, _NO_FIGURE_EIGHT)
     handlers[_C.CONTROL_HIGH_LATENCY] = _with_text(px4)
-    handlers[_C.EXTERNAL_WIND_ESTIMATE] = lambda command: _answer_twice(px4, command)
-    handlers[_C.FIXED_MAG_CAL_YAW] = lambda command: _calibrate_by_yaw(px4, command)
     handlers[_C.DO_GRIPPER] = lambda _: Progress((_UNKNOWN_PROGRESS,), _GRIPS_FOR_S)
     handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
     handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
-    handlers[_C.LOGGING_STOP] = lambda _: Progress((), _LOG_STOPS_AFTER_S)
     return handlers
 
 
@@ -100,14 +83,6 @@ def _with_text(px4: Px4Vehicle) -> Callable[[Command], int]:
         return MavResult.FAILED
 
     return fail
-
-
-def _calibrate_by_yaw(px4: Px4Vehicle, command: Command) -> int:
-    if px4.is_armed:
-        return MavResult.TEMPORARILY_REJECTED
-    px4.info(f"Assuming vehicle is facing heading {command.param1:.1f} degrees")
-    px4.info("Mag quick calibration finished")
-    return MavResult.ACCEPTED
 
 
 def _test_actuator(px4: Px4Vehicle, command: Command) -> int | None:
@@ -126,16 +101,9 @@ def _store(px4: Px4Vehicle, command: Command) -> int | None:
     return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
 
 
-def _answer_twice(px4: Px4Vehicle, command: Command) -> int:
-    """The estimator takes it, the commander does not know it."""
-    px4.commands.answer(command, MavResult.ACCEPTED)
-    return MavResult.UNSUPPORTED
-
-
 _FORCE = 21196.0
 _ALIASES: dict[Px4Mode, Px4Mode] = {(AUTO, 0): MISSION, ORBIT: POSITION}
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
-_AUTOTUNE_PERCENTS = (0, 20, 40, 60, 80, 95)
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
@@ -159,7 +127,6 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.DO_CHANGE_SPEED: flight.change_speed,
         MavCmd.MISSION_START: flight.start_mission,
         MavCmd.DO_SET_HOME: flight.set_home,
-        MavCmd.DO_AUTOTUNE_ENABLE: flight.tune,
         MavCmd.PREFLIGHT_CALIBRATION: lambda command: px4.calibration.command(command),
         MavCmd.RUN_PREARM_CHECKS: flight.run_prearm_checks,
         MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: flight.reboot,
@@ -338,9 +305,6 @@ class _Flight:
             px4.home = (north, east, px4.frame.origin.altitude_m - command.z)
         px4.home_is_set_by_hand = True
         return MavResult.ACCEPTED
-
-    def tune(self, command: Command) -> int | Progress:
-        return Progress(_AUTOTUNE_PERCENTS, 2.0) if command.param1 == 1.0 else MavResult.DENIED
 
     def run_prearm_checks(self, _: Command) -> int:
         self._px4.arming.report_reasons()

@@ -6,18 +6,15 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavAutopilot, MavLandedState, MavOdidUaType, MavType, StorageStatus
+from aerokit.mavlink.enums import StorageStatus
 from aerokit.mavlink.message import Message
 from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
 from aerokit.sim.px4.base import Px4Vehicle
-from aerokit.sim.px4.modes import ORBIT, custom_mode
+from aerokit.sim.px4.modes import ORBIT
 
 _LIBRARY_HASH = b"\xa4C\x87s\xec\x08o="
 _METADATA_URI, _METADATA_CRC = "mftp://etc/extras/component_general.json.xz", 2472443404
 _CAPACITY_MIB, _USED_MIB = 258_019.6, 192_146.9
-_REMOTE_ID_EPOCH = 1_546_300_800
-"""2019-01-01, from which OPEN_DRONE_ID counts seconds."""
-_ANYONE = bytes(20)
 
 
 def _autopilot_version(px4: Px4Vehicle) -> m.AutopilotVersion:
@@ -48,122 +45,17 @@ def _component_metadata(px4: Px4Vehicle) -> m.ComponentMetadata:
     return m.ComponentMetadata(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI)
 
 
-def _component_information(px4: Px4Vehicle) -> m.ComponentInformation:
-    return m.ComponentInformation(px4.time_boot_ms, _METADATA_CRC, _METADATA_URI, 0, "")
-
-
 def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
     return m.MagCalReport(0, 0, 4, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0, 0, 1.0)
-
-
-def _high_latency(px4: Px4Vehicle) -> m.HighLatency2:
-    o = px4.motion
-    place = px4.frame.to_global(o.north, o.east, o.down)
-    heading = round(math.degrees(o.yaw) % 360.0 / 2)
-    throttle, speed = round(px4.throttle * 100), min(255, round(o.ground_speed_m_s * 5))
-    climb = max(-127, min(127, round(-o.velocity_down * 10)))
-    return m.HighLatency2(
-        px4.time_boot_ms,
-        px4.VEHICLE_TYPE,
-        MavAutopilot.PX4,
-        custom_mode(px4.mode) >> 16,
-        place.latitude_e7,
-        place.longitude_e7,
-        round(place.altitude_m),
-        0,
-        heading,
-        0,
-        0,
-        throttle,
-        0,
-        0,
-        speed,
-        0,
-        0,
-        255,
-        255,
-        -128,
-        climb,
-        int(px4.battery.percent),
-        px4.mission.current,
-        0,
-        -128,
-        -128,
-        -128,
-    )
-
-
-def _basic_id(px4: Px4Vehicle) -> m.OpenDroneIdBasicId:
-    is_plane = px4.VEHICLE_TYPE == MavType.FIXED_WING
-    kind = MavOdidUaType.AEROPLANE if is_plane else MavOdidUaType.HELICOPTER_OR_MULTIROTOR
-    return m.OpenDroneIdBasicId(0, 0, _ANYONE, 1, kind, b"1006554d49534954414\0")
-
-
-def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
-    if not px4.has_position:
-        return None
-    o = px4.motion
-    place = px4.frame.to_global(o.north, o.east, o.down)
-    course = round(math.degrees(math.atan2(o.velocity_east, o.velocity_north)) % 360.0) % 360 * 100
-    return m.OpenDroneIdLocation(
-        0,
-        0,
-        _ANYONE,
-        1 if px4.is_landed else 2,
-        course,
-        round(o.ground_speed_m_s * 100),
-        round(-o.velocity_down * 100),
-        place.latitude_e7,
-        place.longitude_e7,
-        place.altitude_m,
-        place.altitude_m,
-        0,
-        px4.altitude_m,
-        12,
-        5,
-        0,
-        3,
-        65535.0,
-        0,
-    )
-
-
-def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
-    if not px4.is_ready:
-        return None
-    home = px4.frame.to_global(*px4.home)
-    seconds = max(0, int(px4.unix_time) - _REMOTE_ID_EPOCH)
-    return m.OpenDroneIdSystem(
-        0,
-        0,
-        _ANYONE,
-        0,
-        0,
-        home.latitude_e7,
-        home.longitude_e7,
-        1,
-        0,
-        -1000.0,
-        -1000.0,
-        0,
-        0,
-        home.altitude_m,
-        seconds,
-    )
 
 
 IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.AutopilotVersion.ID: _autopilot_version,
     m.MagCalReport.ID: _mag_cal_report,
-    m.HighLatency2.ID: _high_latency,
     m.StorageInformation.ID: _storage_information,
     m.FlightInformation.ID: _flight_information,
     m.ProtocolVersion.ID: _protocol_version,
-    m.ComponentInformation.ID: _component_information,
     m.ComponentMetadata.ID: _component_metadata,
-    m.OpenDroneIdBasicId.ID: _basic_id,
-    m.OpenDroneIdLocation.ID: _remote_location,
-    m.OpenDroneIdSystem.ID: _remote_system,
 }
 """Message id → what to send now, or None."""
 
@@ -174,8 +66,6 @@ _FIELD_GAUSS = (0.215, 0.0, 0.426)
 _IMU_FIELDS = 7167
 _COVARIANCE = tuple([math.nan] * 21)
 _UNUSED_CHANNEL = 65535
-_OUTPUTS = 16
-_DISARMED_US = 900
 _CLIMB_M_S, _DESCENT_M_S = 3.0, 0.7
 
 
@@ -281,32 +171,6 @@ def _timesync(px4: Px4Vehicle) -> m.Timesync:
     return m.Timesync(0, int(px4.uptime * 1e9))
 
 
-def _actuator_outputs(px4: Px4Vehicle) -> m.ActuatorOutputStatus:
-    pulse = _DISARMED_US if not px4.is_armed else round(1000 + 1000 * px4.throttle)
-    outputs = (*(float(pulse),) * 4, *(float(_DISARMED_US),) * (_OUTPUTS - 4))
-    return m.ActuatorOutputStatus(px4.time_boot_us, _OUTPUTS, outputs)
-
-
-def _state_for_gimbal(px4: Px4Vehicle) -> m.AutopilotStateForGimbalDevice:
-    o = px4.motion
-    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
-    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    landed = MavLandedState.ON_GROUND if px4.is_landed else MavLandedState.IN_AIR
-    return m.AutopilotStateForGimbalDevice(
-        0,
-        0,
-        px4.time_boot_us,
-        q,
-        0,
-        *velocity,
-        0,
-        o.yaw_rate,
-        1023 if px4.is_landed else 895,
-        landed,
-        o.yaw_rate,
-    )
-
-
 def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None:
     """Only while armed."""
     if not px4.is_armed or not px4.has_position:
@@ -329,10 +193,6 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
     )
 
 
-def _orbit_status(px4: Px4Vehicle) -> m.OrbitExecutionStatus | None:
-    return px4.flight.orbit.status() if px4.mode == ORBIT else None
-
-
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
     """Only the return is estimated: up or down to its height, back, down."""
     if px4.is_landed:
@@ -348,6 +208,10 @@ def _link_status(px4: Px4Vehicle) -> m.LinkNodeStatus:
     return m.LinkNodeStatus(px4.time_boot_us, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
 
 
+def _orbit_status(px4: Px4Vehicle) -> m.OrbitExecutionStatus | None:
+    return px4.flight.orbit.status() if px4.mode == ORBIT else None
+
+
 SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.LinkNodeStatus.ID: _link_status,
     m.ScaledImu.ID: _scaled_imu,
@@ -358,10 +222,8 @@ SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.HighresImu.ID: _highres_imu,
     m.Timesync.ID: _timesync,
     m.DistanceSensor.ID: _distance_sensor,
-    m.AutopilotStateForGimbalDevice.ID: _state_for_gimbal,
     m.Odometry.ID: _odometry,
-    m.OrbitExecutionStatus.ID: _orbit_status,
-    m.ActuatorOutputStatus.ID: _actuator_outputs,
     m.TimeEstimateToTarget.ID: _time_estimate,
+    m.OrbitExecutionStatus.ID: _orbit_status,
 }
 """Message id → what to send now, or None."""

@@ -12,7 +12,6 @@ from aerokit.sim.motion import Motion, Wind
 _FLARE_SINK_M_S = 0.5
 _APPROACH_SHARE = 0.85
 _NEAR_M = 60.0
-_LINED_UP_RAD = math.radians(25.0)
 _LOOK_AHEAD_M = 80.0
 
 

@@ -16,7 +16,6 @@ from aerokit.sim.local_frame import Ned
 
 _MIDDLE, _RANGE = 1500.0, 500.0
 _FULL_STEERING_RAD_S = math.radians(90.0)
-_STANDING_M = 0.5
 
 
 class _Mode(VehicleMode):

@@ -26,7 +26,6 @@ from aerokit.sim.motion import Motion, Wind
 _GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
 _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 _AMPERES_AT_FULL = 16.0
-_MIDDLE_PWM = 1500
 
 
 class _Motors(Motors):
