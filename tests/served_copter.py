@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from anyio.from_thread import start_blocking_portal
 
 from aerokit.sim import SimulatedCopter, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence

@@ -6,7 +6,7 @@ import argparse
 import asyncio
 
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 VEHICLES: dict[str, type[SimulatedCopter] | type[SimulatedPx4]] = {
     "copter": SimulatedCopter,

@@ -29,8 +29,7 @@ from aerokit.errors import AerokitError, CommandRejected
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavResult
 from aerokit.missions import Mission, land, take_off, waypoint
 from aerokit.sim import simulated_link
-from aerokit.sim.kinds import simulated
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import simulated, wait_longer
 from aerokit.testing import run_virtual
 
 __all__ = ["Call", "Step", "differences", "program", "run_choice", "run_simulated"]

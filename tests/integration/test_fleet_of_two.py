@@ -20,7 +20,7 @@ from any_vehicle import INSTANCE
 
 import aerokit
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio

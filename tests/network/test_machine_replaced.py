@@ -14,7 +14,7 @@ from zenoh_network import free_port, router
 import aerokit
 from aerokit import events
 from aerokit.sim import SimulatedCopter, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 pytest.importorskip("zenoh")
 pytestmark = [

@@ -17,7 +17,7 @@ from aerokit.errors import CommandRejected, LinkOpenError
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint
 from aerokit.network import found, publishing
 from aerokit.sim import SimulatedCopter, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 zenoh: Any = pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio

@@ -12,7 +12,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey
-from aerokit.sim.fitting import fitted
+from aerokit.sim.channel import fitted
 from aerokit.sim.kinds import kind_names, simulated
 from aerokit.sim.vehicle import SimulatedVehicle
 

@@ -13,7 +13,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavModeFlag, MavMountMode, MavResult, MavType
 from aerokit.mavlink.framer import Framer
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 ARM = MavCmd.COMPONENT_ARM_DISARM
 NAN = float("nan")

@@ -253,6 +253,8 @@ REQUESTED = (
     m.StorageInformation,
     m.FlightInformation,
     m.MagCalReport,
+    m.OpenDroneIdLocation,
+    m.OpenDroneIdSystem,
     m.CurrentMode,
 )
 

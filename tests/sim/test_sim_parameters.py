@@ -19,11 +19,11 @@ from aerokit.parameters import (
     unpack_parameters,
 )
 from aerokit.sim import SimulatedCopter, SimulatedPx4
-from aerokit.sim.ardupilot.parameter_tables import KINDS, parameters_of
+from aerokit.sim.ardupilot.kinds import KINDS, parameters_of
 from aerokit.sim.file_tree import FileFault
 from aerokit.sim.parameter_server import rounded
 from aerokit.sim.parameters import ParameterPackMount, Parameters
-from aerokit.sim.px4.parameters import px4_parameters
+from aerokit.sim.px4.storage import px4_parameters
 
 REAL, INT8, INT16, INT32 = MavParamType.REAL32, MavParamType.INT8, MavParamType.INT16, MavParamType.INT32
 

@@ -16,7 +16,7 @@ import anyio
 import aerokit
 from aerokit.runtime.events import LinkRestored
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 __all__ = ["Left", "fly_round", "left"]
 

@@ -14,7 +14,7 @@ from aerokit import messages as m
 from aerokit.errors import SetpointStreamStopped
 from aerokit.runtime.events import VehicleRebooted
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import wait_longer
 
 pytestmark = pytest.mark.anyio
 

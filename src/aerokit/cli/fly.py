@@ -123,8 +123,8 @@ async def _simulated(options: argparse.Namespace, plan: Plan, stack: AsyncExitSt
     """A vehicle of the kind that the plan was made for, where it begins."""
     from aerokit.cli.vehicles import simulated_vehicle
     from aerokit.sim import simulated_link
+    from aerokit.sim.kinds import wait_longer
     from aerokit.sim.local_frame import HOME
-    from aerokit.sim.patience import wait_longer
 
     kind = options.vehicle or _kind_for(plan)
     places = [plan.mission.home, *(item.position for item in plan.mission.items)]

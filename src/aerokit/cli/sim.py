@@ -27,8 +27,8 @@ from aerokit.cli.vehicles import simulated_fleet
 from aerokit.links import create_link
 from aerokit.links.address import parse_address
 from aerokit.sim import SimulatedVehicle, SimulatorServer, Wind
+from aerokit.sim.kinds import wait_longer
 from aerokit.sim.local_frame import HOME
-from aerokit.sim.patience import wait_longer
 
 if TYPE_CHECKING:
     import argparse

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from aerokit.sim.ardupilot.boot import BootTimeline
 from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
+from aerokit.sim.ardupilot.kinds import BootTimeline
 from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
 from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
 from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub

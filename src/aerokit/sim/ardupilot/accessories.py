@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from aerokit.mavlink.enums import MavResult, MavSeverity
 from aerokit.sim.ardupilot.host import Host
-from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.commands import Command, whole
 
 _SERVOS = 32

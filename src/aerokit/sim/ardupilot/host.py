@@ -13,11 +13,10 @@ from typing import ClassVar, Protocol
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.boot import BootTimeline
+from aerokit.sim.ardupilot.kinds import BootTimeline, Kind
 from aerokit.sim.ardupilot.mission_lists import CommandList
 from aerokit.sim.ardupilot.mode import VehicleMode
 from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.autopilot import SimulatedAutopilot
 from aerokit.sim.battery import Battery
 from aerokit.sim.channel import Channel

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.missions import float32
 
 _HIGHEST_M = 83000.0

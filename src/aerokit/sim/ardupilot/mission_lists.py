@@ -11,8 +11,8 @@ from typing import ClassVar
 
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored, whole
-from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.missions import float32
 
 _LOWEST_RALLY_M, _HIGHEST_RALLY_M = -32768, 32767

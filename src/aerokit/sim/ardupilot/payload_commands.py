@@ -12,7 +12,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMountMode, MavResult, MavSeverity
 from aerokit.sim.ardupilot.accessories import Accessories
 from aerokit.sim.ardupilot.gimbal import Gimbal
-from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandHandler, whole

@@ -15,7 +15,7 @@ from aerokit.mavlink.messages import (
     TerrainRequest,
 )
 from aerokit.sim.ardupilot.host import Host
-from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, whole
 

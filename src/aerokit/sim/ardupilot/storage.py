@@ -10,12 +10,12 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.autopilot import VehicleSigning
 from aerokit.sim.file_tree import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
 from aerokit.sim.parameters import ParameterPackMount
-from aerokit.sim.signing import VehicleSigning
 
 LOG_FOLDER = "/APM/LOGS"
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))

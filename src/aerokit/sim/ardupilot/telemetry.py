@@ -9,7 +9,7 @@ from typing import Any
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import PlaneMode
 from aerokit.mavlink.message import Message
-from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.plane.host import PlaneHost
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
 from aerokit.sim.ardupilot.rover.host import RoverHost

@@ -21,7 +21,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.mavlink.message import Message
-from aerokit.sim.ardupilot.parameter_tables import Kind
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
 _FENCE = int(Sensor.MAV_SYS_STATUS_GEOFENCE)  # integers: arithmetic on flags takes ten times as long

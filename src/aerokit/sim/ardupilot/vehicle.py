@@ -12,7 +12,6 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.sim.ardupilot.accessories import Accessories
-from aerokit.sim.ardupilot.boot import BOOT_TIMELINES, BootTimeline
 from aerokit.sim.ardupilot.calibration import Calibrations
 from aerokit.sim.ardupilot.camera import Camera
 from aerokit.sim.ardupilot.failsafes import Failsafes
@@ -20,12 +19,12 @@ from aerokit.sim.ardupilot.fence import Fence
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
 from aerokit.sim.ardupilot.gimbal import Gimbal
 from aerokit.sim.ardupilot.host import ArmingPart, Host
+from aerokit.sim.ardupilot.kinds import BOOT_TIMELINES, BootTimeline, parameters_of
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.ardupilot.mission_server import MissionServer
 from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
 from aerokit.sim.ardupilot.motors import Motors
 from aerokit.sim.ardupilot.navigation import Navigation
-from aerokit.sim.ardupilot.parameter_tables import parameters_of
 from aerokit.sim.ardupilot.radio import Joystick, Radio
 from aerokit.sim.ardupilot.requests import Requests
 from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, Storage

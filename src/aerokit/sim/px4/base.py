@@ -43,8 +43,7 @@ from aerokit.sim.px4.modes import (
     Px4Mode,
 )
 from aerokit.sim.px4.offboard import Offboard
-from aerokit.sim.px4.parameters import px4_parameters
-from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage
+from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage, px4_parameters
 from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
 from aerokit.sim.vehicle import Component, sender_of
 

@@ -49,7 +49,66 @@ def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
     return m.MagCalReport(0, 0, 4, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0, 0, 1.0)
 
 
+_REMOTE_ID_EPOCH = 1_546_300_800
+_ANYONE = bytes(20)
+
+
+def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
+    if not px4.has_position:
+        return None
+    o = px4.motion
+    place = px4.frame.to_global(o.north, o.east, o.down)
+    course = round(math.degrees(math.atan2(o.velocity_east, o.velocity_north)) % 360.0) % 360 * 100
+    return m.OpenDroneIdLocation(
+        0,
+        0,
+        _ANYONE,
+        1 if px4.is_landed else 2,
+        course,
+        round(o.ground_speed_m_s * 100),
+        round(-o.velocity_down * 100),
+        place.latitude_e7,
+        place.longitude_e7,
+        place.altitude_m,
+        place.altitude_m,
+        0,
+        px4.altitude_m,
+        12,
+        5,
+        0,
+        3,
+        65535.0,
+        0,
+    )
+
+
+def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
+    if not px4.is_ready:
+        return None
+    home = px4.frame.to_global(*px4.home)
+    seconds = max(0, int(px4.unix_time) - _REMOTE_ID_EPOCH)
+    return m.OpenDroneIdSystem(
+        0,
+        0,
+        _ANYONE,
+        0,
+        0,
+        home.latitude_e7,
+        home.longitude_e7,
+        1,
+        0,
+        -1000.0,
+        -1000.0,
+        0,
+        0,
+        home.altitude_m,
+        seconds,
+    )
+
+
 IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
+    m.OpenDroneIdLocation.ID: _remote_location,
+    m.OpenDroneIdSystem.ID: _remote_system,
     m.AutopilotVersion.ID: _autopilot_version,
     m.MagCalReport.ID: _mag_cal_report,
     m.StorageInformation.ID: _storage_information,

@@ -22,15 +22,14 @@ from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.copter.auto import Auto
 from aerokit.sim.ardupilot.copter.failsafes import CopterArming, CopterFailsafes, CopterFence
-from aerokit.sim.ardupilot.copter.guided import Guided
+from aerokit.sim.ardupilot.copter.guided import Guided, Setpoints
 from aerokit.sim.ardupilot.copter.host import CopterHost
 from aerokit.sim.ardupilot.copter.modes import AltHold, Follow, Holding, Loiter, Refusing, Stabilize, Throw
 from aerokit.sim.ardupilot.copter.returning import Land, Rtl, SmartRtl
-from aerokit.sim.ardupilot.copter.setpoints import Setpoints
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.mode import VehicleMode, variant
-from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import Command, CommandHandler, whole
 

@@ -20,9 +20,9 @@ from aerokit.sim.ardupilot.arming import Arming
 from aerokit.sim.ardupilot.commands import common_commands
 from aerokit.sim.ardupilot.failsafes import Failsafes
 from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.parameter_tables import Kind
 from aerokit.sim.ardupilot.plane.auto import Auto
 from aerokit.sim.ardupilot.plane.failsafes import PlaneFailsafes, PlaneFence
 from aerokit.sim.ardupilot.plane.guided import Guided, PlaneSetpoints, guided_commands

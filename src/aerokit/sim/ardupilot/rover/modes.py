@@ -7,11 +7,10 @@ from collections.abc import Callable
 
 from aerokit.mavlink.enums import MavSeverity, RoverMode
 from aerokit.mavlink.messages import MissionItemReached
-from aerokit.sim.ardupilot.level import LevelAuto
+from aerokit.sim.ardupilot.level import LevelAuto, Target
 from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.navigation import best_return_place
 from aerokit.sim.ardupilot.rover.host import RoverHost
-from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.local_frame import Ned
 
 _MIDDLE, _RANGE = 1500.0, 500.0

@@ -6,10 +6,9 @@ import math
 from collections.abc import Callable
 
 from aerokit.mavlink.enums import SubMode
-from aerokit.sim.ardupilot.level import LevelAuto
+from aerokit.sim.ardupilot.level import LevelAuto, Target
 from aerokit.sim.ardupilot.mode import VehicleMode, variant
 from aerokit.sim.ardupilot.sub.host import SubHost
-from aerokit.sim.ardupilot.targets import Target
 from aerokit.sim.local_frame import Ned
 from aerokit.sim.motion import wrap_pi
 from aerokit.sim.setpoints import rotated
