@@ -57,7 +57,7 @@ def true_place(vehicle: Any) -> GlobalPoint:
     frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
     if frame is None or motion is None:
         raise InvalidArgument(f"{type(vehicle).__name__} has no true place")
-    place: GlobalPoint = frame.to_global(motion.north, motion.east, motion.down)
+    place: GlobalPoint = frame.to_global(*motion.place)
     return place
 
 

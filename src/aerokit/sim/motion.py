@@ -12,6 +12,8 @@ import math
 import random
 from dataclasses import dataclass
 
+from aerokit.sim.local_frame import Ned
+
 __all__ = [
     "GRAVITY_M_S2",
     "Motion",
@@ -135,6 +137,11 @@ class Motion:
         self._accelerating = False
         self._wanted_yaw: float | None = None
         self._wanted_yaw_rate = 0.0
+
+    @property
+    def place(self) -> Ned:
+        """North, east, down."""
+        return (self.north, self.east, self.down)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
         """Fly at this velocity."""

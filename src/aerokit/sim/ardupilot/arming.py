@@ -206,7 +206,7 @@ class Arming:
         vehicle.fence.armed()
         if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
             motion = vehicle.motion
-            vehicle.navigation.set_home((motion.north, motion.east, motion.down), lock=False)
+            vehicle.navigation.set_home(motion.place, lock=False)
         vehicle.info(self.ARMED_TEXT)
         vehicle.motors.set_armed(True, vehicle.now)
         vehicle.mode.enter(force=False)

@@ -164,7 +164,7 @@ class Camera:
 
     def _take_feedback(self) -> m.CameraFeedback:
         motion, nav = self._vehicle.motion, self._vehicle.navigation
-        place = self._vehicle.frame.to_global(motion.north, motion.east, motion.down)
+        place = self._vehicle.frame.to_global(*motion.place)
         return m.CameraFeedback(
             time_usec=round(self._vehicle.unix_time * 1e6),
             target_system=0,

@@ -147,7 +147,7 @@ class HomeAndOrigin:
         if command.param1 == 1.0 or command.place() == (0, 0):
             if not nav.has_position:
                 return MavResult.FAILED
-            return self._make_home((motion.north, motion.east, motion.down))
+            return self._make_home(motion.place)
         if command.param1 != 0.0:
             return MavResult.FAILED
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame

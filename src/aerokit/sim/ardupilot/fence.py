@@ -255,7 +255,7 @@ class Fence:
         if down and self._floor_by_hand is not True and self.enabled & MIN_ALT:
             self.tell("auto-disabled", self.enable(False, MIN_ALT, by_hand=False))
         new = 0
-        for kind, beyond in self._beyond(self._place()).items():
+        for kind, beyond in self._beyond(self._vehicle.motion.place).items():
             new |= self._judge(kind, beyond) if self.active & kind else 0
         if not down:
             self._raise_floor()
@@ -272,10 +272,6 @@ class Fence:
         self._record(kind)
         self._backup[kind] = beyond + (self.CIRCLE_BACKUP_M if kind == CIRCLE else _BACKUP_M)
         return kind
-
-    def _place(self) -> Ned:
-        motion = self._vehicle.motion
-        return (motion.north, motion.east, motion.down)
 
     def _beyond(self, place: Ned) -> dict[int, float]:
         """How many metres beyond each limit; negative within."""
@@ -337,7 +333,7 @@ class Fence:
 
     def beyond_m(self, kinds: int) -> float:
         """How many metres beyond the limits of these kinds it is, the farthest counts."""
-        beyond = self._beyond(self._place())
+        beyond = self._beyond(self._vehicle.motion.place)
         return max(beyond[kind] for kind in _NAMES if kinds & kind)
 
     def forbids_modes(self) -> bool:

@@ -395,7 +395,7 @@ class LevelAuto(VehicleMode):
 
     def _go(self, item: MissionItem) -> None:
         vehicle, motion = self.vehicle, self.vehicle.motion
-        here: Ned = self._place or (motion.north, motion.east, motion.down)
+        here: Ned = self._place or motion.place
         self._reached_at = None
         if item.command == _HOME:
             self._place, self._stops = vehicle.navigation.home or here, True
@@ -412,7 +412,7 @@ class LevelAuto(VehicleMode):
 
     def _set_home(self, item: MissionItem) -> None:
         motion = self.vehicle.motion
-        point: Ned | None = (motion.north, motion.east, motion.down)
+        point: Ned | None = motion.place
         if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
             point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:

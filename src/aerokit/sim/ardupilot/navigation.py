@@ -93,7 +93,7 @@ class Navigation:
         if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
             return None
         motion = self._vehicle.motion
-        return self.frame.to_global(motion.north, motion.east, motion.down)
+        return self.frame.to_global(*motion.place)
 
     @property
     def altitude_above_home(self) -> float:
@@ -168,14 +168,14 @@ class Navigation:
             return
         if self.origin is None:
             motion = self._vehicle.motion
-            self.origin = (motion.north, motion.east, motion.down)
+            self.origin = motion.place
             self._tell_origin()
         if not self.home_is_locked:
             self._set_first_home()
 
     def _set_first_home(self) -> None:
         motion = self._vehicle.motion
-        self.home = (motion.north, motion.east, motion.down)
+        self.home = motion.place
         self._vehicle.missions.commands.add_home()
         self._vehicle.send_home()
 

@@ -48,7 +48,7 @@ class SmartPath:
         if self._vehicle.parameters["SRTL_POINTS"] <= 0 or self._vehicle.parameters["SRTL_ACCURACY"] <= 0:
             return
         if self._vehicle.navigation.has_position:
-            self._points.append(self._here())
+            self._points.append(self._vehicle.motion.place)
             self._good_at = self._saved_at = self._vehicle.now
             self.is_active = True
 
@@ -79,7 +79,7 @@ class SmartPath:
                 self._give_up("bad position")
             return
         self._good_at = vehicle.now
-        if self._add(self._here()):
+        if self._add(self._vehicle.motion.place):
             self._saved_at = vehicle.now
         elif vehicle.now - self._saved_at > _PATIENCE_S:
             self._give_up("buffer full")
@@ -109,10 +109,6 @@ class SmartPath:
     def _give_up(self, why: str) -> None:
         self.is_active = False
         self._vehicle.send_text(MavSeverity.WARNING, f"SmartRTL deactivated: {why}")
-
-    def _here(self) -> Ned:
-        motion = self._vehicle.motion
-        return (motion.north, motion.east, motion.down)
 
 
 def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:

@@ -59,7 +59,7 @@ def _ahrs2(vehicle: ArduPilotVehicle) -> m.Ahrs2:
 
 def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
     motion = vehicle.motion
-    place = vehicle.navigation.frame.to_global(motion.north, motion.east, motion.down)
+    place = vehicle.navigation.frame.to_global(*motion.place)
     return m.Simstate(
         motion.roll,
         motion.pitch,
@@ -235,7 +235,7 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.has_position:
         return None
-    north, east, down = nav.local((motion.north, motion.east, motion.down))
+    north, east, down = nav.local(motion.place)
     return m.LocalPositionNed(
         vehicle.time_boot_ms,
         north,
@@ -253,7 +253,7 @@ def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
         return m.GpsRawInt(0, GpsFixType.NO_GPS, 0, 0, 0, 65535, 65535, 0, 0, 0)
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
         return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 0, 0, 3)
-    place = nav.frame.to_global(motion.north, motion.east, motion.down)
+    place = nav.frame.to_global(*motion.place)
     altitude = round(place.altitude_m * 1000)
     course = (
         round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000

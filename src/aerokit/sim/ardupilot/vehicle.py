@@ -1,5 +1,8 @@
 """What ArduPilot's simulated vehicles have in common: boot, parameters, files, missions, requests, modes, texts."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# The host declares what parts need of each other; here each is what it really is.
+
 from __future__ import annotations
 
 import math
@@ -68,8 +71,6 @@ class ArduPilotVehicle(Host):
     """Message id → what to send now, or None."""
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
     """Classes of the modes, in the order in which they are listed."""
-    ARMING: ClassVar[Callable[[Any], ArmingPart]]
-    """Its arming checks."""
     FAILSAFES: ClassVar[type[Failsafes]]
     """What it does by itself."""
     FENCE: ClassVar[type[Fence]] = Fence
@@ -147,7 +148,7 @@ class ArduPilotVehicle(Host):
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: Motors = self.make_motors()
         self.navigation: Navigation = Navigation(self, self.frame)
-        self.arming = type(self).ARMING(self)
+        self.arming = self.make_arming()
         self.accessories: Accessories = Accessories(self)
         self.failsafes: Failsafes = self.FAILSAFES(self)
         self.fence: Fence = self.FENCE(self)
@@ -185,6 +186,10 @@ class ArduPilotVehicle(Host):
     def make_motors(self) -> Motors:
         """What drives it."""
         return Motors()
+
+    def make_arming(self) -> ArmingPart:
+        """Its arming checks."""
+        raise NotImplementedError
 
     def make_commands(self) -> dict[int, CommandHandler]:
         """MAV_CMD → handler."""

@@ -1,5 +1,8 @@
 """How the parts of a simulated PX4 are put together: boot, state, modes, flying."""
 
+# pyright: reportIncompatibleVariableOverride=false
+# The host declares what parts need of each other; here each is what it really is.
+
 from __future__ import annotations
 
 import math
@@ -212,7 +215,7 @@ class Px4Vehicle(Px4Host):
 
     def _become_ready(self) -> None:
         self.is_ready = True
-        self.home = (self.motion.north, self.motion.east, self.motion.down)
+        self.home = self.motion.place
 
     def start_channel(self, channel: Channel) -> None:
         """Everything is streamed without being asked."""
@@ -244,7 +247,7 @@ class Px4Vehicle(Px4Host):
     def armed(self) -> None:
         self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
         if not self.home_is_set_by_hand:
-            self.home = (self.motion.north, self.motion.east, self.motion.down)
+            self.home = self.motion.place
         self.failsafes.armed()
         if self.mode == MISSION:
             self.mission.enter()

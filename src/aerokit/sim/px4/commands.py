@@ -297,7 +297,7 @@ class _Flight:
     def set_home(self, command: Command) -> int:
         px4, motion = self._px4, self._px4.motion
         if command.param1 > 0.5:
-            px4.home = (motion.north, motion.east, motion.down)
+            px4.home = motion.place
         elif not math.isfinite(command.x + command.y + command.z):
             return MavResult.DENIED
         else:

@@ -47,7 +47,7 @@ class Fence:
         motion = self._px4.motion
         if round(self._px4.parameters["GF_ACTION"]) == _NO_ACTION:
             return []
-        return self.breaches_at((motion.north, motion.east, motion.down))
+        return self.breaches_at(motion.place)
 
     def allows(self, place: Ned) -> bool:
         """Whether the vehicle may be sent there: with no action, or a warning only, anywhere."""

@@ -144,7 +144,7 @@ class Flight:
 
     def stay_here(self) -> None:
         motion = self._vehicle.motion
-        self.target = (motion.north, motion.east, motion.down)
+        self.target = motion.place
 
     def update(self) -> None:
         """Tell the motion what to do until the next tick."""
@@ -254,7 +254,7 @@ class Flight:
             self.descend()
             return
         self.go()
-        if math.dist(self.target, (motion.north, motion.east, motion.down)) > _ARRIVED_M:
+        if math.dist(self.target, motion.place) > _ARRIVED_M:
             return
         if self._phase == "climb":
             self._phase = "return"

@@ -93,7 +93,7 @@ class Gimbal:
         north, east = self._px4.frame.to_local(place[0], place[1])
         motion = self._px4.motion
         north, east = north - motion.north, east - motion.east
-        here = self._px4.frame.to_global(motion.north, motion.east, motion.down)
+        here = self._px4.frame.to_global(*motion.place)
         pitch = math.atan2(place[2] - here.altitude_m, math.hypot(north, east))
         return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
 

@@ -135,7 +135,7 @@ class Offboard:
 
     def _wanted_velocity(self) -> Ned:
         motion, limits = self._vehicle.motion, self._vehicle.parameters
-        place = (motion.north, motion.east, motion.down)
+        place = motion.place
         fastest = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)
         accelerations = (motion.limits.acceleration_m_s2,) * 2 + (motion.limits.vertical_acceleration_m_s2,)
         wanted = []

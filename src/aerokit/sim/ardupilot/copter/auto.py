@@ -277,7 +277,7 @@ class Auto(Mode):
     def _place(self, item: MissionItem) -> Ned:
         """Where an item leads; what is 0 in it stays as it is."""
         motion, leg = self.copter.motion, self._leg
-        here: Ned = (motion.north, motion.east, motion.down)
+        here: Ned = motion.place
         if isinstance(leg, Way) and leg.is_complete:
             here = leg.destination
         point = self.copter.point(int(item.x), int(item.y), item.z, item.frame)
@@ -359,7 +359,7 @@ class Auto(Mode):
 
     def _set_home(self, item: MissionItem) -> None:
         navigation, motion = self.copter.navigation, self.copter.motion
-        point: Ned | None = (motion.north, motion.east, motion.down)
+        point: Ned | None = motion.place
         if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
             point = self.copter.point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:

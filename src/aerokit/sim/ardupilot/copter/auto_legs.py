@@ -68,7 +68,7 @@ class Way:
         motion.seek_position(
             *self.destination, speed=limits.speed, climb=limits.climb, descent=limits.descent
         )
-        away = math.dist(self.destination, (motion.north, motion.east, motion.down))
+        away = math.dist(self.destination, motion.place)
         self.is_complete = self.is_complete or away <= self._radius
 
 

@@ -175,13 +175,11 @@ class Guided(Mode):
             else:
                 motion.seek_acceleration(*self.acceleration)
         else:
-            error = [target - now for target, now in zip(self.position, self._place(), strict=True)]
+            error = [
+                target - now for target, now in zip(self.position, self.copter.motion.place, strict=True)
+            ]
             north, east, down = (speed + gap for speed, gap in zip(self.velocity, error, strict=True))
             self._seek_velocity(north, east, down)
-
-    def _place(self) -> Ned:
-        motion = self.copter.motion
-        return (motion.north, motion.east, motion.down)
 
     def _seek_velocity(self, north: float, east: float, down: float) -> None:
         size = math.hypot(north, east)

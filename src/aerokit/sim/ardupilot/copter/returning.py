@@ -114,7 +114,7 @@ class Rtl(Mode):
             descent=limits["WPNAV_SPEED_DN"] / 100,
         )
         copter.yaw.update()
-        self._go_on(math.dist(target, (copter.motion.north, copter.motion.east, copter.motion.down)))
+        self._go_on(math.dist(target, copter.motion.place))
 
     def _go_on(self, distance: float) -> None:
         if self._phase == "climb" and distance < _ARRIVED_M:
@@ -180,5 +180,5 @@ class SmartRtl(Mode):
         )
         copter.yaw.update()
         near = _ARRIVED_M if len(self._way) == 1 else limits["WPNAV_RADIUS"] / 100
-        if math.dist(target, (copter.motion.north, copter.motion.east, copter.motion.down)) < near:
+        if math.dist(target, copter.motion.place) < near:
             del self._way[0]

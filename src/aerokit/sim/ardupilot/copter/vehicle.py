@@ -247,9 +247,11 @@ class SimulatedCopter(CopterHost):
     CAPABILITIES: ClassVar[int] = 0xFBEF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = _MODES
-    ARMING: ClassVar[type[Arming]] = CopterArming
     FAILSAFES: ClassVar[type[Failsafes]] = CopterFailsafes
     FENCE: ClassVar[type[Fence]] = CopterFence
+
+    def make_arming(self) -> Arming:
+        return CopterArming(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         return copter_commands(self)

@@ -194,7 +194,7 @@ class Auto(NavigatingMode):
 
     def _go(self, item: MissionItem, does: int) -> None:
         wing, before = self.plane.wing, self._place
-        self._start = (wing.north, wing.east, wing.down)
+        self._start = wing.place
         point = self.plane.point(int(item.x), int(item.y), item.z, item.frame) or self._start
         north, east = self._start[:2] if (item.x, item.y) == (0, 0) else point[:2]
         down = point[2] if item.z != 0 else (wing.down if before is None else before[2])
@@ -236,7 +236,7 @@ class Auto(NavigatingMode):
 
     def _set_home(self, item: MissionItem) -> None:
         wing, plane = self.plane.wing, self.plane
-        point: Ned | None = (wing.north, wing.east, wing.down)
+        point: Ned | None = wing.place
         if item.param1 != 1:
             point = plane.point(int(item.x), int(item.y), item.z, item.frame)
         if point is not None:

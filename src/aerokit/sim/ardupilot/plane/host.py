@@ -67,7 +67,7 @@ class Landing:
         self.point: Ned = point
         self._start = start
         wing = plane.wing
-        self._from: Ned = (wing.north, wing.east, wing.down)
+        self._from: Ned = wing.place
         self._flares = self._is_told = False
         self._stopped_at = math.nan
 
@@ -86,7 +86,7 @@ class Landing:
         wing = self._plane.wing
         distance = math.hypot(start[0] - wing.north, start[1] - wing.east)
         if distance < _NEAR_M and abs(wing.down - start[2]) < _NEAR_M / 4:
-            self._from, self._start = (wing.north, wing.east, wing.down), None
+            self._from, self._start = wing.place, None
             return
         wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
 

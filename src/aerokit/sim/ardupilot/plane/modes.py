@@ -144,7 +144,7 @@ class NavigatingMode(PlaneModeBase):
         wing = self.plane.wing
         self.speed = 0.0
         self.radius = 0.0
-        self._place = (wing.north, wing.east, wing.down)
+        self._place = wing.place
         return True
 
     @property

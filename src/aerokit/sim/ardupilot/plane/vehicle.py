@@ -187,7 +187,6 @@ class SimulatedPlane(PlaneHost):
     CAPABILITIES: ClassVar[int] = 0xF36F
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = _MODES
-    ARMING: ClassVar[type[Arming]] = PlaneArming
     FAILSAFES: ClassVar[type[Failsafes]] = PlaneFailsafes
     FENCE: ClassVar[type[Fence]] = PlaneFence
 
@@ -196,6 +195,9 @@ class SimulatedPlane(PlaneHost):
 
     def make_motors(self) -> Motors:
         return _Engine()
+
+    def make_arming(self) -> Arming:
+        return PlaneArming(self)
 
     def make_commands(self) -> dict[int, CommandHandler]:
         return plane_commands(self)

@@ -73,7 +73,7 @@ class RoverArming(Arming):
         if not super().disarm(force=True):
             return False
         if was_armed and rover.navigation.home is not None and not rover.navigation.home_is_locked:
-            rover.navigation.set_home((rover.motion.north, rover.motion.east, rover.motion.down), lock=False)
+            rover.navigation.set_home(rover.motion.place, lock=False)
         return True
 
 
@@ -289,7 +289,6 @@ class SimulatedRover(RoverHost):
     CAPABILITIES: ClassVar[int] = 0xF1EF
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = ROVER_MODES
-    ARMING: ClassVar[type[Arming]] = RoverArming
     FAILSAFES: ClassVar[type[Failsafes]] = RoverFailsafes
     FENCE: ClassVar[type[Fence]] = RoverFence
 
@@ -307,6 +306,9 @@ class SimulatedRover(RoverHost):
 
     def make_motors(self) -> Motors:
         return _Motors()
+
+    def make_arming(self) -> Arming:
+        return RoverArming(self)
 
     def hear_setpoints(self) -> None:
         RoverTargets(self, self.guided)

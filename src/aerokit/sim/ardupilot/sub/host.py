@@ -34,7 +34,7 @@ class SubHost(LevelVehicle):
 
     def distance(self, place: Ned) -> float:
         """Metres to a point."""
-        return math.dist(self._below(place), (self.motion.north, self.motion.east, self.motion.down))
+        return math.dist(self._below(place), self.motion.place)
 
     def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
         """Towards a point with this speed in m/s, up and down as WPNAV_SPEED_UP and …_DN allow."""

@@ -239,7 +239,6 @@ class SimulatedSub(SubHost):
     CAPABILITIES: ClassVar[int] = 0xF9E7
     BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
     MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]] = SUB_MODES
-    ARMING: ClassVar[type[Arming]] = SubArming
     FAILSAFES: ClassVar[type[Failsafes]] = SubFailsafes
 
     def make_motion(self, wind: Wind | None) -> UnderwaterMotion:
@@ -248,6 +247,9 @@ class SimulatedSub(SubHost):
 
     def make_motors(self) -> Motors:
         return _Motors(self)
+
+    def make_arming(self) -> Arming:
+        return SubArming(self)
 
     def hear_setpoints(self) -> None:
         SubTargets(self, self.guided)
