@@ -15,7 +15,7 @@ from aerokit.sim.commands import Command, CommandHandler, CommandServer
 from aerokit.sim.file_tree import FileTree
 from aerokit.sim.vehicle import Component, SimulatedVehicle
 
-__all__ = ["SimulatedAutopilot"]
+__all__ = ["SimulatedAutopilot", "VehicleSigning"]
 
 
 class VehicleSigning:

@@ -11,9 +11,10 @@ from aerokit.sim.local_frame import Ned
 
 PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
 
-POSITION = (Mask.X_IGNORE, Mask.Y_IGNORE, Mask.Z_IGNORE)
-_VELOCITY = (Mask.VX_IGNORE, Mask.VY_IGNORE, Mask.VZ_IGNORE)
-_ACCELERATION = (Mask.AX_IGNORE, Mask.AY_IGNORE, Mask.AZ_IGNORE)
+# integers: arithmetic on flags takes ten times as long
+_POSITION = (int(Mask.X_IGNORE), int(Mask.Y_IGNORE), int(Mask.Z_IGNORE))
+_VELOCITY = (int(Mask.VX_IGNORE), int(Mask.VY_IGNORE), int(Mask.VZ_IGNORE))
+_ACCELERATION = (int(Mask.AX_IGNORE), int(Mask.AY_IGNORE), int(Mask.AZ_IGNORE))
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Setpoint:
 
     @property
     def has_position(self) -> bool:
-        return not self.mask & sum(POSITION)
+        return not self.mask & sum(_POSITION)
 
     @property
     def has_velocity(self) -> bool:
@@ -58,7 +59,7 @@ class Setpoint:
 
     def axes(self, position: Ned) -> tuple[Ned, Ned, Ned]:
         """Position, velocity and acceleration axis by axis, NaN where one is ignored or no number."""
-        vectors = ((position, POSITION), (self.velocity, _VELOCITY), (self.acceleration, _ACCELERATION))
+        vectors = ((position, _POSITION), (self.velocity, _VELOCITY), (self.acceleration, _ACCELERATION))
         p, v, a = (self._masked(vector, bits) for vector, bits in vectors)
         return p, v, a
 

@@ -1,4 +1,7 @@
-"""`SimulatedRover`: an ArduRover 4.7 car without sockets, threads or a clock of its own."""
+"""`SimulatedRover`: an ArduRover 4.7 car without sockets, threads or a clock of its own.
+
+Beside it what it checks before arming and what it does by itself.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`SimulatedSub`: an ArduSub 4.7 with vectored thrusters, without sockets, threads or a clock of its own."""
+"""`SimulatedSub`: an ArduSub 4.7 with vectored thrusters, without sockets, threads or a clock of its own.
+
+Beside it what it checks before arming and what it does by itself.
+"""
 
 from __future__ import annotations
 
