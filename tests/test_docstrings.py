@@ -26,7 +26,13 @@ MODULES = [
     ),
 ]
 MODULES.remove("aerokit.__main__")  # running it is all it is for
-FOR_PROGRAMS = ("aerokit.links", "aerokit.mavlink", "aerokit.runtime", "aerokit.sync", "aerokit.testing")
+FOR_PROGRAMS = (
+    "aerokit.transport",
+    "aerokit.mavlink",
+    "aerokit.connection",
+    "aerokit.sync",
+    "aerokit.testing",
+)
 """Where programs find constants; elsewhere they are the standard's numbers under the standard's names."""
 
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.errors import InvalidArgument
-from aerokit.mavlink.checksum import x25
+from aerokit._internal.files import read_bounded
+from aerokit.errors import FileFormatError, InvalidArgument
+from aerokit.mavlink.frame import x25
 from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
-from aerokit.whole_file import read_bounded
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -222,7 +222,7 @@ def read_xml(path: Path) -> DialectDefinition:
         )
     except FileNotFoundError:
         raise InvalidArgument(f"no dialect file {path}") from None
-    except InvalidArgument:
+    except (InvalidArgument, FileFormatError):
         raise
     except (ParseError, LookupError, ValueError) as error:
         raise InvalidArgument(f"{path} is not a MAVLink dialect: {error!r}") from error

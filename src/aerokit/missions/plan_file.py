@@ -10,20 +10,15 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.files import read_text, write_whole
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.commands import canonical_frame
-from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
-from aerokit.missions.item import MissionItem
-from aerokit.missions.json_values import JsonValue, load_json
-from aerokit.missions.mission import Mission
-from aerokit.missions.plan import Plan
-from aerokit.missions.plan_items import json_number, merged_entries, read_entries
-from aerokit.missions.rally import RallyPoints
-from aerokit.missions.text_files import read_text
+from aerokit.missions.fence import Fence, FenceCircle, FencePolygon, RallyPoints
+from aerokit.missions.item import MissionItem, canonical_frame
+from aerokit.missions.mission import Mission, Plan
+from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries
 from aerokit.missions.wire import in_degrees
 from aerokit.position import Position
-from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     import os
@@ -82,6 +77,8 @@ def format_plan(plan: Plan) -> str:
         raise InvalidArgument("the plan was read from a file that is nested too deep to be written") from None
     except InvalidArgument:
         raise
+    except FileFormatError as error:  # of the file that it was read from: what else stood there is kept
+        raise InvalidArgument(f"the plan cannot be written again: {error}") from error
     except ValueError as error:
         raise InvalidArgument("a number of the plan is not finite: a .plan file cannot keep it") from error
 

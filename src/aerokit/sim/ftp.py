@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.ftp_message import FtpMessage
+from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 from aerokit.sim.file_tree import EEXIST, ENOENT, FileTree

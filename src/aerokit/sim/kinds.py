@@ -6,10 +6,10 @@ from collections.abc import Collection, Iterable
 from importlib import import_module
 from typing import Any
 
+from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import InvalidArgument
 from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import SimulatedVehicle
-from aerokit.wording import did_you_mean, shown
 
 __all__ = ["kind_class", "kind_names", "simulated", "wait_longer"]
 

@@ -11,7 +11,7 @@ from aerokit.mavlink.enums import MavParamError, MavParamType, MavSeverity
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
-from aerokit.parameters.px4_hash import HASH_NAME, px4_hash
+from aerokit.parameters.pack import HASH_NAME, px4_hash
 from aerokit.sim.channel import Channel
 from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of

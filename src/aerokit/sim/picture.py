@@ -11,10 +11,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
 
+from aerokit._internal.files import write_whole
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.position import Position
 from aerokit.sim.track_points import Failure, TrackPoint, metres_from
-from aerokit.whole_file import write_whole
 
 __all__ = ["check_picture", "draw_svg", "save_picture"]
 

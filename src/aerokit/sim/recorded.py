@@ -13,7 +13,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult, MavParamError, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.parameters.encoding import UNKNOWN_INDEX
-from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.parameters.pack import HASH_NAME
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import Command, CommandServer
 from aerokit.sim.ftp import FtpPacket

@@ -13,9 +13,9 @@ from typing import Any
 from typing_extensions import Self
 
 from aerokit.errors import BusyError, InvalidArgument, LinkLost
-from aerokit.links import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 from aerokit.sim.channel import Channel, SharedHearing, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
+from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
 __all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from aerokit import geo
+from aerokit._internal import geo
 from aerokit.position import Position
 
 __all__ = ["Failure", "TrackPoint", "metres_from"]

@@ -6,12 +6,12 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.sim.kinds import simulated, wait_longer
+from aerokit.sim.kinds import simulated
+from aerokit.sim.patience import wait_longer
 from aerokit.sim.server import SimulatorServer, open_simulator
-from aerokit.testing.fault_verbs import FaultInjector
+from aerokit.testing.faults import FaultInjector
 from aerokit.testing.interruption import Interruption
-from aerokit.testing.recording import FlightRecording
-from aerokit.testing.stage import Stagehand
+from aerokit.testing.stage import FlightRecording, Stagehand
 
 if TYPE_CHECKING:
     from anyio.from_thread import BlockingPortal
@@ -115,7 +115,7 @@ def hosted_flight(
     """Serve a vehicle of a kind on an address while the block runs; ``options`` are those of the vehicle.
 
     It waits ``speedup`` times as long for what the program sends by its own clock, unless ``parameters`` says
-    otherwise: see `aerokit.sim.kinds.wait_longer`.
+    otherwise: see `aerokit.sim.patience.wait_longer`.
     Raises InvalidArgument for a wrong kind or address, LinkOpenError for one that cannot be opened, and at the
     end what the vehicle raised, if nobody was told of it.
     """

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
-from aerokit.protocols.ftp_message import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.channel import Channel
 from aerokit.sim.file_tree import EISDIR, ENOENT, Entry, FileFault, FileTree, OpenFile
 from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32

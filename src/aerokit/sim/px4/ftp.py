@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
-from aerokit.protocols.ftp_message import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.channel import Channel
 from aerokit.sim.file_tree import EEXIST, FileFault, FileTree, OpenFile
 from aerokit.sim.ftp import FileHost, FtpPacket, FtpServer, path_in, read_crc32

@@ -12,7 +12,7 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
-from aerokit.protocols.ftp_message import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.autopilot import VehicleSigning
 from aerokit.sim.file_tree import EINVAL, FileFault, FileTree, OpenFile
 from aerokit.sim.logs import Px4LogServer, SimulatedLog
