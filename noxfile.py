@@ -178,13 +178,6 @@ def soak(session: nox.Session) -> None:
 
 
 @nox.session
-def diaries(session: nox.Session) -> None:
-    """Keep what goes over the wire in each test (tests/wire_diary.py), after a change that is meant (`-- PATH …`)."""
-    session.install("-e", ".[test]")
-    session.run("python", "tests/keep_diaries.py", *session.posargs)
-
-
-@nox.session
 def mutants(session: nox.Session) -> None:
     """Change one thing at a time: does a test notice? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`; an hour."""
     session.install("-e", ".[test]", "coverage>=7.6", "cosmic-ray>=8.3")

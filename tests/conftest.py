@@ -13,19 +13,6 @@ from flight_harness import Flight, in_the_air, open_flight
 from hypothesis import given, settings, strategies
 from late_loop import LateLoop
 from recorded import headline
-from wire_diary import (
-    pytest_addoption,
-    pytest_collection_modifyitems,
-    pytest_pyfunc_call,
-    pytest_runtest_protocol,
-)
-
-__all__ = [
-    "pytest_addoption",
-    "pytest_collection_modifyitems",
-    "pytest_pyfunc_call",
-    "pytest_runtest_protocol",
-]
 
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
