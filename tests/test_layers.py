@@ -6,7 +6,7 @@ import ast
 import functools
 from pathlib import Path
 
-import pytest
+from for_each import for_each
 
 SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 
@@ -84,7 +84,7 @@ FILES = sorted(
 )
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+@for_each("path", FILES)
 def test_imports_only_from_floors_below(path: Path) -> None:
     own = package_of(path)
     for name in imports_of(path):
@@ -97,7 +97,7 @@ def test_imports_only_from_floors_below(path: Path) -> None:
         assert floor_of(other) < floor_of(own), f"{own} may not import {name}"
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+@for_each("path", FILES)
 def test_only_the_right_floors_touch_the_world(path: Path) -> None:
     own, tops = package_of(path), {name.split(".")[0] for name in imports_of(path)}
     if own in SANS_IO:
@@ -111,7 +111,7 @@ def test_only_the_right_floors_touch_the_world(path: Path) -> None:
 VEHICLE_FILES = [path for path in FILES if package_of(path) == "vehicle"]
 
 
-@pytest.mark.parametrize("path", VEHICLE_FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+@for_each("path", VEHICLE_FILES)
 def test_a_room_imports_only_from_rooms_below(path: Path) -> None:
     rooms = ROOMS["vehicle"]
     own = path.relative_to(SOURCE).with_suffix("").parts[1]

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from ctrl_c import interrupt_soon
+from for_each import for_each
 from served_copter import served, served_copter
 
 import aerokit
@@ -97,13 +98,13 @@ TWINS: list[tuple[type, type, set[str]]] = [
     (Subscription, aerokit.sync.Subscription, set()),
 ]
 MEMBERS = [
-    pytest.param(original, twin, name, id=f"{original.__name__}.{name}")
+    (original, twin, name)
     for original, twin, left_out in TWINS
     for name in sorted(public_names(original) - left_out)
 ]
 
 
-@pytest.mark.parametrize(("original", "twin", "name"), MEMBERS)
+@for_each("original, twin, name", MEMBERS)
 def test_every_member_has_its_twin(original: type, twin: type, name: str) -> None:
     assert hasattr(twin, name), f"aerokit.sync has no {twin.__name__}.{name}"
     if name in original.__dict__.get("__slots__", ()):

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from for_each import for_each
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from targets import TARGETS
@@ -27,9 +28,7 @@ def edited(data: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
     return data
 
 
-@pytest.mark.parametrize(
-    "path", sorted(CORPUS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}"
-)
+@for_each("path", sorted(CORPUS.glob("*/*")))
 def test_known_inputs(path: Path) -> None:
     TARGETS[path.parent.name](path.read_bytes())
 

@@ -4,6 +4,7 @@ import contextlib
 import string
 
 import pytest
+from for_each import for_each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -83,7 +84,7 @@ ACCEPTED: list[tuple[str, LinkAddress]] = [
 ]
 
 
-@pytest.mark.parametrize(("text", "address"), ACCEPTED, ids=[text for text, _ in ACCEPTED])
+@for_each("text, address", ACCEPTED)
 def test_accepted(text: str, address: LinkAddress) -> None:
     assert parse_address(text) == address
     assert parse_address(str(address)) == address

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import pytest
+from for_each import for_each
 
 from aerokit import missions
 from aerokit.errors import InvalidArgument
@@ -100,7 +101,7 @@ CASES: list[tuple[MissionItem, MissionItem]] = [
 ]
 
 
-@pytest.mark.parametrize(("built", "expected"), CASES, ids=lambda item: item.name)
+@for_each("built, expected", CASES)
 def test_what_builders_make(built: MissionItem, expected: MissionItem) -> None:
     assert built == expected
     check_item(built, "item", 2 if built.command == MavCmd.NAV_RALLY_POINT else 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from for_each import for_each
 
 import aerokit
 import aerokit.sync
@@ -49,7 +50,7 @@ def test_a_declaration_that_cannot_be_right_is_an_error_at_once() -> None:
         By("Heartbeet", lambda message: 1)
 
 
-@pytest.mark.parametrize("name", STATES)
+@for_each("name", STATES)
 def test_both_vehicles_have_it_and_it_is_documented(name: str) -> None:
     assert hasattr(aerokit.Vehicle, name)
     assert hasattr(aerokit.sync.Vehicle, name)
