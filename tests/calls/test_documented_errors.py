@@ -9,6 +9,7 @@ from pathlib import Path
 import anyio
 import pytest
 from call_stage import Stage, open_stage
+from call_table import provocations
 from camera_calls import CAMERA
 from component_calls import COMPONENTS
 from documented_errors import NAMES, documented
@@ -22,7 +23,7 @@ from aerokit import errors
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
-PROVOCATIONS = FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
+PROVOCATIONS = provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
 PROMISED = documented()
 LONGEST_S = 200.0
 

@@ -6,10 +6,10 @@ import math
 import random
 from dataclasses import dataclass, replace
 
+from call_table import Row
 from order_air import Silence, Weather
 from order_airs import TwoLinks
 from order_hub import Side, ThroughHub, Ways
-from order_table import Row
 
 RIGHT_AFTER_S = 0.001
 """What is sent with the call has left by then."""

@@ -11,11 +11,12 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 
 import anyio
+from call_table import Row
 from order_air import Air, Crossing
 from order_cases import Case, random_case
 from order_flights import WATCH_S, Flown, Simulated, go_to_place, set_up, somebody_acts, take_over
 from order_judge import faults, orders_in
-from order_table import ARM, ROWS, SET_MODE, Row
+from order_table import ARM, ROWS, SET_MODE
 
 import aerokit
 from aerokit.errors import AerokitError

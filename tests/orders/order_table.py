@@ -4,40 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from typing import Any
 
 import anyio
+from call_table import CALLS, Row, north
 
 import aerokit
 from aerokit import missions
 from aerokit.mavlink.enums import MavCmd
 
 Give = Callable[[aerokit.Vehicle], Awaitable[object]]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One order. ``modes`` are those that it may bring about, on ArduCopter and on PX4.
-
-    ``steers``: it decides where the vehicle goes; given up, the vehicle is told to hold if ``holds``. ``command`` is
-    the one whose answers and copies get lost.
-    ``place`` is where the vehicle is when it is given. ``ends_later``: given up, its end is still seen to.
-    """
-
-    name: str
-    give: Give
-    command: int
-    place: str = "air"
-    modes: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-    steers: bool = True
-    holds: bool = False
-    ends_later: bool = False
-    on: tuple[str, ...] = ("ardupilot", "px4")
-
-
-def north(vehicle: aerokit.Vehicle, metres: float) -> aerokit.Position:
-    return vehicle.position.value.offset(north_m=metres)
 
 
 async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
@@ -92,6 +68,7 @@ RTL, LAND = int(MavCmd.NAV_RETURN_TO_LAUNCH), int(MavCmd.NAV_LAND)
 REBOOT = int(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN)
 
 ROWS = (
+    *(call.order for call in CALLS.values() if call.order is not None),
     Row(
         "set_mode",
         lambda v: v.set_mode("LOITER"),
@@ -100,10 +77,7 @@ ROWS = (
         on=("ardupilot",),
     ),
     Row("set_mode", lambda v: v.set_mode("LAND"), SET_MODE, modes=(("LAND",), ("LAND",)), on=("px4",)),
-    Row("hold", lambda v: v.hold(), SET_MODE, modes=(("BRAKE",), ("LOITER",))),
     Row("hold", lambda v: v.hold(), REPOSITION, modes=(("BRAKE",), ("LOITER",)), on=("px4",)),
-    Row("land", lambda v: v.land(), SET_MODE, modes=(("LAND",), ("LAND",))),
-    Row("return_to_launch", lambda v: v.return_to_launch(timeout=40), SET_MODE, modes=(("RTL",), ("RTL",))),
     Row(
         "go_to",
         lambda v: v.go_to(north(v, 12.0), timeout=30),
@@ -181,12 +155,6 @@ ROWS = (
         place="air, on its mission",
         steers=False,
     ),
-    Row("reboot", lambda v: v.reboot(timeout=20), REBOOT, place="ground", steers=False),
-    Row("arm", lambda v: v.arm(), ARM, place="ground", steers=False),
-    Row("disarm", lambda v: v.disarm(), ARM, place="armed", steers=False),
-    Row("set_speed", lambda v: v.set_speed(2.0), int(MavCmd.DO_CHANGE_SPEED), steers=False),
-    Row("set_home", lambda v: v.set_home(), int(MavCmd.DO_SET_HOME), steers=False),
-    Row("look_at", lambda v: v.look_at(north(v, 50.0)), int(MavCmd.DO_SET_ROI_LOCATION), steers=False),
     Row(
         "gimbal.point",
         lambda v: v.gimbal.point(-45.0, 90.0, wait=False),

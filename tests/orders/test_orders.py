@@ -10,12 +10,13 @@ import re
 from pathlib import Path
 
 import pytest
+from call_table import Row
 from order_air import Silence, Weather
 from order_airs import TwoLinks
 from order_cases import RIGHT_AFTER_S, Case, random_case, random_case_over_two
 from order_flights import Flown, fly, mode_of
 from order_judge import faults
-from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
+from order_table import ARM, REPOSITION, ROWS, SET_MODE
 
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
 from aerokit.mavlink.enums import MavCmd

@@ -11,6 +11,7 @@ from call_stage import DATA, Place, Stage, airborne, anywhere, armed, grounded, 
 from camera_beside import camera_of, settings_of
 from camera_calls import AWAITED
 from component_calls import COMPONENTS_AWAITED
+from provoked import Do, Provocation, Table, ignored, refused
 
 import aerokit
 from aerokit import (
@@ -29,8 +30,9 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.components.settings import Settings
 
-__all__ = ["CALLS", "Call"]
+__all__ = ["CALLS", "Call", "Row", "north", "provocations"]
 
+Give = Callable[[aerokit.Vehicle], Awaitable[object]]
 COPTER, PX4 = ("ardupilot",), ("px4",)
 BOTH = COPTER + PX4
 KEY = SigningKey.from_passphrase("calls")
@@ -41,14 +43,78 @@ def _nothing(_: Stage) -> None:
 
 
 @dataclass(frozen=True)
+class Row:
+    """One order of docs/reliability.md. ``modes`` are those that it may bring about, on ArduCopter and on PX4.
+
+    ``steers``: it decides where the vehicle goes; given up, the vehicle is told to hold if ``holds``. ``command`` is
+    the one whose answers and copies get lost.
+    ``place`` is where the vehicle is when it is given. ``ends_later``: given up, its end is still seen to.
+    """
+
+    name: str
+    give: Give
+    command: int
+    place: str = "air"
+    modes: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    steers: bool = True
+    holds: bool = False
+    ends_later: bool = False
+    on: tuple[str, ...] = BOTH
+
+
+@dataclass(frozen=True)
 class Call:
-    """One call that ends well. ``before`` and ``after`` are for the simulated vehicle itself, around each call."""
+    """One call that ends well, and all that tests need to know of it.
+
+    ``before`` and ``after`` are for the simulated vehicle itself, around each call. ``command`` is the MAV_CMD that it
+    sends: refused, it raises CommandRejected, unanswered CommandTimeout. ``wrong`` has an argument that is not allowed.
+    ``order`` is its row in the table of orders (`order_table`).
+    """
 
     do: Callable[[Stage], Awaitable[object]]
     place: Place = anywhere
     on: tuple[str, ...] = BOTH
     before: Callable[[Stage], object] = _nothing
     after: Callable[[Stage], object] = _nothing
+    command: int | None = None
+    wrong: Do | None = None
+    order: Row | None = None
+
+    def provocations(self, name: str) -> Table:
+        """How the errors that most calls document are provoked."""
+        rows: Table = {}
+        for error, trouble in (("CommandRejected", refused), ("CommandTimeout", ignored)):
+            if self.command is not None:
+                rows[name, error] = Provocation(self.do, self.place, trouble(self.command), on=self.on[0])
+        if self.wrong is not None:
+            rows[name, "InvalidArgument"] = Provocation(self.wrong, self.place, on=self.on[0])
+        return rows
+
+
+PLACES: dict[Place, str] = {airborne: "air", grounded: "ground", armed: "armed"}
+
+
+def _action(
+    name: str, give: Give, command: int, place: Place = airborne, *, wrong: Give | None = None, **order: Any
+) -> dict[str, Call]:
+    """An action of a vehicle that sends this command: one row for all tests of calls, and for the table of orders."""
+    call = Call(
+        lambda stage: give(stage.vehicle),
+        place,
+        command=command,
+        wrong=None if wrong is None else lambda stage: wrong(stage.vehicle),
+        order=Row(name, give, command, PLACES[place], **order),
+    )
+    return {f"Vehicle.{name}": call}
+
+
+def provocations() -> Table:
+    """Of all calls."""
+    return {key: row for name, call in CALLS.items() for key, row in call.provocations(name).items()}
+
+
+def north(vehicle: aerokit.Vehicle, metres: float) -> aerokit.Position:
+    return vehicle.position.value.offset(north_m=metres)
 
 
 def _simulated(stage: Stage) -> SimulatedCopter | SimulatedPx4:
@@ -238,19 +304,45 @@ CALLS: dict[str, Call] = {
     "Vehicle.wait_ready": Call(_not_ready, grounded, before=_fail_checks, after=_pass_checks),
     "Vehicle.why_not_armable": Call(lambda s: s.vehicle.why_not_armable(), grounded),
     "Vehicle.set_mode": Call(lambda s: s.vehicle.set_mode("LAND"), airborne),
-    "Vehicle.hold": Call(lambda s: s.vehicle.hold(), airborne),
-    "Vehicle.arm": Call(lambda s: s.vehicle.arm(), grounded),
-    "Vehicle.disarm": Call(lambda s: s.vehicle.disarm(), armed),
+    **_action("hold", lambda v: v.hold(), MavCmd.DO_SET_MODE, modes=(("BRAKE",), ("LOITER",))),
+    **_action(
+        "arm",
+        lambda v: v.arm(),
+        MavCmd.COMPONENT_ARM_DISARM,
+        grounded,
+        wrong=lambda v: v.arm(mode="NONE"),
+        steers=False,
+    ),
+    **_action("disarm", lambda v: v.disarm(), MavCmd.COMPONENT_ARM_DISARM, armed, steers=False),
     "Vehicle.take_off": Call(lambda s: s.vehicle.take_off(5.0), armed),
     "Vehicle.go_to": Call(lambda s: s.vehicle.go_to(s.target(), speed_m_s=4, heading_deg=90), airborne),
-    "Vehicle.land": Call(lambda s: s.vehicle.land(), airborne),
-    "Vehicle.return_to_launch": Call(lambda s: s.vehicle.return_to_launch(), airborne),
-    "Vehicle.set_speed": Call(lambda s: s.vehicle.set_speed(3.0), on_mission),
+    **_action("land", lambda v: v.land(), MavCmd.DO_SET_MODE, modes=(("LAND",), ("LAND",))),
+    **_action(
+        "return_to_launch",
+        lambda v: v.return_to_launch(timeout=40),
+        MavCmd.DO_SET_MODE,
+        modes=(("RTL",), ("RTL",)),
+    ),
+    **_action(
+        "set_speed",
+        lambda v: v.set_speed(2.0),
+        MavCmd.DO_CHANGE_SPEED,
+        wrong=lambda v: v.set_speed(-1),
+        steers=False,
+    ),
     "Vehicle.set_heading": Call(lambda s: s.vehicle.set_heading(60, relative=True), airborne),
-    "Vehicle.set_home": Call(lambda s: s.vehicle.set_home(), airborne),
-    "Vehicle.look_at": Call(lambda s: s.vehicle.look_at(s.home.replace(altitude_relative_m=0.0)), airborne),
-    "Vehicle.stop_looking": Call(lambda s: s.vehicle.stop_looking(), airborne),
-    "Vehicle.reboot": Call(lambda s: s.vehicle.reboot(), grounded),
+    **_action(
+        "set_home",
+        lambda v: v.set_home(),
+        MavCmd.DO_SET_HOME,
+        wrong=lambda v: v.set_home(aerokit.Position(1, 1)),
+        steers=False,
+    ),
+    **_action("look_at", lambda v: v.look_at(north(v, 50.0)), MavCmd.DO_SET_ROI_LOCATION, steers=False),
+    **_action("stop_looking", lambda v: v.stop_looking(), MavCmd.DO_SET_ROI_NONE, steers=False),
+    **_action(
+        "reboot", lambda v: v.reboot(timeout=20), MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, grounded, steers=False
+    ),
     "Vehicle.setup_signing": Call(_sign, grounded, after=_no_key),
     "Vehicle.command": Call(
         lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
