@@ -473,6 +473,7 @@ async def signing(trace: Trace) -> None:
         await vehicle.setup_signing(Signing(SigningKey.from_passphrase("golden")))
         await vehicle.arm()
         await vehicle.disarm()
+        await anyio.sleep(0.3)
         trace.note("the key is taken away")
         await vehicle.setup_signing(None)
 

@@ -95,15 +95,23 @@ PLACES: dict[Place, str] = {airborne: "air", grounded: "ground", armed: "armed"}
 
 
 def _action(
-    name: str, give: Give, command: int, place: Place = airborne, *, wrong: Give | None = None, **order: Any
+    name: str,
+    give: Give,
+    command: int,
+    place: Place = airborne,
+    *,
+    wrong: Give | None = None,
+    on: tuple[str, ...] = BOTH,
+    **order: Any,
 ) -> dict[str, Call]:
     """An action of a vehicle that sends this command: one row for all tests of calls, and for the table of orders."""
     call = Call(
         lambda stage: give(stage.vehicle),
         place,
+        on,
         command=command,
         wrong=None if wrong is None else lambda stage: wrong(stage.vehicle),
-        order=Row(name, give, command, PLACES[place], **order),
+        order=Row(name, give, command, PLACES[place], on=on, **order),
     )
     return {f"Vehicle.{name}": call}
 
