@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.links.helm import HELM_KEPT_S, READ_COMMANDS, READ_MESSAGES, Gate, Helm, is_read, refusals_in
+from aerokit.links.helm import READ_COMMANDS, READ_MESSAGES, Gate, Helm, is_read, refusals_in
 from aerokit.mavlink import messages
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -31,6 +31,8 @@ from aerokit.mavlink.messages import (
     Statustext,
 )
 from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
+
+HELM_KEPT_S = 5.0
 
 ARM = CommandLong(1, 1, MavCmd.COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
 ASK = CommandLong(1, 1, MavCmd.REQUEST_MESSAGE, 0, 148, 0, 0, 0, 0, 0, 0)

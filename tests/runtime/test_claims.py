@@ -15,7 +15,10 @@ from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.statistics import SourceStatistics
 from aerokit.runtime import routes as routes_module
 from aerokit.runtime.claims import Claim, boot_time_ms
-from aerokit.runtime.routes import LIVE_FOR_S, MOVES_AFTER_S, Routes
+from aerokit.runtime.routes import Routes
+
+LIVE_FOR_S = 30.0
+MOVES_AFTER_S = 3.5
 
 HOME, SAME_HOST, ELSEWHERE = "1@copter", "2@copter", "1@stranger"
 

@@ -16,8 +16,12 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, SystemTime
 from aerokit.runtime.connection import Connection
-from aerokit.runtime.peers import MOST_PEERS, MOST_SENDERS, MOST_STRANGERS
-from aerokit.runtime.routes import MOST_CLAIMS, MOST_ROUTES, Routes
+from aerokit.runtime.peers import MOST_STRANGERS
+from aerokit.runtime.routes import MOST_CLAIMS, Routes
+
+MOST_PEERS = 256
+MOST_ROUTES = 1024
+MOST_SENDERS = 2048
 
 pytestmark = pytest.mark.anyio
 

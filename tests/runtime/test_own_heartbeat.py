@@ -19,8 +19,9 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavType
 from aerokit.runtime.connection import Connection
 from aerokit.runtime.events import HeartbeatPaused, HeartbeatResumed
-from aerokit.runtime.own_heartbeat import BLOCKING_FED_WITHIN_S
 from aerokit.sim import SimulatedCopter
+
+BLOCKING_FED_WITHIN_S = 60.0
 
 
 @pytest.mark.anyio

@@ -23,7 +23,8 @@ from aerokit.mavlink.messages import (
     Timesync,
 )
 from aerokit.runtime.connection import Connection
-from aerokit.runtime.peers import MOST_PEERS
+
+MOST_PEERS = 256
 
 pytestmark = pytest.mark.anyio
 

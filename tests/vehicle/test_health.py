@@ -9,7 +9,7 @@ from flight_harness import Flight, now, open_flight, open_px4
 from aerokit.errors import CommandRejected, CommandTimeout, LinkLost, OperationTimeout
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
-from aerokit.mavlink.messages import Statustext
+from aerokit.mavlink.messages import Statustext, SysStatus
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
 pytestmark = pytest.mark.anyio
@@ -288,3 +288,11 @@ async def test_ready_after_the_link_was_restored_without_a_reboot(grounded: Flig
     await grounded.vehicle.wait_ready()
     assert grounded.vehicle.position.updated_at >= restored_at
     assert now() - restored_at < 2.0
+
+
+async def test_state_older_than_five_seconds_is_missing_for_flight(grounded: Flight) -> None:
+    grounded.copter.faults.lose(SysStatus, times=1_000_000)
+    await anyio.sleep(4.5)
+    assert grounded.vehicle.missing_for_flight() == []
+    await anyio.sleep(1.5)
+    assert any("no SYS_STATUS for" in each for each in grounded.vehicle.missing_for_flight())

@@ -13,7 +13,8 @@ from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.sim import SimulatedCopter, SimulatedPx4
-from aerokit.vehicle.orders.late_arming import LATE_S
+
+LATE_S = 15.0
 
 pytestmark = pytest.mark.anyio
 
@@ -198,5 +199,19 @@ async def test_answer_that_names_another_station_proves_nothing(grounded: Flight
     assert grounded.copter.arming.arm()
     grounded.wire.deliver(FrameEncoder(1, 1).encode(CommandAck(ARM, 0, 0, 0, 0, 0)))
     await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+
+
+async def test_order_that_arms_after_the_time_to_watch_is_left_to_the_pilot(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    (order,) = grounded.wire.commands(ARM)
+    await anyio.sleep(LATE_S + 2.0)
+    grounded.copter.faults.commands.clear()
+    grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
+    await anyio.sleep(6.0)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]

@@ -10,7 +10,7 @@ from flight_harness import Wire, attached_sinks, in_the_air, open_flight
 
 import aerokit
 from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
-from aerokit.mavlink.enums import CopterMode
+from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.mavlink.messages import Heartbeat, SetMode
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.vehicle.orders.setpoints import VelocitySetpoint
@@ -174,3 +174,14 @@ async def test_the_block_is_left_while_another_task_flies(caplog: pytest.LogCapt
         assert copter.mode.name == "BRAKE"
     assert isinstance(ended[0], (ConnectionClosed, OperationRejected))
     assert "vehicle 1 is let go: holding in BRAKE" in caplog.text
+
+
+async def test_end_of_block_waits_a_moment_for_an_unanswered_hold() -> None:
+    async with in_the_air() as flight:
+        with anyio.move_on_after(1.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+        flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
+        with anyio.move_on_after(1.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+        left_at = anyio.current_time()
+    assert 1.0 < anyio.current_time() - left_at < 3.0

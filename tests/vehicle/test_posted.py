@@ -25,9 +25,11 @@ from aerokit.mavlink.messages import Heartbeat
 from aerokit.runtime.cells import Source, StateCell
 from aerokit.vehicle.orders.helm import MODE_GRACE_S, Helm
 from aerokit.vehicle.orders.order import Subject, subjects_of
-from aerokit.vehicle.orders.posted import OWN_MODES_S, Posted
+from aerokit.vehicle.orders.posted import Posted
 from aerokit.vehicle.orders.posting import MODE_ATTEMPTS
 from aerokit.vehicle.state.telemetry import Telemetry
+
+OWN_MODES_S = 10.0
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
 STABILIZE, GUIDED, LOITER = (
