@@ -25,21 +25,30 @@ def tests(session: nox.Session) -> None:
 
 
 MEETS_OTHERS = (
-    "tests/test_sync.py", "tests/test_sync_loop.py", "tests/test_sync_parameters.py", "tests/test_beside_sniffio.py",
-    "tests/test_package.py", "tests/links/test_serial.py", "tests/runtime/test_ends.py", "tests/runtime/test_leaks.py",
-    "tests/dronekit/test_dronekit_life.py", "tests/dronekit/test_dronekit_orders.py", "tests/vehicle/test_guided.py",
-    "tests/parameters", "tests/testing/test_clock.py",
-)  # fmt: skip
+    "tests/sync/test_sync.py",
+    "tests/sync/test_sync_loop.py",
+    "tests/sync/test_sync_parameters.py",
+    "tests/test_beside_sniffio.py",
+    "tests/test_package.py",
+    "tests/transport/test_serial.py",
+    "tests/connection/test_ends.py",
+    "tests/connection/test_leaks.py",
+    "tests/dronekit/test_dronekit_life.py",
+    "tests/dronekit/test_dronekit_orders.py",
+    "tests/vehicle/commanding/test_guided.py",
+    "tests/parameters",
+    "tests/testing/test_clock.py",
+)
 """The tests of what uses other packages: anyio and its threads, serial ports, geodesy, dialects of pymavlink."""
 OF_EXTRAS = (
-    "tests/convert",
-    "tests/flights",
-    "tests/links/test_zenoh.py",
-    "tests/monitor",
-    "tests/network",
-    "tests/report",
-    "tests/serve",
-    "tests/viewers",
+    "tests/logs/convert",
+    "tests/logs/flights",
+    "tests/transport/test_zenoh.py",
+    "tests/apps/monitor",
+    "tests/apps/network",
+    "tests/logs/report",
+    "tests/apps/serve",
+    "tests/apps/foxglove",
 )
 
 
@@ -164,7 +173,7 @@ def fuzz(session: nox.Session) -> None:
 def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")
-    session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests"})
+    session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests/helpers"})
 
 
 @nox.session
@@ -189,7 +198,7 @@ def orders(session: nox.Session) -> None:
     """Fly the order table of docs/reliability.md with many seeds of each row (100): `nox -s orders -- 300`."""
     session.install("-e", ".[test]")
     seeds = session.posargs[0] if session.posargs else "100"
-    session.run("pytest", "-q", "tests/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
+    session.run("pytest", "-q", "tests/vehicle/commanding/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
 
 
 @nox.session
@@ -219,7 +228,9 @@ def clients(session: nox.Session) -> None:
 def browser(session: nox.Session) -> None:
     """Fly by the page of `aerokit serve`, and open a report, in headless Chromium (or AEROKIT_CHROMIUM)."""
     session.install("-e", ".[test]", "playwright>=1.45")
-    session.run("pytest", "-q", "-n", "0", "tests/browser", "tests/report/test_report.py", *session.posargs)
+    session.run(
+        "pytest", "-q", "-n", "0", "tests/browser", "tests/logs/report/test_report.py", *session.posargs
+    )
 
 
 @nox.session

@@ -1,6 +1,6 @@
 """Orders that get no answer are sent again, but not against a newer order, a pilot, or what they have brought about.
 
-The rules by themselves are in tests/vehicle/test_posted.py.
+The rules by themselves are in tests/vehicle/commanding/test_posted.py.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from aerokit.mavlink.tlog import TlogWriter, read_tlog
 from aerokit.protocols.transfer import Progress
 from aerokit.vehicle.state.equipment import Battery
 
-RECORDINGS = Path(__file__).parent.parent / "recordings"
+RECORDINGS = Path(__file__).parents[2] / "recordings"
 
 
 @pytest.fixture(params=[".bin", ".ulg"])

@@ -48,7 +48,7 @@ def test_both_vehicles_have_it_and_it_is_documented(name: str) -> None:
 
 
 def test_the_page_is_that_of_the_declarations() -> None:
-    page = Path(__file__).parents[2] / "docs" / "states.md"
+    page = Path(__file__).parents[3] / "docs" / "states.md"
     assert page.read_text(encoding="utf-8") == rendered(), (
         "python -m aerokit.vehicle.state.table > docs/states.md"
     )

@@ -52,7 +52,7 @@ def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("aerokit.cli.which_vehicle.LISTEN_S", 0.0)  # there is one; tests/cli has several
+    monkeypatch.setattr("aerokit.cli.which_vehicle.LISTEN_S", 0.0)  # there is one; tests/apps/cli has several
 
 
 # ------------------------------------------------------------------------------------- arguments

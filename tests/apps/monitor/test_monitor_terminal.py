@@ -21,7 +21,7 @@ from aerokit.cli.monitor import END_WITHIN_S
 if sys.platform == "win32":
     pytest.skip("there are no pseudo-terminals", allow_module_level=True)
 
-SOURCES = Path(__file__).parents[2] / "src"
+SOURCES = Path(__file__).parents[3] / "src"
 LIMIT_S = 60.0
 MONITOR = "import sys; from aerokit.cli.main import main; sys.exit(main(['monitor', {address!r}]))"
 BLOCKED = f"""

@@ -8,7 +8,7 @@ import pytest
 
 __all__ = ["LONG", "SHORT", "headline", "path_of", "recording"]
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 LONG = ROOT.parent / "shared" / "traces"
 """Whole flights; not part of the project."""
 SHORT = ROOT / "tests" / "recordings"

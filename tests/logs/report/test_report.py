@@ -30,7 +30,7 @@ from aerokit.testing import open_flight, run_virtual
 
 pytest.importorskip("plotly")
 
-RECORDINGS = Path(__file__).parent.parent / "recordings"
+RECORDINGS = Path(__file__).parents[2] / "recordings"
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
 

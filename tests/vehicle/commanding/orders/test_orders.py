@@ -51,7 +51,7 @@ def test_no_rule_is_broken(row: Row, autopilot: str, seed: int) -> None:
 
 
 def test_each_order_stands_in_the_documentation() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
+    text = (Path(__file__).parents[4] / "docs" / "reliability.md").read_text()
     for row in ROWS:
         assert re.search(rf"^\| [^|]*`{re.escape(row.name.split()[0])}", text, re.MULTILINE), row.name
 
@@ -186,7 +186,7 @@ def test_a_reboot_is_not_sent_again_over_the_next_link() -> None:
 
 
 def test_each_command_that_is_sent_once_stands_in_the_documentation() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
+    text = (Path(__file__).parents[4] / "docs" / "reliability.md").read_text()
     for command, (what, where) in SENT_ONCE.items():
         condition = "" if where is None else f" (param{where[0] + 1} = {where[1]:g})"
         assert f"| {MavCmd(command).name}{condition} | {what} |" in text

@@ -18,7 +18,7 @@ from aerokit.links.link import Link
 from aerokit.sim import SimulatedVehicle, simulated_link
 from aerokit.testing import run_virtual
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "command-line.md"
+DOCUMENT = Path(__file__).parents[3] / "docs" / "command-line.md"
 MISSION = """QGC WPL 110
 0\t1\t0\t16\t0\t0\t0\t0\t47.397742\t8.545594\t488\t1
 1\t0\t3\t22\t0\t0\t0\t0\t0\t0\t15\t1

@@ -532,3 +532,13 @@ async def test_a_mode_is_not_asked_for_again_once_there_is_a_newer_order(grounde
             await newer.set_mode(loiter)
     assert wire.mode_orders() == [guided.custom_mode, loiter.custom_mode]
     assert vehicle.mode_name == "LOITER"
+
+
+@pytest.mark.parametrize(("waited_s", "end"), [(9.0, ""), (11.0, TAKEN)])
+def test_mode_ordered_ten_seconds_ago_is_not_the_programs_any_more(waited_s: float, end: str) -> None:
+    stage = Stage()
+    stage.post("mode", mode=GUIDED)
+    stage.now += waited_s
+    motion = stage.post("motion")
+    stage.tell(GUIDED)
+    assert motion.end == end

@@ -1,6 +1,6 @@
 """What comes from the air fills no table without end: one test for each table that has names or numbers off the link.
 
-Framers, senders, routes and peers are in ``runtime/test_nobody_elses.py`` and ``mavlink/test_hostile_bytes.py``.
+Framers, senders, routes and peers are in ``connection/test_nobody_elses.py`` and ``mavlink/test_hostile_bytes.py``.
 """
 
 from __future__ import annotations

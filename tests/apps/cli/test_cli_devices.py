@@ -32,7 +32,7 @@ def address(camera: SimulatedCamera, gimbal: SimulatedGimbal) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.cli.which_vehicle.LISTEN_S", 0.0)  # tests/cli has several vehicles
+    monkeypatch.setattr("aerokit.cli.which_vehicle.LISTEN_S", 0.0)  # tests/apps/cli has several vehicles
 
 
 @pytest.fixture

@@ -278,7 +278,7 @@ def test_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_all_extras_are_looked_for() -> None:
-    text = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
     section = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
     extras = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))
     assert extras - {"all", "test", "dev", "docs"} == set(EXTRAS)

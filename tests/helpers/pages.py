@@ -42,7 +42,7 @@ from aerokit.links.address import LinkAddress
 from aerokit.sim import SimulatedCamera, SimulatedComponent, SimulatedCopter, SimulatorServer
 from aerokit.testing import run_virtual
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 THE_RULE = "docs/how-to/index.md#how-to-read-the-code"
 """Where it is said that ``vehicle`` is connected."""
 ADDRESS = "udpin:0.0.0.0:14550"

@@ -25,7 +25,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import TlogWriter, read_tlog
 from aerokit.protocols.transfer import Progress
 
-RECORDING = Path(__file__).parent.parent / "recordings" / "px4-quad.tlog"
+RECORDING = Path(__file__).parents[2] / "recordings" / "px4-quad.tlog"
 BEGIN = 1_700_000_000.25
 PLACES = [(47.4 + i * 1e-4, 8.5 - i * 1e-4, 500.0 + i, float(i)) for i in range(5)]
 """Degrees, and metres above the sea and above home: one a second."""

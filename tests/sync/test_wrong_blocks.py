@@ -63,7 +63,7 @@ def test_the_asynchronous_one_without_asyncio_says_what_to_do(name: str) -> None
 
 
 def test_classifiers_name_no_loop_but_asyncio() -> None:
-    project = (Path(__file__).parent.parent / "pyproject.toml").read_text(encoding="utf-8")
+    project = (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
     frameworks = set(re.findall(r'"Framework :: (\w+)"', project))
     assert frameworks == {"AsyncIO", "Pytest"}
 

@@ -84,7 +84,7 @@ class Kept(Publisher):
 
 
 def test_the_file_is_what_the_types_say() -> None:
-    path = Path(__file__).parents[2] / "docs" / "state.schema.json"
+    path = Path(__file__).parents[3] / "docs" / "state.schema.json"
     assert path.read_text(encoding="utf-8") == rendered(), (
         "python -m aerokit.network.schema > docs/state.schema.json"
     )
