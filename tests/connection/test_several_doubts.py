@@ -21,12 +21,14 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.runtime.connection import Connection
-from aerokit.runtime.link_choice import PATIENCE_S, STEADY_S, LinkChoice
+from aerokit.runtime.link_choice import PATIENCE_S, LinkChoice
 from aerokit.runtime.link_questions import UNWANTED_HZ
 from aerokit.runtime.link_state import LinkState
 from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND
+
+STEADY_S = 3.0
 
 pytestmark = pytest.mark.anyio
 
