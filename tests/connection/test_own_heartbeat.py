@@ -15,10 +15,10 @@ from served_copter import served, served_copter
 import aerokit.sync
 from aerokit import OwnHeartbeat, dronekit
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
 from aerokit.errors import InvalidArgument
+from aerokit.events import HeartbeatPaused, HeartbeatResumed
 from aerokit.mavlink.enums import MavType
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import HeartbeatPaused, HeartbeatResumed
 from aerokit.sim import SimulatedCopter
 
 BLOCKING_FED_WITHIN_S = 60.0

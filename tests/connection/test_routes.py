@@ -8,10 +8,10 @@ import anyio
 import pytest
 
 from aerokit import connect, events, open_connection
+from aerokit.connection.connection import Connection
 from aerokit.errors import ConnectFailed
-from aerokit.links import MemoryLink, Peer
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import x25
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import (
@@ -22,7 +22,7 @@ from aerokit.mavlink.messages import (
     RequestDataStream,
     Timesync,
 )
-from aerokit.runtime.connection import Connection
+from aerokit.transport import MemoryLink, Peer
 
 MOST_PEERS = 256
 

@@ -18,7 +18,6 @@ from aerokit import OwnHeartbeat, Signing, SigningKey, VelocitySetpoint
 from aerokit import messages as m
 from aerokit.errors import AerokitError
 from aerokit.hub import Endpoint, Hub
-from aerokit.links import FaultModel, FaultyLink, Link, SeveralLinks, memory_link_pair
 from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.missions import Fence, FenceCircle, Mission, RallyPoints, rally_point, waypoint
 from aerokit.parameters import ParameterRenamedWarning
@@ -31,6 +30,8 @@ from aerokit.sim import (
     simulated_link,
 )
 from aerokit.sim.journal import Journal
+from aerokit.testing import FaultModel, FaultyLink
+from aerokit.transport import Link, SeveralLinks, memory_link_pair
 
 __all__ = ["SCENES", "recorded"]
 
@@ -486,7 +487,8 @@ def dronekit_script() -> str:
     """The orders that reach the vehicle, in their order."""
     from served_copter import served
 
-    from aerokit.dronekit import VehicleMode, connect
+    from aerokit.dronekit import VehicleMode
+    from aerokit.dronekit import vehicle as connect
 
     simulated = copter()
     journal = simulated.journal = Journal()

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from aerokit.links.link import Link, Peer, Receiver
 from aerokit.mavlink import enums
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFtpOpcode, MavModeFlag
@@ -17,7 +16,8 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import SECRET_FIELDS, Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, FileTransferProtocol, Heartbeat
-from aerokit.protocols.ftp_message import FtpMessage
+from aerokit.protocols.ftp import FtpMessage
+from aerokit.transport.link import Link, Peer, Receiver
 
 ANSWERS = frozenset(
     (

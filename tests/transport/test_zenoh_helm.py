@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.links.helm import READ_COMMANDS, READ_MESSAGES, Gate, Helm, is_read, refusals_in
 from aerokit.mavlink import messages
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -30,7 +29,15 @@ from aerokit.mavlink.messages import (
     SetPositionTargetLocalNed,
     Statustext,
 )
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
+from aerokit.transport.zenoh.control_lease import (
+    READ_COMMANDS,
+    READ_MESSAGES,
+    Gate,
+    Helm,
+    is_read,
+    refusals_in,
+)
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
 
 HELM_KEPT_S = 5.0
 

@@ -9,9 +9,9 @@ from any_message import anything
 
 from aerokit.autopilots import autopilot_for
 from aerokit.mavlink import messages
+from aerokit.vehicle.state.field import message_type
 from aerokit.vehicle.state.states import SOURCES
 from aerokit.vehicle.state.telemetry import Telemetry
-from aerokit.vehicle.state.told import message_type
 
 HEARTBEATS = {
     "copter": messages.Heartbeat(2, 3, 81, 4, 3),
