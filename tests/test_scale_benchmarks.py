@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -15,6 +17,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.exhaustive
 def test_every_row_has_a_figure_and_its_aim(tmp_path: Path) -> None:
     path = tmp_path / "scale.json"
     done = run("--quick", "--output", str(path))

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from exhaustive import exhaustive
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from targets import TARGETS
@@ -14,7 +15,6 @@ from targets import TARGETS
 HERE = Path(__file__).parent
 CORPUS = HERE / "corpus"
 KNOWN = {name: [path.read_bytes() for path in sorted((CORPUS / name).iterdir())] for name in TARGETS}
-EXAMPLES = 40
 
 edits = st.tuples(st.floats(0, 1), st.integers(0, 4), st.binary(max_size=4))
 """Where, how many bytes are cut out there, and what is put in."""
@@ -34,13 +34,14 @@ def test_known_inputs(path: Path) -> None:
     TARGETS[path.parent.name](path.read_bytes())
 
 
+@pytest.mark.parametrize("examples", [8, exhaustive(40)])
 @pytest.mark.parametrize("name", TARGETS)
-def test_other_inputs(name: str) -> None:
+def test_other_inputs(name: str, examples: int) -> None:
     inputs = st.builds(edited, st.sampled_from(KNOWN[name]), st.lists(edits, max_size=6)) | st.binary(
         max_size=300
     )
 
-    @settings(max_examples=EXAMPLES, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
     @given(inputs)
     def fuzz(data: bytes) -> None:
         TARGETS[name](data)
