@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from exhaustive import exhaustive
 from served_copter import served, served_copter
 
 import aerokit
@@ -125,7 +126,9 @@ def test_demo_that_cannot_connect_leaves_the_last_recording(
     assert last.read_bytes() == b"the last flight"
 
 
-@pytest.mark.parametrize(("vehicle", "firmware"), [("copter", "ArduCopter"), ("px4", "PX4")])
+@pytest.mark.parametrize(
+    ("vehicle", "firmware"), [("copter", "ArduCopter"), exhaustive(pytest.param("px4", "PX4"))]
+)
 def test_demo_on_its_own_vehicle(
     vehicle: str, firmware: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -201,7 +204,7 @@ def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
 
 
 @posix_only
-@pytest.mark.parametrize("mode", ["LOITER", "BRAKE"])
+@pytest.mark.parametrize("mode", ["LOITER", exhaustive("BRAKE")])
 def test_a_pilot_who_takes_over_keeps_the_vehicle(mode: str, tmp_path: Path) -> None:
     with (
         served([SimulatedCopter(boot_time_s=0.0)], "tcpin:127.0.0.1:0") as address,

@@ -357,6 +357,7 @@ def test_ctrl_c_ends_a_connect() -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+@pytest.mark.exhaustive
 def test_the_tests_interrupt_themselves_also_where_ctrl_c_is_ignored() -> None:
     test = f"{__file__}::{test_ctrl_c_ends_a_connect.__name__}"
     ignore = "import signal, sys, pytest; signal.signal(signal.SIGINT, signal.SIG_IGN)"

@@ -78,7 +78,7 @@ def free_port() -> int:
 async def test_a_live_stream_beside_the_vehicles_state() -> None:
     port = free_port()
     async with (
-        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        simulated_link(SimulatedCopter(boot_time_s=0.0), speedup=10.0) as link,
         aerokit.connect(link) as vehicle,
     ):
         await vehicle.wait_ready(timeout=30)

@@ -12,7 +12,7 @@ import statistics
 import anyio
 import pytest
 from bad_link import DELAY_S, NARROW, WIDE, Program, Radio, attempt
-from exhaustive import sampled
+from exhaustive import exhaustive, sampled
 from transfers_under_test import CASES, TINY, Case, leftovers, make_copter
 from verdicts import judge
 
@@ -40,7 +40,9 @@ ROUGH = Radio(
 
 
 @each_case
-@pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: f"{loss:.0%}")
+@pytest.mark.parametrize(
+    "loss", [exhaustive(loss) if loss != 0.1 else loss for loss in LOSSES], ids=lambda loss: f"{loss:.0%}"
+)
 def test_a_transfer_ends_with_exact_content_and_leaves_nothing(case: Case, loss: float) -> None:
     for seed in range(SEEDS):
         verdict = judge(case, TINY, WIDE.with_loss(loss), seed)
@@ -76,7 +78,7 @@ def test_three_seconds_of_silence_are_survived(case: Case) -> None:
 
 
 @each_case
-@pytest.mark.parametrize("share", [0.0, 0.4, 0.9])
+@pytest.mark.parametrize("share", [exhaustive(0.0), 0.4, exhaustive(0.9)])
 def test_a_link_that_dies_is_an_error_that_names_what_is_missing(case: Case, share: float) -> None:
     ideal_s = case.ideal(make_copter(case, TINY, WIDE), TINY).seconds(WIDE)
     verdict = judge(
@@ -89,7 +91,7 @@ def test_a_link_that_dies_is_an_error_that_names_what_is_missing(case: Case, sha
 
 
 @each_case
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
+@pytest.mark.parametrize("share", [exhaustive(0.1), 0.5, exhaustive(0.95)])
 def test_cancelled_at_any_moment_it_leaves_nothing_behind(case: Case, share: float) -> None:
     radio = NARROW.with_loss(0.1)
     copter = make_copter(case, TINY, radio)

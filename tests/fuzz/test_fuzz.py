@@ -53,6 +53,7 @@ def test_each_folder_of_the_corpus_is_of_a_target() -> None:
     assert {path.name for path in CORPUS.iterdir()} == set(TARGETS)
 
 
+@pytest.mark.exhaustive
 def test_the_command_line_finds_what_is_wrong(tmp_path: Path) -> None:
     command = [sys.executable, str(HERE / "fuzz.py"), "--plain", "--runs", "20", "address", "waypoints"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)

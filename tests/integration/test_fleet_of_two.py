@@ -93,6 +93,7 @@ async def two_vehicles() -> AsyncIterator[list[str]]:
         yield addresses
 
 
+@pytest.mark.exhaustive
 async def test_they_take_off_together_go_and_land_together() -> None:
     port = free_port()
     place = f"tcp/127.0.0.1:{port}"

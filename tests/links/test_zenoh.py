@@ -182,6 +182,7 @@ async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
             assert told.losses == []
 
 
+@pytest.mark.exhaustive
 async def test_a_router_is_killed_and_comes_back() -> None:
     port = free_port()
     with router(port) as first:

@@ -42,6 +42,7 @@ def hub(*addresses: str) -> Iterator[subprocess.Popen[str]]:
             running.kill()
 
 
+@pytest.mark.exhaustive
 async def test_a_machine_is_killed_and_replaced_in_flight() -> None:
     vehicle_port, port = free_port(), free_port()
     copter = SimulatedCopter(boot_time_s=0.0)

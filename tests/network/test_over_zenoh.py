@@ -98,6 +98,7 @@ async def test_the_one_without_the_helm_is_told() -> None:
         await one.arm()
 
 
+@pytest.mark.exhaustive
 async def test_a_reconnecting_program_lives_through_a_partition() -> None:
     port = free_port()
     async with copter_at(port), HoldingProxy(port) as line:

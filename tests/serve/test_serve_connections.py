@@ -97,7 +97,7 @@ async def ask(stream: Stream, request: bytes) -> int:
 @asynccontextmanager
 async def open_server() -> AsyncIterator[Server]:
     async with (
-        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        simulated_link(SimulatedCopter(boot_time_s=0.0), speedup=10.0) as link,
         aerokit.connect(link) as vehicle,
         make_app(vehicle, token=TOKEN, open_reading=True) as app,
     ):

@@ -43,7 +43,7 @@ async def bridged(
 ) -> AsyncIterator[tuple[FoxgloveBridge, Connection]]:
     vehicles = vehicles or (SimulatedCopter(boot_time_s=0.0),)
     async with (
-        simulated_link(vehicles) as link,
+        simulated_link(vehicles, speedup=10.0) as link,
         open_connection(link) as connection,
         foxglove_bridge(connection, port=0, **options) as bridge,
     ):
