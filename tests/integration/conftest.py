@@ -45,12 +45,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "choice" in metafunc.fixturenames:
-        choices = [
-            pytest.param(choice, id=choice.kind.name) for choice in Choice.from_options(metafunc.config)
-        ]
-        is_chosen = len(choices) == 1
+        choices = Choice.from_options(metafunc.config)
+        rows = [pytest.param(choice, id=choice.kind.name) for choice in choices]
+        few = len(rows) == 1
         metafunc.parametrize(
-            "choice", [row if is_chosen or row.id in DEFAULT_KINDS else exhaustive(row) for row in choices]
+            "choice", [row if few or row.id in DEFAULT_KINDS else exhaustive(row) for row in rows]
         )
 
 

@@ -56,7 +56,7 @@ async def fly(vehicle: Vehicle) -> None:
 
 
 each_use = pytest.mark.parametrize(
-    "use", [exhaustive(nothing), exhaustive(read), arm, exhaustive(fly)], ids=lambda use: use.__name__
+    "use", [arm, *map(exhaustive, (nothing, read, fly))], ids=lambda use: use.__name__
 )
 
 
