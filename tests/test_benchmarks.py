@@ -25,7 +25,7 @@ AIMS = {
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "benchmarks/run.py", *arguments]
     return subprocess.run(
-        command, cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=60, check=False
+        command, cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=200, check=False
     )
 
 
@@ -76,7 +76,7 @@ def test_transfers_are_measured_and_compared_with_what_they_should_be(tmp_path: 
     done = subprocess.run(
         [sys.executable, "benchmarks/transfers.py", "--quick", "--library", "aerokit", "--library", "pymavlink",
          "--output", str(path), "mission_download"],
-        cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=60, check=False,
+        cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=200, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "failed" not in done.stdout, done.stderr

@@ -52,7 +52,7 @@ def read_until(process: subprocess.Popen[str], text: str) -> str:
 def read_rest(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
     rest = process.stdout.read()
-    process.wait(30)
+    process.wait(200)
     assert "Traceback" not in rest
     return rest
 
@@ -239,7 +239,7 @@ def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
     with served([copter]) as address, in_the_air(address, tmp_path, side_m=3) as process:
         assert process.stdout is not None
         process.stdout.close()
-        process.wait(60)
+        process.wait(200)
         assert copter.is_landed
 
 

@@ -33,7 +33,7 @@ LATER = 4
 REBOOTING_S = 2.0
 ENDURING_MAH = 1e6
 """It flies by the clock of the wall, twenty times as fast, until this machine is through with all calls."""
-PATIENCE_S = 40.0
+PATIENCE_S = 200.0
 """For what is left to go: an order to arm is watched, and answered."""
 
 

@@ -209,7 +209,7 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.Mon
         question = asyncio.create_task(asking.agrees("fly?"))
         await asyncio.sleep(0)
         os.write(ours, b"n\n")
-        return await asyncio.wait_for(question, 10)
+        return await asyncio.wait_for(question, 100)
 
     with open(theirs) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)

@@ -375,7 +375,7 @@ time.sleep(0.1)
         subprocess.run(
             [sys.executable, "-c", program.format(address=fc.address)],
             env={**os.environ, "PYTHONPATH": str(SOURCES)},
-            timeout=60,
+            timeout=200,
             check=False,
         )
         assert set(released(fc, since)) == {(0, IGNORED, 0, *(IGNORED,) * 5, *(0,) * 10)}

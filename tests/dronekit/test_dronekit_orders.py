@@ -12,7 +12,7 @@ from aerokit.dronekit.line import Orders
 from aerokit.errors import ConnectionClosed
 from aerokit.sync.loop_thread import LoopThread
 
-LIMIT_S = 10.0
+LIMIT_S = 100.0
 
 
 @pytest.fixture

@@ -132,7 +132,7 @@ def test_traceback_of_a_link_that_cannot_be_opened_is_short(
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=200,
     )
     shown = FOREIGN.sub("", ended.stderr)
     assert "cannot open " in shown.splitlines()[-1]

@@ -13,7 +13,7 @@ from zenoh_harness import Told, client, reconnecting, serving
 from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
-from aerokit.links import create_link, needed
+from aerokit.links import create_link, needed, zenoh_listen
 from aerokit.links.handover import Handover
 from aerokit.links.zenoh_keys import Stamp
 from aerokit.links.zenoh_listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
@@ -209,22 +209,21 @@ async def test_a_vehicle_side_is_killed_and_replaced() -> None:
         async with reconnecting(port) as (_, told):
             await eventually(lambda: told.data != b"")
             first.kill()
-            await eventually(lambda: told.interruptions == 1)
+            await eventually(lambda: told.interruptions >= 1)
             told.pieces.clear()
             with process(VEHICLE_SIDE, address):
-                await eventually(lambda: told.restored == 1 and told.data != b"")
+                await eventually(lambda: told.restored >= 1 and told.data != b"")
 
 
-async def test_a_late_joiner_finds_it_at_once() -> None:
+async def test_a_late_joiner_finds_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by the next beacon, which does not come."""
     port = free_port()
     with router(port):
         async with serving(port, how="connect") as (vehicle, _):
-            await asyncio.sleep(0.1)
-            began = asyncio.get_running_loop().time()
+            monkeypatch.setattr(zenoh_listen, "BEACON_EVERY_S", 3600.0)
+            await asyncio.sleep(1.0)  # longer does no harm: the last beacon has gone
             async with client(port):
-                assert (
-                    asyncio.get_running_loop().time() - began < 0.4
-                )  # less than the time to the next beacon
+                pass
             await eventually(lambda: vehicle.peers == ())
 
 

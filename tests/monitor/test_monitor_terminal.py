@@ -23,7 +23,7 @@ if sys.platform == "win32":
     pytest.skip("there are no pseudo-terminals", allow_module_level=True)
 
 SOURCES = Path(__file__).parents[2] / "src"
-LIMIT_S = 60.0
+LIMIT_S = 200.0
 MONITOR = "import sys; from aerokit.cli.main import main; sys.exit(main(['monitor', {address!r}]))"
 BLOCKED = f"""
 import time

@@ -260,7 +260,7 @@ def test_a_program_with_an_unanswered_call_exits(tmp_path: Path, ending: str, co
         [sys.executable, "-X", "dev", str(file)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=200,
         env=environment,
         check=False,
     )
