@@ -161,7 +161,7 @@ def test_setpoints_stream_while_the_block_feeds_them(vehicle: aerokit.sync.Vehic
     vehicle.arm()
     vehicle.take_off(5)
     start = vehicle.position.value
-    with vehicle.guided.velocity() as stream:
+    with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
         running = [stream.is_running]
         stream.fly(VelocitySetpoint(north_m_s=3), 0.2)
     assert [*running, stream.is_running] == [True, False]

@@ -73,7 +73,7 @@ async def test_a_flight(kind: str) -> None:
         await vehicle.take_off(5, timeout=100)
         here = vehicle.position.value
         await vehicle.go_to(here.offset(north_m=10).replace(altitude_amsl_m=None), timeout=100)
-        async with vehicle.guided.velocity() as stream:
+        async with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
             await stream.fly(VelocitySetpoint(east_m_s=1), 0.3)
         assert vehicle.mode_name == "BRAKE"
         await vehicle.land(timeout=100)

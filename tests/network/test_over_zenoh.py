@@ -62,7 +62,7 @@ async def test_the_whole_api() -> None:
         await vehicle.set_mode("GUIDED")
         await vehicle.arm()
         await vehicle.take_off(5)
-        async with vehicle.guided.velocity() as stream:
+        async with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
             await stream.fly(VelocitySetpoint(north_m_s=2), 0.3)
         await vehicle.land()
         link: Any = vehicle.connection.link
