@@ -25,6 +25,13 @@ from aerokit.testing import run_virtual
 POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "4"))
 """At so many awaits of each call; 0: at all. The default run has one, and few of them on PX4."""
 ENDS_S = 2.0
+BY_DEFAULT = {
+    *(
+        (owner, "ardupilot")
+        for owner in ("Vehicle", "Parameters", "MissionControl", "StateCell", "functions")
+    ),
+    *((owner, "px4") for owner in ("Guided", "Camera")),
+}
 
 
 def test_each_public_coroutine_is_in_the_table() -> None:
@@ -47,11 +54,11 @@ def groups() -> Iterator[tuple[str, list[str]]]:
 
 
 def rows() -> Iterator[Any]:
-    """Each group on each autopilot; by default on PX4 only what differs most there."""
+    """Each group on each autopilot; a few of them by default."""
     for owner, names in groups():
         for autopilot in AUTOPILOTS:
             row = pytest.param(names, autopilot, id=f"{owner}-{autopilot}")
-            yield row if autopilot == "ardupilot" or owner == "Guided" else exhaustive(row)
+            yield row if (owner, autopilot) in BY_DEFAULT else exhaustive(row)
 
 
 @pytest.mark.parametrize("points", [2, exhaustive(POINTS)])
