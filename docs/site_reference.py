@@ -32,7 +32,7 @@ ROOMS = (
              "fleet", "selection", "members", "results", "policy", "events", "formation", "following", "apart", "paths",
              "show", "show_report", "clocks"))),
     Room("cells", "Cells and subscriptions", "Values with their age; messages and events as they come",
-         ("aerokit.runtime.cells", "aerokit.runtime.subscription")),
+         ("aerokit.connection.cells", "aerokit.connection.bus")),
     Room("state", "Values of the state", "What cells hold",
          (f"{VEHICLE}.state.movement", f"{VEHICLE}.state.condition", f"{VEHICLE}.state.equipment",
           f"{VEHICLE}.state.gimbal", f"{VEHICLE}.state.status_text", f"{VEHICLE}.components.status")),
@@ -59,31 +59,35 @@ ROOMS = (
     Room("dronekit", "aerokit.dronekit", "The classic API", ("aerokit.dronekit",)),
     Room("sim", "aerokit.sim", "Simulated vehicles", ("aerokit.sim", "aerokit.sim.kinds", "aerokit.sim.picture")),
     Room("testing", "aerokit.testing", "For tests of your program", ("aerokit.testing",)),
-    Room("links", "aerokit.links", "Bytes in, bytes out", ("aerokit.links",)),
+    Room("links", "aerokit.transport", "Bytes in, bytes out", ("aerokit.transport",)),
     Room("hub", "aerokit.hub", "Links joined into one network", ("aerokit.hub",)),
-    Room("mavlink", "aerokit.mavlink", "The wire", ("aerokit.mavlink", "aerokit.mavlink.from_pymavlink",
-         "aerokit.mavlink.to_pymavlink", "aerokit.mavlink.message_factory")),
+    Room("mavlink", "aerokit.mavlink", "The wire", ("aerokit.mavlink", "aerokit.mavlink.pymavlink",
+         "aerokit.mavlink.pymavlink", "aerokit.mavlink.message_factory")),
     Room("protocols", "aerokit.protocols", "MAVLink's microservices without IO",
          tuple(f"aerokit.protocols.{name}" for name in (
              "exchange", "command", "parameter_list", "parameter_read", "parameter_write", "extended_parameters",
              "mission_download", "mission_upload", "missions", "ftp", "ftp_transfer", "log_list", "logs", "transfer"))),
     Room("autopilots", "aerokit.autopilots", "What differs between firmwares", ("aerokit.autopilots",)),
-    Room("geo", "aerokit.geo", "Geodesy, and the base of values",
-         ("aerokit.geo", "aerokit.snapshot", "aerokit.plain")),
-    Room("convert", "aerokit.convert", "Logs in other formats", ("aerokit.convert",)),
-    Room("flights", "aerokit.flights", "Flight logs as what was flown", ("aerokit.flights",)),
-    Room("report", "aerokit.report", "A flight as one HTML file", ("aerokit.report",)),
-    Room("foxglove", "aerokit.foxglove", "Vehicles live in Foxglove", ("aerokit.foxglove",)),
-    Room("network", "aerokit.network", "State for other machines and languages", ("aerokit.network",)),
-    Room("serve", "aerokit.serve", "A page and an API for vehicles", ("aerokit.serve",)),
-    Room("monitor", "aerokit.monitor", "Vehicles in the terminal", ("aerokit.monitor.app",)),
+    Room("geo", "aerokit._internal.geo", "Geodesy, and the base of values",
+         ("aerokit._internal.geo", "aerokit._internal.values", "aerokit._internal.values")),
+    Room("convert", "aerokit.logs.convert", "Logs in other formats", ("aerokit.logs.convert",)),
+    Room("flights", "aerokit.logs.flights", "Flight logs as what was flown", ("aerokit.logs.flights",)),
+    Room("report", "aerokit.logs.report", "A flight as one HTML file", ("aerokit.logs.report",)),
+    Room("foxglove", "aerokit.apps.foxglove", "Vehicles live in Foxglove", ("aerokit.apps.foxglove",)),
+    Room("network", "aerokit.apps.network", "State for other machines and languages", ("aerokit.apps.network",)),
+    Room("serve", "aerokit.apps.serve", "A page and an API for vehicles", ("aerokit.apps.serve",)),
+    Room("monitor", "aerokit.apps.monitor", "Vehicles in the terminal", ("aerokit.apps.monitor.app",)),
 )  # fmt: skip
 MADE = {
     "messages": "Every message of the standard dialect",
     "enums": "Every enum of the standard dialect",
     "cli": "Every option of the command line",
 }
-TITLES = {"messages": "aerokit.messages", "enums": "aerokit.enums", "cli": "aerokit.cli: the command line"}
+TITLES = {
+    "messages": "aerokit.messages",
+    "enums": "aerokit.enums",
+    "cli": "aerokit.apps.cli: the command line",
+}
 
 
 def reference_pages() -> Iterator[tuple[str, str]]:
@@ -196,9 +200,9 @@ def _item(name: str, item: type) -> str:
 def _command_line() -> str:
     import argparse
 
-    from aerokit.cli.main import make_parser
+    from aerokit.apps.cli.main import make_parser
 
-    text = ["# aerokit.cli: the command line\n"]
+    text = ["# aerokit.apps.cli: the command line\n"]
 
     def tell(parser: argparse.ArgumentParser, level: int) -> None:
         text.append(f"{'#' * level} {parser.prog}\n\n```text\n{parser.format_help().rstrip()}\n```\n")

@@ -16,8 +16,8 @@ from exhaustive import exhaustive, sampled
 from transfers_under_test import CASES, TINY, Case, leftovers, make_copter
 from verdicts import judge
 
-from aerokit.links import FaultModel
-from aerokit.protocols.transfer import PATIENCE_S
+from aerokit.protocols.exchange import PATIENCE_S
+from aerokit.testing import FaultModel
 
 SEEDS = int(os.environ.get("AEROKIT_SEEDS", "1"))
 ENOUGH = 21

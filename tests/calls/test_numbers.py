@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 import aerokit
-from aerokit.snapshot import Snapshot
+from aerokit._internal.values import Snapshot
 
 KEPT = Path(__file__).with_name("numbers.txt")
 ROOMS = ("autopilots", "links", "mavlink", "protocols", "runtime", "vehicle")

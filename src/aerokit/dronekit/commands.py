@@ -14,23 +14,21 @@ from typing import TYPE_CHECKING, Any, overload
 
 from pymavlink.dialects.v20.ardupilotmega import MAVLink_mission_item_message
 
+from aerokit._internal.values import Snapshot
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
 from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission
-from aerokit.missions.ardupilot_habits import written_out
-from aerokit.missions.commands import canonical_frame
-from aerokit.missions.item import MissionItem
-from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps, to_wire_float
-from aerokit.snapshot import Snapshot
+from aerokit.missions.item import MissionItem, canonical_frame
+from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps, to_wire_float, written_out
 from aerokit.sync.reply import reply_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.dronekit.attributes import VehicleAttributes
-    from aerokit.dronekit.line import Order
+    from aerokit.dronekit.line import BackgroundCall
     from aerokit.dronekit.values import LocationGlobal
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -139,7 +137,7 @@ class CommandSequence:
         self._uploaded: tuple[tuple[Any, ...], ...] = ()
         """What the commands said when the vehicle had them last."""
         self._downloads = 0
-        self._download: Order | None = None
+        self._download: BackgroundCall | None = None
         self._current = vehicle._dk_current_command
 
     # ------------------------------------------------------------------- from and to the vehicle

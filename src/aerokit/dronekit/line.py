@@ -13,20 +13,30 @@ import weakref
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
+from aerokit.connection.components import is_autopilot
 from aerokit.dronekit.exceptions import classic_errors
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.errors import AerokitError, CommandRejected, ConnectionClosed
-from aerokit.runtime.components import is_autopilot
+from aerokit.mavlink.messages import RcChannelsOverride
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.override_release import OverrideRelease
+    from aerokit.connection.connection import Connection
     from aerokit.mavlink.message import Message
-    from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held, LoopThread
 
-__all__ = ["Line", "Order", "Orders", "Work", "weakly"]
+__all__ = [
+    "CHANNELS_OF_MAVLINK_1",
+    "RELEASE_UPPER",
+    "BackgroundCall",
+    "BackgroundCalls",
+    "Line",
+    "OverrideRelease",
+    "Work",
+    "weakly",
+]
 
 logger: logging.Logger = logging.getLogger("dronekit.mavlink")
+
 of_vehicles: logging.Logger = logging.getLogger("dronekit")
 
 ORDERS_END_S = 2.0
@@ -59,7 +69,7 @@ class Line:
         self._held = held
         self.connection: Connection = held.value
         """The asynchronous connection, for code that runs on its loop."""
-        self.orders: Orders = Orders(loop)
+        self.calls: BackgroundCalls = BackgroundCalls(loop)
         """What was ordered without waiting."""
         self.overrides = overrides
         """The RC channels that are given back when the connection ends."""
@@ -86,7 +96,7 @@ class Line:
         message.encode()  # so that what is wrong with it is told to who made it
         with classic_errors():
             self.connection.raise_if_ended()
-            self.orders.post(self._send, message, to)
+            self.calls.post(self._send, message, to)
 
     def _send(self, message: Message, to: int | None) -> None:
         try:
@@ -107,7 +117,7 @@ class Line:
             self._is_closed.set()
         atexit.unregister(self._at_exit)
         try:
-            self.orders.wait(ORDERS_END_S)
+            self.calls.wait(ORDERS_END_S)
         finally:
             self.listener_thread.stop()
             try:
@@ -161,8 +171,8 @@ def _let_go(
         function()
 
 
-class Order(concurrent.futures.Future[None]):
-    """What was ordered: done when it has ended, with its failure."""
+class BackgroundCall(concurrent.futures.Future[None]):
+    """A call that runs on the loop while the program goes on: done when it has ended, with its failure."""
 
     def __init__(self, kind: str) -> None:
         super().__init__()
@@ -170,25 +180,26 @@ class Order(concurrent.futures.Future[None]):
         self.task: asyncio.Task[None] | None = None
 
 
-class Orders:
-    """Runs coroutine functions on the loop in the background, one of each kind at a time: a newer one replaces it.
+class BackgroundCalls:
+    """Runs coroutine functions on the loop in the background; a failure becomes one warning, too.
 
-    A failure becomes one warning, too.
+    A newer call of a kind ends the wait of the one before. What may still be sent is not decided here, but by the
+    vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter`.
     """
 
     def __init__(self, loop: LoopThread) -> None:
         self._loop = loop
-        self._newest: dict[str, Order] = {}
-        self._pending: set[Order] = set()
+        self._newest: dict[str, BackgroundCall] = {}
+        self._pending: set[BackgroundCall] = set()
         self.describe: Callable[[], str] | None = None
         """What to say of the vehicle when it has refused an order."""
 
-    def give(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> Order:
+    def give(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
         """Start it; what it sends first goes out in the order of these calls. Never blocks; from any thread.
 
         ConnectionClosed when the connection was closed.
         """
-        order = Order(kind)
+        order = BackgroundCall(kind)
         self._pending.add(order)
         order.add_done_callback(self._pending.discard)
         try:
@@ -198,7 +209,7 @@ class Orders:
             raise
         return order
 
-    def withdraw(self, order: Order) -> None:
+    def withdraw(self, order: BackgroundCall) -> None:
         """What :meth:`give` returned is not wanted any more: it is not sent again. Never blocks; from any thread."""
         with contextlib.suppress(ConnectionClosed):
             self._loop.call_soon(self._withdraw, order)
@@ -216,7 +227,7 @@ class Orders:
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
 
-    def _begin(self, order: Order, work: Work) -> None:
+    def _begin(self, order: BackgroundCall, work: Work) -> None:
         place = REPLACES.get(order.kind, order.kind)
         if place in self._newest:
             self._withdraw(self._newest[place])
@@ -226,18 +237,18 @@ class Orders:
             order.task.add_done_callback(lambda _: self._end(place, order))
             self._newest[place] = order
 
-    def _withdraw(self, order: Order) -> None:
+    def _withdraw(self, order: BackgroundCall) -> None:
         if order.task is not None and order in self._newest.values():
             order.task.cancel()
 
-    def _end(self, place: str, order: Order) -> None:
+    def _end(self, place: str, order: BackgroundCall) -> None:
         if self._newest.get(place) is order:
             del self._newest[place]
         if not order.done():  # it was cancelled before its first step, or while it waited
             why = "a newer order replaced it, it was withdrawn, or the connection was closed"
             order.set_exception(ConnectionClosed(f"{order.kind}: {why}"))
 
-    async def _run(self, order: Order, work: Work) -> None:
+    async def _run(self, order: BackgroundCall, work: Work) -> None:
         try:
             await work()
         except Exception as error:
@@ -267,3 +278,61 @@ def weakly(method: Callable[..., object]) -> Callable[..., None]:
             function(present, *args)
 
     return call
+
+
+IGNORE = 0xFFFF
+
+RELEASE = 0
+
+RELEASE_UPPER = 0xFFFE
+"""Gives a channel above 8 back to the radio; 0 leaves it alone."""
+
+CHANNELS_OF_MAVLINK_1 = 8
+
+CHANNELS = 18
+
+COPIES = 3
+"""A release is not acknowledged, so it is sent more than once: frames get lost."""
+
+
+class OverrideRelease:
+    """The channels that this connection overrides, by target, and the messages that end that.
+
+    https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
+    """
+
+    is_wanted: bool
+
+    def __init__(self) -> None:
+        self.is_wanted = True
+        self._overridden: dict[tuple[int, int], set[int]] = {}
+
+    def note_sent(self, message: Message) -> None:
+        """Take the channels of an RC_CHANNELS_OVERRIDE that was sent; other messages mean nothing."""
+        if not isinstance(message, RcChannelsOverride):
+            return
+        target = message.target_system, message.target_component
+        overridden = self._overridden.setdefault(target, set())
+        for channel in range(1, CHANNELS + 1):
+            value = getattr(message, f"chan{channel}_raw")
+            is_upper = channel > CHANNELS_OF_MAVLINK_1
+            if value == (RELEASE_UPPER if is_upper else RELEASE):
+                overridden.discard(channel)
+            elif value not in (IGNORE, RELEASE):
+                overridden.add(channel)
+
+    def send(self, connection: Connection) -> None:
+        """Give back what is overridden, if that is wanted (loop thread). Never raises."""
+        for (system, component), channels in self._overridden.items():
+            if self.is_wanted and channels:
+                values = [_released(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
+                message = RcChannelsOverride(system, component, *values)
+                with contextlib.suppress(AerokitError):  # the link is gone
+                    for _ in range(COPIES):
+                        connection.send(message)
+
+
+def _released(channel: int, is_overridden: bool) -> int:
+    if channel > CHANNELS_OF_MAVLINK_1:
+        return RELEASE_UPPER if is_overridden else 0
+    return RELEASE if is_overridden else IGNORE

@@ -6,26 +6,24 @@ from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING
 
-from aerokit.hub.border import Border
-from aerokit.hub.filters import Filters
-from aerokit.hub.identity import IdentityGuard
-from aerokit.hub.kinds import Kind
+from aerokit.connection.frame_receiver import MOST_PEERS, Peers
+from aerokit.hub.guards import Border, IdentityGuard
+from aerokit.hub.outgoing import Filters, Kind
 from aerokit.hub.port import NEVER, Port, Totals
 from aerokit.hub.values import EndpointStatistics
-from aerokit.links import ReconnectingLink, create_link
-from aerokit.runtime.peers import MOST_PEERS, Peers
+from aerokit.transport import ReconnectingLink, create_link
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.errors import LinkLost
-    from aerokit.hub.held import Held
+    from aerokit.hub.outgoing import Held
     from aerokit.hub.switch import Switch
     from aerokit.hub.values import Endpoint, HubEventKind
-    from aerokit.links.link import Link, Peer
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
+    from aerokit.transport.link import Link, Peer
 
     Tell = Callable[["Attachment", HubEventKind, str], object]
 
@@ -46,7 +44,6 @@ class Attachment:
 
     filters: Filters
     is_open: bool
-    tells_bursts: bool
     totals: Totals
 
     def __init__(
@@ -63,7 +60,7 @@ class Attachment:
             self.link = address
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
-        self.is_open = self.tells_bursts = False
+        self.is_open = False
         self._is_on_link = self._is_single = False
         self._ports: dict[Peer, Port] = {}
         self._guard = IdentityGuard(self.link, self._tell_of_peer)
@@ -186,7 +183,6 @@ class Attachment:
     def _come_up(self) -> None:
         self.is_open = True
         self._is_single = self.link.has_peer(None)
-        self.tells_bursts = self.link.tells_bursts
         if self._is_single and None not in self._ports:
             self._add_port(None)
 
@@ -200,14 +196,16 @@ class Attachment:
             self.link,
             peer,
             self.totals,
+            endpoint=self.name,
             dialect=self._dialect,
             hold_above=self._hold_above(),
+            period=self.filters.period,
+            report=partial(self._tell, self),
             tell=self._dropped,
             border=self._border,
             guard=None if self._is_single else self._guard,
             is_mute=self.endpoint.read_only,
         )
-        port.owner = self
         self._guard.is_shared = len(self._ports) > 1
         self._switch.add(port)
         return port

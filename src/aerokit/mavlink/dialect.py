@@ -10,18 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import IntFlag
 from functools import partial
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import enums, messages
 from aerokit.mavlink.enumeration import make_enum
+from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:
-    from pathlib import Path
-    from types import ModuleType
-
     from aerokit.mavlink.frame import Frame
-    from aerokit.mavlink.message import Message
 
 __all__ = ["STANDARD", "Dialect"]
 
@@ -58,9 +57,9 @@ class Dialect:
 
         Raises InvalidArgument when a file is missing or wrong, or an id is defined twice.
         """
-        from aerokit.mavlink.runtime_dialect import dialect_from_xml
+        from aerokit.mavlink.runtime_dialect import read_xml_dialect
 
-        return dialect_from_xml(path)
+        return Dialect(*read_xml_dialect(Path(path), STANDARD))
 
     @classmethod
     def from_pymavlink(cls, module: str | ModuleType) -> Dialect:
@@ -68,9 +67,9 @@ class Dialect:
 
         Raises InvalidArgument when there is no such module or it is no dialect.
         """
-        from aerokit.mavlink.runtime_dialect import dialect_from_pymavlink
+        from aerokit.mavlink.runtime_dialect import read_pymavlink_dialect
 
-        return dialect_from_pymavlink(module)
+        return Dialect(*read_pymavlink_dialect(module, STANDARD))
 
     def __getitem__(self, message_id: int) -> type[Message]:
         """The class of a message id; KeyError when the dialect has none."""

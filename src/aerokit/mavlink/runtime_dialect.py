@@ -1,4 +1,7 @@
-"""Dialects that are not committed: read from XML or from a pymavlink module, compiled to the same kind of classes."""
+"""Dialects that are not committed: read from XML or from a pymavlink module, and compiled to classes.
+
+Imported only when a program reads one: the reader of the XML and the renderer of the sources come with it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from struct import Struct
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import message as message_module
@@ -21,25 +24,34 @@ from aerokit.mavlink.definitions import (
     merged_enums,
     read_dialect,
 )
-from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.enumeration import make_enum
 from aerokit.mavlink.generator import xml_folder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.rendering import render_message
 
-__all__ = ["class_from_pymavlink", "compile_message", "dialect_from_pymavlink", "dialect_from_xml"]
+__all__ = ["Read", "class_from_pymavlink", "compile_message", "read_pymavlink_dialect", "read_xml_dialect"]
+
+Read = tuple[str, list[type[Message]], dict[str, type[Any]]]
+"""Name, classes, and enums by the standard's spelling."""
 
 
-def dialect_from_xml(path: str | Path) -> Dialect:
-    """See `Dialect.from_xml`."""
-    path = Path(path)
+class Standard(Protocol):
+    """The committed messages, of which those that say the same are taken."""
+
+    rows: dict[int, tuple[int, int, int]]
+
+    def __getitem__(self, message_id: int, /) -> type[Message]: ...
+
+
+def read_xml_dialect(path: Path, standard: Standard) -> Read:
+    """Name, classes and enums of an XML file and of all that it includes; see `Dialect.from_xml`."""
     dialects = read_dialect(path, [xml_folder()])
     definitions = [message for dialect in dialects for message in dialect.messages]
-    return _dialect(path.stem, definitions, merged_enums(dialects))
+    return _read(path.stem, definitions, merged_enums(dialects), standard)
 
 
-def dialect_from_pymavlink(module: str | ModuleType) -> Dialect:
-    """See `Dialect.from_pymavlink`."""
+def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Read:
+    """Name, classes and enums of a dialect of pymavlink; see `Dialect.from_pymavlink`."""
     if isinstance(module, str):
         module = _import(module)
     known: dict[int, Any] | None = getattr(module, "mavlink_map", None)
@@ -47,16 +59,17 @@ def dialect_from_pymavlink(module: str | ModuleType) -> Dialect:
         raise InvalidArgument(f"{module.__name__} is no pymavlink dialect: it has no mavlink_map")
     definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
-    return _dialect(module.__name__.rpartition(".")[2], definitions, [enum for enum in enums if enum.entries])
+    name = module.__name__.rpartition(".")[2]
+    return _read(name, definitions, [enum for enum in enums if enum.entries], standard)
 
 
-def class_from_pymavlink(message_class: Any) -> type[Message]:
+def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message]:
     """The class for one of pymavlink's message classes: the committed one, if that says the same about the bytes.
 
     Raises InvalidArgument when pymavlink's class does not agree with its own CRC_EXTRA.
     """
     definition = _message(message_class)
-    return _standard_class(definition) or compile_message(definition)
+    return _standard_class(definition, standard) or compile_message(definition)
 
 
 def compile_message(definition: MessageDefinition) -> type[Message]:
@@ -78,7 +91,9 @@ def compile_message(definition: MessageDefinition) -> type[Message]:
     return message_class
 
 
-def _dialect(name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition]) -> Dialect:
+def _read(
+    name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
+) -> Read:
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
         other = by_id.setdefault(definition.id, definition)
@@ -87,8 +102,10 @@ def _dialect(name: str, definitions: Iterable[MessageDefinition], enums: Iterabl
                 f"message id {definition.id} is defined twice in {name}: {other.name} in {other.origin},"
                 f" {definition.name} in {definition.origin}"
             )
-    classes = [_standard_class(definition) or compile_message(definition) for definition in by_id.values()]
-    return Dialect(name, classes, {enum.name: _enum_type(name, enum) for enum in enums})
+    classes = [
+        _standard_class(definition, standard) or compile_message(definition) for definition in by_id.values()
+    ]
+    return name, classes, {enum.name: _enum_type(name, enum) for enum in enums}
 
 
 def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
@@ -106,20 +123,18 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
         raise InvalidArgument(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
 
 
-def _standard_class(definition: MessageDefinition) -> type[Message] | None:
+def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
     """The committed class, when it says the same about the bytes, or knows more extension fields behind them."""
-    row = STANDARD.rows.get(definition.id)
+    row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
-    standard = STANDARD[definition.id]
+    committed = standard[definition.id]
     fields = [(f.attribute, f.type, f.array_length) for f in definition.fields]
-    known = [(f.name, f.type, f.array_length) for f in standard.FIELDS[: len(fields)]]
-    return standard if definition.name == standard.NAME and known == fields else None
+    known = [(f.name, f.type, f.array_length) for f in committed.FIELDS[: len(fields)]]
+    return committed if definition.name == committed.NAME and known == fields else None
 
 
 # -------------------------------------------------------------------------------- pymavlink modules
-
-
 def _import(name: str) -> ModuleType:
     candidates = [name] if "." in name else [f"pymavlink.dialects.v20.{name}", name]
     for candidate in candidates:

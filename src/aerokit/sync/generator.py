@@ -23,37 +23,139 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.sync.originals import TWINS, Member, Twin, decorators_of, function_node, imports_of, members_of
-from aerokit.sync.source_text import (
-    WIDTH,
-    arguments_of,
-    call,
-    docstring,
-    forwarded,
-    function,
-    optional,
-    outer,
-)
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-__all__ = ["FILE", "FILES", "generate"]
+__all__ = [
+    "FILE",
+    "FILES",
+    "WIDTH",
+    "arguments_of",
+    "call",
+    "docstring",
+    "forwarded",
+    "function",
+    "generate",
+    "optional",
+    "outer",
+]
+
+WIDTH = 110
+"""Of a line; what is written is as `ruff format` would have it."""
+
+
+def outer(annotation: ast.expr | None) -> str:
+    """The name in an annotation, without what is in brackets behind it."""
+    while isinstance(annotation, ast.Subscript):
+        annotation = annotation.value
+    return annotation.id if isinstance(annotation, ast.Name) else ""
+
+
+def optional(annotation: ast.expr | None) -> ast.expr | None:
+    """What is in front of ``| None``, if that is how the annotation ends."""
+    if isinstance(annotation, ast.BinOp) and isinstance(annotation.op, ast.BitOr):
+        last = annotation.right
+        return annotation.left if isinstance(last, ast.Constant) and last.value is None else None
+    return None
+
+
+def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    """The arguments as they are handed on, without ``self``."""
+    positional = [each.arg for each in (*node.args.posonlyargs, *node.args.args)]
+    positional = [each for each in positional if each != "self"]
+    star = [f"*{node.args.vararg.arg}"] if node.args.vararg else []
+    rest = [f"**{node.args.kwarg.arg}"] if node.args.kwarg else []
+    return positional + star + [f"{each.arg}={each.arg}" for each in node.args.kwonlyargs] + rest
+
+
+def source(node: ast.expr) -> str:
+    """An expression as it is written, with double quotes."""
+    text = ast.unparse(node)
+    return text if '"' in text else text.replace("'", '"')
+
+
+def call(function: str, arguments: Sequence[str], indent: str = "        ") -> str:
+    """A call, one argument a line where it would be too long."""
+    line = f"{function}({', '.join(arguments)})"
+    if len(indent) + len(line) < WIDTH:  # a comma may follow
+        return line
+    return f"{function}(\n" + "".join(f"{indent}    {each},\n" for each in arguments) + f"{indent})"
+
+
+def function(
+    node: ast.FunctionDef | ast.AsyncFunctionDef, returns: ast.expr | None, text: str | None, body: str
+) -> str:
+    """A method whose body is one statement."""
+    gives = "" if returns is None else f" -> {source(returns)}"
+    line = f"    def {node.name}({', '.join(arguments_of(node.args))}){gives}:\n"
+    if len(line) > WIDTH + 1:
+        line = f"    def {node.name}(\n"
+        line += _lines(arguments_of(node.args), "        ") + f"    ){gives}:\n"
+    return f"{line}{docstring(text)}        {body}\n"
+
+
+def arguments_of(arguments: ast.arguments) -> list[str]:
+    """Each as it is written, with its default."""
+    positional = [*arguments.posonlyargs, *arguments.args]
+    lacking: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
+    found = [_argument(*each) for each in zip(positional, [*lacking, *arguments.defaults])]  # noqa: B905
+    if arguments.vararg is not None:
+        found.append("*" + _argument(arguments.vararg, None))
+    elif arguments.kwonlyargs:
+        found.append("*")
+    found += [_argument(*each) for each in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
+    return found + (["**" + _argument(arguments.kwarg, None)] if arguments.kwarg else [])
+
+
+def _lines(arguments: Iterable[str], indent: str) -> str:
+    """One argument a line; what is too long for one continues before its ``| None``."""
+    lines = ""
+    for each in arguments:
+        if len(indent) + len(each) + 1 > WIDTH:
+            head, none, tail = each.rpartition(" | None")
+            each = f"{head}\n{indent}{none.lstrip()}{tail}"
+        lines += f"{indent}{each},\n"
+    return lines
+
+
+def _argument(each: ast.arg, default: ast.expr | None) -> str:
+    kind = "" if each.annotation is None else f": {source(each.annotation)}"
+    value = "" if default is None else f"{' = ' if kind else '='}{source(default)}"
+    return f"{each.arg}{kind}{value}"
+
+
+def docstring(text: str | None, indent: str = "        ") -> str:
+    """As it stands in the source; nothing for none."""
+    if not text:
+        return ""
+    lines = text.splitlines()
+    if len(lines) == 1:
+        return f'{indent}"""{lines[0]}"""\n'
+    body = "".join(f"{indent}{line}\n" if line else "\n" for line in lines[1:])
+    return f'{indent}"""{lines[0]}\n{body}{indent}"""\n'
+
 
 FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fleet_twins")}
 """What is written: page → file."""
+
 FILE = FILES["twins"]
 """The first of them."""
+
 OF_ONE = ("TwinOf", "BlockTwin", "SelectionTwin")
 """Bases that are told whose twin it is."""
+
 FUNCTIONS: dict[str, tuple[str, ...]] = {
-    "twins": ("aerokit.runtime.opening.open_connection", "aerokit.vehicle.connect.connect"),
+    "twins": ("aerokit.connection.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
 }
 """Blocks that are opened by a function, by pages."""
+
 BLOCKS = {"SelectionTwin": "fleet_blocks", "FleetTwin": "fleet_blocks"}
 """Where bases are that are not in ``blocks.py``."""
 
 HEAD = '''# Generated by aerokit.sync.generator from the asynchronous classes: do not edit.
+# ruff: noqa: B008, F401, RUF100 - defaults are those of the originals; bases are named in texts
 # pyright: reportIncompatibleMethodOverride=false
 """The classes of :mod:`aerokit.sync`: methods, arguments, errors and documentation of the asynchronous ones.
 
@@ -70,8 +172,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 
 # --------------------------------------------------------------------------------------- writing
-
-
 @dataclass
 class Page:
     """What is written, and what it has to import."""
@@ -81,6 +181,7 @@ class Page:
     for_types: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
+        self._homes: dict[str, tuple[str, str]] = {}
         self._twins = {each.name for each in TWINS}
         self._elsewhere = {each.name: each.page for each in TWINS if each.page != self.name}
 
@@ -100,6 +201,7 @@ class Page:
         if name in self._twins or name in TYPE_VARIABLES or hasattr(builtins, name):
             return
         where = next((found[name] for found in map(imports_of, modules) if name in found), (modules[0], name))
+        where = self._homes.setdefault(where[1] or name, where)  # a name may be exported by two modules
         (self.at_run_time if at_run_time else self.for_types).add(where)
 
     def returned(self, expression: str, returns: ast.expr | None) -> str:
@@ -133,12 +235,16 @@ class Page:
                 else f"return self._block({block})"
             )
             return function(node, kind, member.text, body)
-        called = f"self.aio.{name}({', '.join(arguments)})"
+        called = f"self.aio.{name}"
         if name not in twin.direct:
             run = "run" if isinstance(node, ast.AsyncFunctionDef) else "call"
-            called = call(f"self._loop.{run}", [f"self.aio.{name}", *arguments])
-        is_none = isinstance(node.returns, ast.Constant) and node.returns.value is None
-        body = called if is_none else f"return {self.returned(called, node.returns)}"
+            called, arguments = f"self._loop.{run}", [called, *arguments]
+        if outer(node.returns) in self._twins:
+            made = call(called, arguments, "            ")
+            body = call(f"return {outer(node.returns)}", ["self._loop", made])
+        else:
+            is_none = isinstance(node.returns, ast.Constant) and node.returns.value is None
+            body = call(called if is_none else f"return {called}", arguments)
         return function(node, node.returns, member.text, body)
 
     def _value(self, twin: Twin, member: Member) -> str:
@@ -151,7 +257,7 @@ class Page:
         decorator = "property" if wrapped == read or name in twin.parts else "cached_property"
         if member.returns is None:
             raise ValueError(f"the type of {twin.name}.{name} is not annotated")
-        kind = ast.unparse(member.returns)
+        kind = source(member.returns)
         return f"    @{decorator}\n    def {name}(self) -> {kind}:\n{docstring(member.text)}        return {wrapped}\n"
 
 
@@ -164,8 +270,6 @@ TYPE_VARIABLES = {
 
 
 # --------------------------------------------------------------------------------------- the page
-
-
 def generate(name: str = "twins") -> str:
     """The text of ``sync/twins.py``, or of another page."""
     page, twins = Page(name), [each for each in TWINS if each.page == name]
@@ -178,12 +282,12 @@ def generate(name: str = "twins") -> str:
         if name == "twins"
         else ("aerokit.sync.fleet_blocks", "opened_fleet")
     )
-    page.at_run_time |= {opener, ("aerokit.arguments", "checked")}
+    page.at_run_time |= {opener, ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
         (each.module, f"{each.name} as Async{each.name}") for each in twins if each.base in OF_ONE
     }
     variables = TYPE_VARIABLES if name == "twins" else {}
-    page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.runtime.events", "Event")}
+    page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
     for path in FUNCTIONS[name]:
         module, _, name = path.rpartition(".")
         page.at_run_time.add((module, f"{name} as {name}_async"))
@@ -201,13 +305,14 @@ def generate(name: str = "twins") -> str:
 
 def _class(page: Page, twin: Twin) -> str:
     original = getattr(importlib.import_module(twin.module), twin.name)
-    parameter = f"[{twin.parameter}]" if twin.parameter else ""
-    base = twin.base + parameter
+    base = f"{twin.base}[{twin.parameter}]" if twin.parameter else twin.base
     if base in OF_ONE:
         base += f'["Async{twin.name}"]'
+    if twin.inherits:
+        base += f", {twin.inherits}"
     text = docstring(inspect.getdoc(original), "    ")
     members = "\n".join(page.member(twin, each) for each in members_of(twin))
-    return f"class {twin.name}({base}):\n{text}\n{members}"
+    return "\n".join([f"class {twin.name}({base}):\n{text}", *([members] if members else [])])
 
 
 def _opener(page: Page, path: str) -> str:
@@ -219,7 +324,7 @@ def _opener(page: Page, path: str) -> str:
         page.need(default, (module,), at_run_time=True)
     assert isinstance(node.returns, ast.Subscript)
     kind = ast.unparse(node.returns.slice)
-    lines = "".join(f"    {each},\n" for each in arguments_of(node.args))
+    lines = _lines(arguments_of(node.args), "    ")
     given = "".join(f"        {each.lstrip('*')},\n" for each in forwarded(node))
     opens = "opened" if page.name == "twins" else "opened_fleet"
     text = ast.get_docstring(node) or ""
@@ -233,20 +338,30 @@ def _opener(page: Page, path: str) -> str:
 
 
 def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
-    lines = ""
-    for module in sorted(
-        {module for module, _ in names}, key=lambda name: (name.startswith("aerokit"), name)
-    ):
-        found = sorted(name for other, name in names if other == module)
-        if "" in found:
-            lines += f"{indent}import {module}\n"
-        found = [name for name in found if name]
-        line = f"{indent}from {module} import {', '.join(found)}\n"
-        if len(line) > WIDTH:
-            line = f"{indent}from {module} import (\n" + "".join(f"{indent}    {name},\n" for name in found)
-            line += f"{indent})\n"
-        lines += line if found else ""
-    return lines
+    """Sorted as ruff does: ours behind the standard library's, ``import x`` first, constants before classes."""
+    parts: list[str] = []
+    for is_ours in (False, True):
+        modules = {module for module, _ in names if module.startswith("aerokit") == is_ours}
+        plain = [f"{indent}import {module}\n" for module in sorted(modules) if (module, "") in names]
+        parts.append("".join([*plain, *(_from_lines(module, names, indent) for module in sorted(modules))]))
+    return "\n".join(part for part in parts if part)
+
+
+def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
+    found = sorted((name for other, name in names if other == module and name), key=_by_kind)
+    joined = [name for name in found if " as " not in name]
+    lines = {name: f"{indent}from {module} import {name}\n" for name in found if name not in joined}
+    if joined:
+        line = f"{indent}from {module} import {', '.join(joined)}\n"
+        if len(line) > WIDTH + 1:
+            line = f"{indent}from {module} import (\n{_lines(joined, indent + '    ')}{indent})\n"
+        lines[joined[0]] = line
+    return "".join(lines[name] for name in sorted(lines, key=_by_kind))
+
+
+def _by_kind(name: str) -> tuple[bool, bool, str]:
+    """Constants, classes, others; each by the alphabet."""
+    return not name.isupper(), name[0].islower(), name.lower()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

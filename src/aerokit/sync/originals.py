@@ -21,15 +21,18 @@ __all__ = ["TWINS", "Member", "Twin", "decorators_of", "function_node", "imports
 class Twin:
     """One class to be made: ``base`` is what is written by hand for it, in ``blocks.py``.
 
-    ``only``: these members alone; ``without``: all but these. ``direct``: methods that only read, and are called on
-    the thread of the program; ``called``: properties that are read on the loop; ``parts``: those that are made
-    there when they are first read. ``page``: the file that it is written to.
+    ``inherits``: the twin of a base of the original, which has that one's members. ``only``: these members alone;
+    ``without``: all but these; ``special``: of methods like ``__getitem__``, these too. ``direct``: methods that only
+    read, and are called on the thread of the program; ``called``: properties that are read on the loop; ``parts``:
+    those that are made there when they are first read. ``page``: the file that it is written to.
     """
 
     path: str
     base: str = "TwinOf"
+    inherits: str = ""
     only: frozenset[str] = frozenset()
     without: frozenset[str] = frozenset()
+    special: frozenset[str] = frozenset()
     direct: frozenset[str] = frozenset()
     called: frozenset[str] = frozenset()
     parts: frozenset[str] = frozenset()
@@ -53,39 +56,39 @@ def _names(text: str) -> frozenset[str]:
 
 TWINS = (
     Twin(
-        "aerokit.runtime.cells.StateCell",
+        "aerokit.connection.cells.StateCell",
         "CellTwin",
         without=_names("observe set forget close"),
         direct=_names("fresh"),
         parameter="T",
     ),
-    Twin("aerokit.runtime.cells.Changes", "ChangesTwin", parameter="T"),
-    Twin("aerokit.runtime.subscription.Subscription", "SubscriptionTwin", parameter="ItemT"),
+    Twin("aerokit.connection.cells.Changes", "ChangesTwin", parameter="T"),
+    Twin("aerokit.connection.bus.Subscription", "SubscriptionTwin", parameter="ItemT"),
     Twin(
-        "aerokit.runtime.connection.Connection",
+        "aerokit.connection.connection.Connection",
         "ConnectionTwin",
         only=_names("send subscribe link_state links signing unsent_bytes discard_unsent is_open now counts"),
         direct=_names("now"),
         called=_names("unsent_bytes"),
     ),
-    Twin("aerokit.vehicle.orders.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
-    Twin("aerokit.vehicle.orders.guided.Guided"),
+    Twin("aerokit.vehicle.commanding.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
+    Twin("aerokit.vehicle.commanding.guided.Guided"),
     Twin("aerokit.vehicle.gimbal.control.GimbalControl", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),
-    Twin("aerokit.vehicle.gimbal.gimbals.Gimbals", "GimbalsTwin", called=_names("ids")),
-    Twin("aerokit.vehicle.orders.posting.PostedOrder"),
+    Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids"), parameter='"Gimbal"'),
+    Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.logs.Logs"),
     Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
-    Twin("aerokit.vehicle.plans.mission.MissionControl"),
-    Twin("aerokit.vehicle.plans.fence.FenceControl"),
-    Twin("aerokit.vehicle.plans.rally.RallyControl"),
+    Twin("aerokit.vehicle.missions.mission.MissionControl"),
+    Twin("aerokit.vehicle.missions.plans.FenceControl"),
+    Twin("aerokit.vehicle.missions.plans.RallyControl"),
     Twin("aerokit.vehicle.camera.part.CameraBlock", "BlockTwin"),
     Twin("aerokit.vehicle.camera.shooting.PhotoInterval", "PhotoIntervalTwin"),
-    Twin("aerokit.vehicle.camera.camera.Camera"),
+    Twin("aerokit.vehicle.camera.cameras.Camera"),
     Twin("aerokit.vehicle.components.settings.Settings", direct=_names("known")),
     Twin("aerokit.vehicle.components.component.Component", called=_names("files parameters settings")),
     Twin(
@@ -97,11 +100,16 @@ TWINS = (
             "camera cameras components guided gimbal gimbals files logs parameters mission fence rally"
         ),
     ),
-    Twin("aerokit.fleets.following.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
+    Twin("aerokit.fleets.formations.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
     Twin(
-        "aerokit.fleets.selection.Selection", "SelectionTwin", without=_names("vehicles"), page="fleet_twins"
+        "aerokit.fleets.fleet.Selection",
+        "SelectionTwin",
+        without=_names("vehicles"),
+        special=_names("__getitem__"),
+        direct=_names("__getitem__"),
+        page="fleet_twins",
     ),
-    Twin("aerokit.fleets.fleet.Fleet", "FleetTwin", without=_names("vehicles"), page="fleet_twins"),
+    Twin("aerokit.fleets.fleet.Fleet", "FleetTwin", inherits="Selection", page="fleet_twins"),
 )
 """The classes that programs without ``async`` use, each below those that it gives."""
 
@@ -153,14 +161,20 @@ class Member:
 
 def members_of(twin: Twin) -> list[Member]:
     """Those of the class and of what it inherits, each once, in the order of the oldest definition."""
-    cls = getattr(importlib.import_module(twin.module), twin.name)
+    cls = _class_of(twin)
+    inherited = next((_class_of(each).__mro__ for each in TWINS if each.name == twin.inherits), ())
     found: dict[str, Member] = {}
     filled = _filled(cls)
     for each in reversed(cls.__mro__):
-        if each.__module__.startswith("aerokit."):
+        if each.__module__.startswith("aerokit.") and each not in inherited:
             found |= {member.name: filled(member) for member in _own(each)}
-    wanted = twin.only or frozenset(found)
+    wanted = twin.only or {name for name in found if not name.startswith("_")} | twin.special
     return [each for name, each in found.items() if name in wanted and name not in twin.without]
+
+
+def _class_of(twin: Twin) -> type:
+    original: type = getattr(importlib.import_module(twin.module), twin.name)
+    return original
 
 
 def _filled(cls: type) -> Callable[[Member], Member]:
@@ -190,7 +204,7 @@ def _own(cls: type) -> Iterator[Member]:
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             if node.name == "__init__" and isinstance(node, ast.FunctionDef):
                 yield from _attributes(node, (cls.__module__,))
-            elif not node.name.startswith("_") and not _is_setter(node):
+            elif not _is_setter(node):
                 yield Member(node.name, (cls.__module__,), node, node.returns, ast.get_docstring(node))
         elif isinstance(node, ast.AnnAssign) and _is_told(node.annotation):
             assert isinstance(node.target, ast.Name)

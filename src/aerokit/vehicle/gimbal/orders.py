@@ -7,36 +7,43 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from aerokit._internal.wording import shown
 from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.messages import GimbalManagerInformation, MountConfigure, MountControl
-from aerokit.wording import shown
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.gimbal.claims import Claims
-    from aerokit.vehicle.gimbal.device import Device
-    from aerokit.vehicle.gimbal.hearing import Hearing
-    from aerokit.vehicle.orders.bridge import Bridge
-    from aerokit.vehicle.orders.newest import Turn
-    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.order import Order
+    from aerokit.vehicle.gimbal.device import Claims, Device, GimbalControllers
+    from aerokit.vehicle.gimbal.discovery import Hearing
+    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.state.equipment import GimbalAttitude
 
-__all__ = ["CONFIGURE", "LEVEL", "LOCKED", "NAN", "PITCHYAW", "GimbalOrders"]
+__all__ = ["CONFIGURE", "LEVEL", "LOCKED", "NAN", "PITCHYAW", "GimbalOrders", "GimbalPart"]
 
 NAN = math.nan
 
 PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE
+
 MOUNT = MavCmd.DO_MOUNT_CONTROL
+
 LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
 """Roll and pitch from the horizon, yaw from the vehicle's nose."""
+
 LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
 """Yaw from north."""
+
 RELEASE, UNCHANGED = -3, -1
+
 FOUND_S = 1.0
 """How long what was promised may take to come."""
+
 BY_THE_STANDARD = GimbalRules()
 
 
@@ -119,10 +126,10 @@ class GimbalOrders:
 
     # ----------------------------------------------------------------------------- sending
 
-    async def give(self, turn: Turn, command: int, *params: float, is_sent: bool = False) -> None:
-        """One command to the manager, of an order."""
-        with turn.order() as order:
-            await self.bridge.orders.give(
+    async def give(self, turn: Order | None, command: int, *params: float, is_sent: bool = False) -> None:
+        """One command to the manager, of an order, or on its own."""
+        with self.bridge.arbiter.aside(turn) as order:
+            await self.bridge.sender.give(
                 order,
                 self.talk.commands.send_long,
                 command,
@@ -131,9 +138,9 @@ class GimbalOrders:
                 is_sent=is_sent,
             )
 
-    def begin(self) -> Turn:
+    def begin(self) -> Order:
         """A new order: those before end."""
-        return self.device.newest.begin()
+        return self.bridge.arbiter.of_device(self.device.topic)
 
     async def insist(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command, and claim control if that is denied, now or to somebody who did not wait for the answer."""
@@ -147,7 +154,7 @@ class GimbalOrders:
                 raise
             await send()
 
-    async def manage(self, turn: Turn, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
+    async def manage(self, turn: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
         """PITCHYAW, in degrees; False for a manager that does not know it. Control is claimed if that is denied."""
         if self.talk.commands.is_unknown(PITCHYAW, self.manager_id):
             return False
@@ -161,13 +168,13 @@ class GimbalOrders:
             return False
         return True
 
-    async def look(self, turn: Turn, command: int, *params: float, **place: Any) -> None:
+    async def look(self, turn: Order, command: int, *params: float, **place: Any) -> None:
         """A command about a region of interest, as COMMAND_INT if it has a place."""
 
         async def send() -> None:
-            with turn.order() as order:
+            with self.bridge.arbiter.aside(turn) as order:
                 commands = self.talk.commands
-                await self.bridge.orders.give(
+                await self.bridge.sender.give(
                     order,
                     commands.send_int if place else commands.send_long,
                     command,
@@ -181,7 +188,7 @@ class GimbalOrders:
         else:
             await send()
 
-    async def mount(self, turn: Turn, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
+    async def mount(self, turn: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
         """DO_MOUNT_CONTROL; False for firmware that is older, and was told the mode by a message without an answer."""
         if not self.talk.commands.is_unknown(MOUNT, self.manager_id):
             try:
@@ -196,7 +203,7 @@ class GimbalOrders:
         self.talk.send(MountConfigure(self.talk.system_id, self.manager_id, mode, 1, 1, 1))
         return False
 
-    async def mount_to(self, turn: Turn, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
+    async def mount_to(self, turn: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
         """The mount's angles, whose yaw is from the nose: right at the moment of the order."""
         heading = self.talk.telemetry.attitude.latest
         nose = 0.0 if heading is None else heading.yaw_deg
@@ -279,7 +286,7 @@ class GimbalOrders:
         self._claimed = manager_id
         return True
 
-    async def let_go(self, turn: Turn) -> None:
+    async def let_go(self, turn: Order) -> None:
         """What was claimed without a block."""
         if self._claimed == self.manager_id:
             self._claimed = None
@@ -306,3 +313,25 @@ class GimbalOrders:
         autopilot = self.talk.autopilot
         who = autopilot.firmware if self.manager_id == self.talk.component_id else shown(self.manager_id)
         raise NotSupported(f"{self.name}: {who} {what}; nothing was sent")
+
+
+class GimbalPart:
+    """A part of :class:`Gimbal`: its state, and some of its orders."""
+
+    def __init__(self, bridge: Bridge, hearing: Hearing, device: Device | None) -> None:
+        self._orders = GimbalOrders(bridge, hearing, device)
+        self._bridge, self._talk = bridge, bridge.talk
+        shown = self._orders.shown
+        self.attitude: StateCell[GimbalAttitude] = shown.attitude
+        """Where it points (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION,
+        MOUNT_STATUS). The autopilot is asked for it while somebody waits, follows or observes; reading asks nothing."""
+        self.controllers: StateCell[GimbalControllers] = shown.controllers
+        """Who is in control of it, as its manager tells by itself (GIMBAL_MANAGER_STATUS)."""
+
+    @property
+    def device_id(self) -> int:
+        """Its gimbal device id: 1 to 6 behind its manager, or its component id; 0 while none is heard of."""
+        return self._orders.device.device_id
+
+    def _now(self) -> float:
+        return self._talk.connection.now()
