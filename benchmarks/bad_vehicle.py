@@ -16,9 +16,10 @@ from pathlib import Path
 
 from content import DOWNLOAD_PATH, PARAMETERS, UPLOAD_PATH, as_numbers, file_content, mission_items
 
-from aerokit.links import FaultModel, FaultyLink, create_link
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedCopter, SimulatorServer
+from aerokit.testing import FaultModel, FaultyLink
+from aerokit.transport import create_link
 
 __all__ = ["main"]
 

@@ -26,9 +26,9 @@ from table import Row, row
 
 import aerokit
 from aerokit import messages
+from aerokit.connection.connection import Connection
 from aerokit.mavlink import STANDARD, Frame, Message
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.runtime.connection import Connection
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 from aerokit.vehicle.vehicle import Vehicle
 

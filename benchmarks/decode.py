@@ -21,8 +21,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega
 
 from aerokit.mavlink import STANDARD, Framer, Message, read_tlog
-from aerokit.mavlink.checksum import x25
-from aerokit.mavlink.frame import MAGIC_V2
+from aerokit.mavlink.frame import MAGIC_V2, x25
 
 ROOT = Path(__file__).resolve().parent.parent
 _FOLDERS = {"": ROOT.parent / "shared" / "traces", "_short": ROOT / "tests" / "recordings"}

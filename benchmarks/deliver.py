@@ -26,8 +26,8 @@ from pymavlink import mavutil
 from table import Row, row
 
 import aerokit
-from aerokit.links.base import BaseLink
 from aerokit.mavlink import STANDARD, Frame
+from aerokit.transport.link import BaseLink
 
 __all__ = ["FedLink", "rows"]
 

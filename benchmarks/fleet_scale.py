@@ -24,8 +24,8 @@ from typing import Any
 from scale import RATES, _hovering
 
 import aerokit
-from aerokit.links import create_link
 from aerokit.sim import SimulatorServer
+from aerokit.transport import create_link
 
 FIRST_PORT = 14700
 LATE_S = 0.1

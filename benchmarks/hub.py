@@ -34,10 +34,9 @@ import table
 from table import Row, row
 
 from aerokit.hub.targets import Targets
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.frame import MAGIC_V2, Frame
+from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
 from aerokit.mavlink.messages import Heartbeat, SystemTime
 from aerokit.mavlink.tlog import read_tlog
 

@@ -28,13 +28,13 @@ from table import Row, row
 
 import aerokit
 from aerokit import messages
-from aerokit.links import memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
 from aerokit.missions import Mission, land, take_off, waypoint
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport import memory_link_pair
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 
 NAMES = ("copter_hundred", "px4_hundred", "copter_flight", "px4_flight", "clients")

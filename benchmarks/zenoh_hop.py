@@ -23,13 +23,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from aerokit.errors import LinkLost
-from aerokit.links import Peer, create_link
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Ping
+from aerokit.transport import Peer, create_link
 
 ECHO = """
 import asyncio, sys
-from aerokit.links import create_link
+from aerokit.transport import create_link
 
 class Echo:
     def __init__(self, link): self.link = link

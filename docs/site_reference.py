@@ -26,64 +26,66 @@ class Room:
 ROOMS = (
     Room("aerokit", "aerokit", "Connecting, and what a program says", ("aerokit",)),
     Room("vehicle", "aerokit.vehicle: Vehicle", "State, actions, and the way to its parts",
-         (f"{VEHICLE}.vehicle", f"{VEHICLE}.vehicles", f"{VEHICLE}.overview")),
+         (f"{VEHICLE}.vehicle", f"{VEHICLE}.connect")),
     Room("fleets", "aerokit.fleets: Fleet", "Many vehicles as one",
          tuple(f"aerokit.fleets.{name}" for name in (
-             "fleet", "selection", "members", "results", "policy", "events", "formation", "following", "apart", "paths",
-             "show", "show_report", "clocks"))),
+             "fleet", "members", "policy", "events", "formation", "formations", "separation", "paths", "shows.show",
+             "shows.clocks"))),
     Room("cells", "Cells and subscriptions", "Values with their age; messages and events as they come",
-         ("aerokit.runtime.cells", "aerokit.runtime.subscription")),
+         ("aerokit.connection.cells", "aerokit.connection.bus")),
     Room("state", "Values of the state", "What cells hold",
          (f"{VEHICLE}.state.movement", f"{VEHICLE}.state.condition", f"{VEHICLE}.state.equipment",
-          f"{VEHICLE}.state.gimbal", f"{VEHICLE}.state.status_text", f"{VEHICLE}.components.status")),
+          f"{VEHICLE}.state.status_text")),
     Room("guided", "Set-point streams, posted orders", "`vehicle.guided`, `vehicle.posted`",
-         (f"{VEHICLE}.orders.guided", f"{VEHICLE}.orders.setpoints", f"{VEHICLE}.orders.posted")),
+         (f"{VEHICLE}.commanding.guided", f"{VEHICLE}.commanding.setpoints", f"{VEHICLE}.commanding.posted")),
     Room("missions", "Missions, fences, rally points", "`vehicle.mission`, `.fence`, `.rally`, and `aerokit.missions`",
-         (f"{VEHICLE}.plans.mission", f"{VEHICLE}.plans.fence", f"{VEHICLE}.plans.rally", "aerokit.missions")),
+         (f"{VEHICLE}.missions.mission", f"{VEHICLE}.missions.plans", "aerokit.missions")),
     Room("parameters", "Parameters", "`vehicle.parameters`, and `aerokit.parameters`",
-         (f"{VEHICLE}.parameters.parameters", f"{VEHICLE}.parameters.results", f"{VEHICLE}.parameters.transaction",
+         (f"{VEHICLE}.parameters.parameters", f"{VEHICLE}.parameters.writing", f"{VEHICLE}.parameters.transaction",
           "aerokit.parameters")),
     Room("files", "Files and logs", "`vehicle.files`, `vehicle.logs`",
-         (f"{VEHICLE}.files.files", f"{VEHICLE}.files.logs", f"{VEHICLE}.files.log_entry")),
+         (f"{VEHICLE}.files.files", f"{VEHICLE}.files.logs", f"{VEHICLE}.files.log_paths")),
     Room("camera", "Cameras", "`vehicle.camera`, `vehicle.camera_at`",
-         (f"{VEHICLE}.camera.camera", f"{VEHICLE}.camera.values", f"{VEHICLE}.camera.capture",
-          f"{VEHICLE}.camera.geotag", "aerokit.video")),
+         (f"{VEHICLE}.camera.cameras", f"{VEHICLE}.camera.values", f"{VEHICLE}.camera.capture", "aerokit.video")),
     Room("gimbal", "Gimbals", "`vehicle.gimbal`, `vehicle.gimbals`",
-         (f"{VEHICLE}.gimbal.gimbal", f"{VEHICLE}.gimbal.gimbals", f"{VEHICLE}.gimbal.control",
-          f"{VEHICLE}.gimbal.rates", f"{VEHICLE}.gimbal.values")),
+         (f"{VEHICLE}.gimbal.gimbal", f"{VEHICLE}.gimbal.control", f"{VEHICLE}.gimbal.rates",
+          f"{VEHICLE}.gimbal.device")),
     Room("components", "Components", "`vehicle.component(id)`: what else is on board",
-         (f"{VEHICLE}.components.component", f"{VEHICLE}.components.settings", f"{VEHICLE}.components.metadata")),
+         (f"{VEHICLE}.components.component", f"{VEHICLE}.components.settings")),
     Room("errors", "aerokit.errors", "The tree of exceptions", ("aerokit.errors",)),
     Room("events", "aerokit.events", "What is told when it happens", ("aerokit.events",)),
     Room("sync", "aerokit.sync", "The blocking twin", ("aerokit.sync",)),
     Room("dronekit", "aerokit.dronekit", "The classic API", ("aerokit.dronekit",)),
     Room("sim", "aerokit.sim", "Simulated vehicles", ("aerokit.sim", "aerokit.sim.kinds", "aerokit.sim.picture")),
     Room("testing", "aerokit.testing", "For tests of your program", ("aerokit.testing",)),
-    Room("links", "aerokit.links", "Bytes in, bytes out", ("aerokit.links",)),
+    Room("links", "aerokit.transport", "Bytes in, bytes out", ("aerokit.transport",)),
     Room("hub", "aerokit.hub", "Links joined into one network", ("aerokit.hub",)),
-    Room("mavlink", "aerokit.mavlink", "The wire", ("aerokit.mavlink", "aerokit.mavlink.from_pymavlink",
-         "aerokit.mavlink.to_pymavlink", "aerokit.mavlink.message_factory")),
+    Room("mavlink", "aerokit.mavlink", "The wire", ("aerokit.mavlink", "aerokit.mavlink.pymavlink")),
     Room("protocols", "aerokit.protocols", "MAVLink's microservices without IO",
          tuple(f"aerokit.protocols.{name}" for name in (
-             "exchange", "command", "parameter_list", "parameter_read", "parameter_write", "extended_parameters",
-             "mission_download", "mission_upload", "missions", "ftp", "ftp_transfer", "log_list", "logs", "transfer"))),
+             "exchange", "command", "parameter_list", "parameter_requests", "extended_parameters", "missions",
+             "mission_download", "mission_upload", "ftp", "ftp_transfer", "logs"))),
     Room("autopilots", "aerokit.autopilots", "What differs between firmwares", ("aerokit.autopilots",)),
-    Room("geo", "aerokit.geo", "Geodesy, and the base of values",
-         ("aerokit.geo", "aerokit.snapshot", "aerokit.plain")),
-    Room("convert", "aerokit.convert", "Logs in other formats", ("aerokit.convert",)),
-    Room("flights", "aerokit.flights", "Flight logs as what was flown", ("aerokit.flights",)),
-    Room("report", "aerokit.report", "A flight as one HTML file", ("aerokit.report",)),
-    Room("foxglove", "aerokit.foxglove", "Vehicles live in Foxglove", ("aerokit.foxglove",)),
-    Room("network", "aerokit.network", "State for other machines and languages", ("aerokit.network",)),
-    Room("serve", "aerokit.serve", "A page and an API for vehicles", ("aerokit.serve",)),
-    Room("monitor", "aerokit.monitor", "Vehicles in the terminal", ("aerokit.monitor.app",)),
+    Room("geo", "aerokit._internal.geo", "Geodesy, and the base of values",
+         ("aerokit._internal.geo", "aerokit._internal.values")),
+    Room("convert", "aerokit.logs.convert", "Logs in other formats", ("aerokit.logs.convert",)),
+    Room("flights", "aerokit.logs.flights", "Flight logs as what was flown", ("aerokit.logs.flights",)),
+    Room("report", "aerokit.logs.report", "A flight as one HTML file", ("aerokit.logs.report",)),
+    Room("foxglove", "aerokit.apps.foxglove", "Vehicles live in Foxglove", ("aerokit.apps.foxglove",)),
+    Room("network", "aerokit.apps.network", "State for other machines and languages", ("aerokit.apps.network",)),
+    Room("serve", "aerokit.apps.serve", "A page and an API for vehicles", ("aerokit.apps.serve",)),
+    Room("monitor", "aerokit.apps.monitor", "Vehicles in the terminal", ("aerokit.apps.monitor.app",)),
 )  # fmt: skip
 MADE = {
     "messages": "Every message of the standard dialect",
     "enums": "Every enum of the standard dialect",
     "cli": "Every option of the command line",
 }
-TITLES = {"messages": "aerokit.messages", "enums": "aerokit.enums", "cli": "aerokit.cli: the command line"}
+TITLES = {
+    "messages": "aerokit.messages",
+    "enums": "aerokit.enums",
+    "cli": "aerokit.apps.cli: the command line",
+}
 
 
 def reference_pages() -> Iterator[tuple[str, str]]:
@@ -196,9 +198,9 @@ def _item(name: str, item: type) -> str:
 def _command_line() -> str:
     import argparse
 
-    from aerokit.cli.main import make_parser
+    from aerokit.apps.cli.main import make_parser
 
-    text = ["# aerokit.cli: the command line\n"]
+    text = ["# aerokit.apps.cli: the command line\n"]
 
     def tell(parser: argparse.ArgumentParser, level: int) -> None:
         text.append(f"{'#' * level} {parser.prog}\n\n```text\n{parser.format_help().rstrip()}\n```\n")

@@ -14,8 +14,7 @@ from typing import Any
 import aerokit
 from aerokit.sim import SimulatedCamera, SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
-from aerokit.vehicle.camera.capture import Capture
-from aerokit.vehicle.camera.geotag import geotagged, write_captures
+from aerokit.vehicle.camera.capture import Capture, geotagged, write_captures
 
 HEIGHT_M, LENGTH_M, LANE_M, LANES = 20.0, 40.0, 15.0, 3
 

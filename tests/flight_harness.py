@@ -13,15 +13,15 @@ import anyio
 
 import aerokit
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
 from aerokit.errors import LinkLost
-from aerokit.links.link import Link, Peer, Receiver
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing.clock import VirtualClockLoop
+from aerokit.transport.link import Link, Peer, Receiver
 
 M = TypeVar("M", bound=Message)
 

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from aerokit.links.link import Link, Peer, Receiver
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, Heartbeat
+from aerokit.transport.link import Link, Peer, Receiver
 
 
 @dataclass

@@ -11,10 +11,10 @@ from order_air import Air, Crossing, Diary, Silence, Weather
 from stream_splitter import Splitter
 
 import aerokit
-from aerokit.links import Link, SeveralLinks, memory_link_pair
+from aerokit.connection.opening import open_connection
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedVehicle, SimulatorServer
+from aerokit.transport import Link, SeveralLinks, memory_link_pair
 
 
 @dataclass(frozen=True)

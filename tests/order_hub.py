@@ -17,9 +17,9 @@ from aerokit.errors import LinkLost
 from aerokit.hub import Endpoint, Hub
 from aerokit.hub.attachment import Attachment
 from aerokit.hub.senders import MOVES_AFTER_S
-from aerokit.links import Link, memory_link_pair
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedVehicle, SimulatorServer
+from aerokit.transport import Link, memory_link_pair
 
 Side = Literal["vehicle", "program"]
 Ways = Literal["one", "vehicle twice", "program twice", "program copied"]

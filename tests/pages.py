@@ -37,10 +37,10 @@ from served_copter import served_copter
 
 import aerokit
 from aerokit import SigningKey
-from aerokit.links import Link, create, create_link, memory_link_pair
-from aerokit.links.address import LinkAddress
 from aerokit.sim import SimulatedCamera, SimulatedComponent, SimulatedCopter, SimulatorServer
 from aerokit.testing import run_virtual
+from aerokit.transport import Link, create, create_link, memory_link_pair
+from aerokit.transport.address import LinkAddress
 
 ROOT = Path(__file__).parent.parent
 THE_RULE = "docs/how-to/index.md#how-to-read-the-code"

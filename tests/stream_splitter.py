@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import AsyncExitStack
 
 from aerokit.errors import LinkLost
-from aerokit.links import MemoryLink, Peer, memory_link_pair
+from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 
 class Splitter:

@@ -16,7 +16,7 @@ from served_copter import served, served_copter
 
 import aerokit
 import aerokit.sync
-from aerokit.cli import main
+from aerokit.apps.cli import main
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.sim import SimulatedCopter
 

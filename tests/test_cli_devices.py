@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from served_copter import served
 
-from aerokit.cli import main
+from aerokit.apps.cli import main
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 Run = Callable[..., tuple[int, str, str]]
@@ -32,7 +32,7 @@ def address(camera: SimulatedCamera, gimbal: SimulatedGimbal) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.cli.which_vehicle.LISTEN_S", 0.0)  # tests/cli has several vehicles
+    monkeypatch.setattr("aerokit.apps.cli.vehicle_command.LISTEN_S", 0.0)  # tests/cli has several vehicles
 
 
 @pytest.fixture

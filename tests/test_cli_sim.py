@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 from recorded import SHORT
 
-from aerokit.cli import main
-from aerokit.cli.main import make_parser
-from aerokit.cli.places import EACH_ITS_OWN, each_with_its_own, place_of
-from aerokit.cli.sim import _client_address
-from aerokit.cli.vehicles import simulated_fleet
+from aerokit.apps.cli import main
+from aerokit.apps.cli.arguments import EACH_ITS_OWN, each_with_its_own, place_of
+from aerokit.apps.cli.main import make_parser
+from aerokit.apps.cli.sim import _client_address, simulated_fleet
 from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4
 from aerokit.sim.track import true_point
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from served_copter import served
 
-from aerokit.cli import main
-from aerokit.cli.progress import progress_bar
-from aerokit.protocols.transfer import Progress
+from aerokit.apps.cli import main
+from aerokit.apps.cli.terminal import progress_bar
+from aerokit.protocols.exchange import Progress
 from aerokit.sim import SimulatedCopter
 
 WAYPOINTS = """QGC WPL 110
@@ -52,7 +52,9 @@ def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("aerokit.cli.which_vehicle.LISTEN_S", 0.0)  # there is one; tests/cli has several
+    monkeypatch.setattr(
+        "aerokit.apps.cli.vehicle_command.LISTEN_S", 0.0
+    )  # there is one; tests/cli has several
 
 
 # ------------------------------------------------------------------------------------- arguments

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from flight_harness import Flight
 
-from aerokit.cli import main
+from aerokit._internal.wording import did_you_mean, shown
+from aerokit.apps.cli import main
 from aerokit.errors import InvalidArgument, ParameterRejected
-from aerokit.links import parse_address
 from aerokit.sim.kinds import kind_class
-from aerokit.wording import did_you_mean, shown
+from aerokit.transport import parse_address
 
 
 @pytest.mark.parametrize(

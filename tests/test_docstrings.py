@@ -20,7 +20,13 @@ MODULES = [
     *sorted(module.name for module in pkgutil.walk_packages(aerokit.__path__, "aerokit.")),
 ]
 MODULES.remove("aerokit.__main__")  # running it is all it is for
-FOR_PROGRAMS = ("aerokit.links", "aerokit.mavlink", "aerokit.runtime", "aerokit.sync", "aerokit.testing")
+FOR_PROGRAMS = (
+    "aerokit.transport",
+    "aerokit.mavlink",
+    "aerokit.connection",
+    "aerokit.sync",
+    "aerokit.testing",
+)
 """Where programs find constants; elsewhere they are the standard's numbers under the standard's names."""
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit import geo
+from aerokit._internal import geo
 from aerokit.errors import InvalidArgument
 
 latitudes = st.floats(-85, 85)

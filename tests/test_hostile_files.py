@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
+from aerokit._internal.files import LARGEST_FILE
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink import Dialect
 from aerokit.missions import Plan, read_plan_file
 from aerokit.missions.plan_file import format_plan, parse_plan
 from aerokit.parameters import load_metadata, parse_metadata, parse_parameter_file, read_parameter_file
-from aerokit.whole_file import LARGEST_FILE
 
 MEGABYTE = 1 << 20
 BOMB = """<?xml version="1.0"?>

@@ -9,10 +9,10 @@ from datetime import datetime, timedelta, timezone
 from pathlib import PurePosixPath
 
 from aerokit import Position
+from aerokit._internal.values import plain
 from aerokit.errors import AerokitError
 from aerokit.mavlink.enums import MavModeFlag, MavState
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.plain import plain
 
 
 class Kind(enum.Enum):

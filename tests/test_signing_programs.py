@@ -15,8 +15,8 @@ from served_copter import served
 
 import aerokit.sync
 from aerokit import Signing, SigningKey
-from aerokit.cli import main
-from aerokit.cli.signing import ENVIRONMENT, key_file, signing_of
+from aerokit.apps.cli import main
+from aerokit.apps.cli.vehicle_command import ENVIRONMENT, key_file, signing_of
 from aerokit.sim import SimulatedCopter
 
 KEY = SigningKey.from_passphrase("right")

@@ -8,7 +8,7 @@ import pickle
 
 import pytest
 
-from aerokit.snapshot import Snapshot
+from aerokit._internal.values import Snapshot
 
 
 class Point(Snapshot):

@@ -22,23 +22,22 @@ import aerokit
 import aerokit.sync
 import aerokit.sync.twins
 from aerokit import errors, events, messages
+from aerokit.connection.bus import Subscription
+from aerokit.connection.cells import StateCell
+from aerokit.connection.opening import open_connection
+from aerokit.events import LinkState
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.missions import Fence, FenceCircle, Mission, waypoint
-from aerokit.runtime.cells import StateCell
-from aerokit.runtime.link_state import LinkState
-from aerokit.runtime.opening import open_connection
-from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
 from aerokit.sync.generator import FILE, generate
+from aerokit.vehicle.commanding.guided import Guided, SetpointStream
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
-from aerokit.vehicle.orders.guided import Guided, SetpointStream
-from aerokit.vehicle.orders.setpoints import VelocitySetpoint
+from aerokit.vehicle.missions.mission import MissionControl
+from aerokit.vehicle.missions.plans import FenceControl, RallyControl
 from aerokit.vehicle.parameters.parameters import Parameters, Transaction
-from aerokit.vehicle.plans.fence import FenceControl
-from aerokit.vehicle.plans.mission import MissionControl
-from aerokit.vehicle.plans.rally import RallyControl
-from aerokit.vehicle.state.told import Told
+from aerokit.vehicle.state.field import Told
 
 LOOP_THREAD = "aerokit loop"
 

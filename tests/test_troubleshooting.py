@@ -17,10 +17,10 @@ import pytest
 
 import aerokit
 from aerokit import enums, errors
-from aerokit.cli.exits import NotInstalled
-from aerokit.links import memory_link_pair
+from aerokit.apps.cli.output import NotInstalled
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport import memory_link_pair
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aerokit.whole_file import write_whole
+from aerokit._internal.files import write_whole
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")

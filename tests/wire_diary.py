@@ -22,12 +22,12 @@ from typing import Any
 
 import pytest
 
+from aerokit.connection import connection
+from aerokit.connection.bus import Bus
 from aerokit.events import Event
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.protocols.exchange import Exchange
-from aerokit.runtime import connection
-from aerokit.runtime.bus import Bus
 from aerokit.testing.clock import VirtualClockLoop
 
 KEPT = Path(__file__).with_name("wire_diaries.json")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from aerokit import Position, messages
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Fence, Mission, RallyPoints
-from aerokit.vehicle.orders.setpoints import (
+from aerokit.vehicle.commanding.setpoints import (
     AttitudeSetpoint,
     LocalPositionSetpoint,
     PositionSetpoint,

@@ -24,7 +24,7 @@ sys.stdin.read()
 """
 VEHICLE_SIDE = """
 import asyncio, sys
-from aerokit.links import create_link
+from aerokit.transport import create_link
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Heartbeat
 

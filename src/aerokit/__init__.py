@@ -18,111 +18,45 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.installed import complaint
-from aerokit.lazy import lazy_names
+from aerokit._internal.imports import complaint, lazy_exports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit import errors, events
-    from aerokit.fleets.apart import Deconfliction
-    from aerokit.fleets.fleet import Fleet
-    from aerokit.fleets.formation import Formation, Offset
-    from aerokit.fleets.members import Member, MemberState
-    from aerokit.fleets.opening import fleet
-    from aerokit.fleets.results import FleetResult
-    from aerokit.fleets.show import Show
-    from aerokit.hub.hub import Hub
-    from aerokit.hub.values import Endpoint
-    from aerokit.mavlink import enums, messages
-    from aerokit.mavlink.dialect import Dialect
-    from aerokit.mavlink.signing import Signing, SigningKey
-    from aerokit.position import Position
-    from aerokit.runtime.connection import Connection
-    from aerokit.runtime.link_state import LinkState
-    from aerokit.runtime.opening import open_connection
-    from aerokit.runtime.own_heartbeat import OwnHeartbeat
-    from aerokit.vehicle.connect import connect
-    from aerokit.vehicle.orders.setpoints import (
-        AccelerationSetpoint,
-        AttitudeSetpoint,
-        BodyVelocitySetpoint,
-        LocalPositionSetpoint,
-        PositionSetpoint,
-        VelocitySetpoint,
-    )
-    from aerokit.vehicle.vehicle import Vehicle
+    from aerokit import errors as errors
+    from aerokit import events as events
+    from aerokit.connection.connection import Connection as Connection
+    from aerokit.connection.opening import open_connection as open_connection
+    from aerokit.connection.own_heartbeat import OwnHeartbeat as OwnHeartbeat
+    from aerokit.events import LinkState as LinkState
+    from aerokit.fleets.fleet import Fleet as Fleet
+    from aerokit.fleets.formation import Formation as Formation
+    from aerokit.fleets.formation import Offset as Offset
+    from aerokit.fleets.members import Member as Member
+    from aerokit.fleets.members import MemberState as MemberState
+    from aerokit.fleets.opening import fleet as fleet
+    from aerokit.fleets.policy import FleetResult as FleetResult
+    from aerokit.fleets.separation import Deconfliction as Deconfliction
+    from aerokit.fleets.shows.show import Show as Show
+    from aerokit.hub.hub import Hub as Hub
+    from aerokit.hub.values import Endpoint as Endpoint
+    from aerokit.mavlink import enums as enums
+    from aerokit.mavlink import messages as messages
+    from aerokit.mavlink.dialect import Dialect as Dialect
+    from aerokit.mavlink.signing import Signing as Signing
+    from aerokit.mavlink.signing import SigningKey as SigningKey
+    from aerokit.position import Position as Position
+    from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint as AccelerationSetpoint
+    from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint as AttitudeSetpoint
+    from aerokit.vehicle.commanding.setpoints import BodyVelocitySetpoint as BodyVelocitySetpoint
+    from aerokit.vehicle.commanding.setpoints import LocalPositionSetpoint as LocalPositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import PositionSetpoint as PositionSetpoint
+    from aerokit.vehicle.commanding.setpoints import VelocitySetpoint as VelocitySetpoint
+    from aerokit.vehicle.connect import connect as connect
+    from aerokit.vehicle.vehicle import Vehicle as Vehicle
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "AccelerationSetpoint",
-    "AttitudeSetpoint",
-    "BodyVelocitySetpoint",
-    "Connection",
-    "Deconfliction",
-    "Dialect",
-    "Endpoint",
-    "Fleet",
-    "FleetResult",
-    "Formation",
-    "Hub",
-    "LinkState",
-    "LocalPositionSetpoint",
-    "Member",
-    "MemberState",
-    "Offset",
-    "OwnHeartbeat",
-    "Position",
-    "PositionSetpoint",
-    "Show",
-    "Signing",
-    "SigningKey",
-    "Vehicle",
-    "VelocitySetpoint",
-    "connect",
-    "enums",
-    "errors",
-    "events",
-    "fleet",
-    "messages",
-    "open_connection",
-]
-
-# Imported when first asked for: whoever wants `aerokit.messages` does not pay for asyncio.
-_HOMES = {
-    "AccelerationSetpoint": "aerokit.vehicle.orders.setpoints",
-    "AttitudeSetpoint": "aerokit.vehicle.orders.setpoints",
-    "BodyVelocitySetpoint": "aerokit.vehicle.orders.setpoints",
-    "Connection": "aerokit.runtime.connection",
-    "OwnHeartbeat": "aerokit.runtime.own_heartbeat",
-    "Deconfliction": "aerokit.fleets.apart",
-    "Dialect": "aerokit.mavlink.dialect",
-    "Endpoint": "aerokit.hub.values",
-    "Hub": "aerokit.hub.hub",
-    "Fleet": "aerokit.fleets.fleet",
-    "FleetResult": "aerokit.fleets.results",
-    "Formation": "aerokit.fleets.formation",
-    "LinkState": "aerokit.runtime.link_state",
-    "LocalPositionSetpoint": "aerokit.vehicle.orders.setpoints",
-    "Member": "aerokit.fleets.members",
-    "MemberState": "aerokit.fleets.members",
-    "Offset": "aerokit.fleets.formation",
-    "Position": "aerokit.position",
-    "PositionSetpoint": "aerokit.vehicle.orders.setpoints",
-    "Show": "aerokit.fleets.show",
-    "Signing": "aerokit.mavlink.signing",
-    "SigningKey": "aerokit.mavlink.signing",
-    "Vehicle": "aerokit.vehicle.vehicle",
-    "VelocitySetpoint": "aerokit.vehicle.orders.setpoints",
-    "connect": "aerokit.vehicle.connect",
-    "enums": "aerokit.mavlink.enums",
-    "errors": "aerokit.errors",
-    "events": "aerokit.events",
-    "fleet": "aerokit.fleets.opening",
-    "messages": "aerokit.mavlink.messages",
-    "open_connection": "aerokit.runtime.opening",
-}
 
 if (_mixed := complaint(__path__[0])) is not None:
     import warnings
@@ -131,4 +65,37 @@ if (_mixed := complaint(__path__[0])) is not None:
 
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "aerokit.connection.connection": ("Connection",),
+        "aerokit.connection.opening": ("open_connection",),
+        "aerokit.connection.own_heartbeat": ("OwnHeartbeat",),
+        "aerokit.errors": ("errors",),
+        "aerokit.events": ("LinkState", "events"),
+        "aerokit.fleets.fleet": ("Fleet",),
+        "aerokit.fleets.formation": ("Formation", "Offset"),
+        "aerokit.fleets.members": ("Member", "MemberState"),
+        "aerokit.fleets.opening": ("fleet",),
+        "aerokit.fleets.policy": ("FleetResult",),
+        "aerokit.fleets.separation": ("Deconfliction",),
+        "aerokit.fleets.shows.show": ("Show",),
+        "aerokit.hub.hub": ("Hub",),
+        "aerokit.hub.values": ("Endpoint",),
+        "aerokit.mavlink.dialect": ("Dialect",),
+        "aerokit.mavlink.enums": ("enums",),
+        "aerokit.mavlink.messages": ("messages",),
+        "aerokit.mavlink.signing": ("Signing", "SigningKey"),
+        "aerokit.position": ("Position",),
+        "aerokit.vehicle.commanding.setpoints": (
+            "AccelerationSetpoint",
+            "AttitudeSetpoint",
+            "BodyVelocitySetpoint",
+            "LocalPositionSetpoint",
+            "PositionSetpoint",
+            "VelocitySetpoint",
+        ),
+        "aerokit.vehicle.connect": ("connect",),
+        "aerokit.vehicle.vehicle": ("Vehicle",),
+    },
+)

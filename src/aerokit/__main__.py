@@ -2,6 +2,6 @@
 
 import sys
 
-from aerokit.cli import main
+from aerokit.apps.cli import main
 
 sys.exit(main())

@@ -6,10 +6,10 @@ import math
 from numbers import Real
 from typing import TYPE_CHECKING
 
-from aerokit import geo
-from aerokit.arguments import checks_arguments
+from aerokit._internal import geo
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from typing_extensions import Self

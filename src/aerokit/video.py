@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit.arguments import checks_arguments
-from aerokit.async_block import async_block
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.async_block import async_block
+from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError, NotSupported
-from aerokit.snapshot import Snapshot
-from aerokit.vehicle.checks import check_range
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping

@@ -7,8 +7,7 @@ import math
 import pytest
 
 from aerokit.autopilots import Autopilot, autopilot_for
-from aerokit.autopilots.health import PREARM_CHECK
-from aerokit.autopilots.streams import ARDUPILOT_GROUPS
+from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, PREARM_CHECK
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages
 from aerokit.mavlink.message import Message

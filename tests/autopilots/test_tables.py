@@ -7,19 +7,10 @@ from typing import Any
 
 import pytest
 
-from aerokit.autopilots import (
-    Autopilot,
-    Mode,
-    ModeTable,
-    Reposition,
-    SetpointRules,
-    ardupilot_modes,
-    autopilot_for,
-)
-from aerokit.autopilots.health import ESTIMATES, SENSORS, names_of
+from aerokit.autopilots import Autopilot, Mode, ModeTable, Reposition, SetpointRules, autopilot_for
+from aerokit.autopilots import ardupilot as ardupilot_modes
 from aerokit.autopilots.px4 import MODES, px4_custom_mode
-from aerokit.autopilots.streams import ARDUPILOT_GROUPS
-from aerokit.autopilots.version import version_text
+from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ESTIMATES, SENSORS, names_of, version_text
 from aerokit.mavlink import enums, messages
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat

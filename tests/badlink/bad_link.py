@@ -18,9 +18,8 @@ from flight_harness import Wire, attached_sinks, make_parts, waiting_on_cells
 
 import aerokit
 from aerokit import messages as m
-from aerokit.links import FaultModel, FaultyLink
 from aerokit.sim import SimulatedVehicle, simulated_link
-from aerokit.testing import run_virtual
+from aerokit.testing import FaultModel, FaultyLink, run_virtual
 
 DELAY_S = 0.05
 PERFECT = FaultModel(delay_s=DELAY_S)

@@ -15,8 +15,8 @@ from bad_link import DELAY_S, NARROW, WIDE, Program, Radio, attempt
 from transfers_under_test import CASES, TINY, Case, leftovers, make_copter
 from verdicts import judge
 
-from aerokit.links import FaultModel
-from aerokit.protocols.transfer import PATIENCE_S
+from aerokit.protocols.exchange import PATIENCE_S
+from aerokit.testing import FaultModel
 
 SEEDS = int(os.environ.get("AEROKIT_SEEDS", "1"))
 ENOUGH = 21

@@ -14,7 +14,7 @@ from ideals import Ideal
 
 from aerokit.errors import FileTimeout, MissionTimeout, ParameterTimeout
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, RallyPoints, rally_point, waypoint
-from aerokit.missions.storage import Storage
+from aerokit.missions.compare import Storage
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter
 from aerokit.sim.logs import SimulatedLog

@@ -12,13 +12,13 @@ from camera_beside import camera_of
 from provoked import Do, Provocation, Table
 
 from aerokit import messages as m
+from aerokit._internal.files import LARGEST_FILE
 from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import MavCmd
 from aerokit.parameters import parse_definition
 from aerokit.sim import SimulatedCamera
 from aerokit.sim.components.camera_parameters import DEFINITION_PATH, own_definition
 from aerokit.vehicle.components.component import Component
-from aerokit.whole_file import LARGEST_FILE
 
 __all__ = ["COMPONENTS", "COMPONENTS_AWAITED", "COMPONENTS_BLOCKING"]
 

@@ -11,7 +11,7 @@ from call_stage import Place, Stage, airborne, anywhere
 
 from aerokit import messages as m
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavResult
-from aerokit.protocols.ftp_message import FtpMessage
+from aerokit.protocols.ftp import FtpMessage
 
 __all__ = [
     "FORGETTING",

@@ -28,7 +28,7 @@ import aerokit
 from aerokit import Position, PositionSetpoint, Signing, VelocitySetpoint, errors, messages
 from aerokit.mavlink.enums import MavCmd
 from aerokit.sim import SimulatedCopter, simulated_link
-from aerokit.vehicle.orders.setpoints import AttitudeSetpoint, LocalPositionSetpoint
+from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint, LocalPositionSetpoint
 
 __all__ = ["FLIGHT"]
 

@@ -8,27 +8,25 @@ from types import FunctionType
 from typing import Any, NamedTuple
 
 import aerokit
-from aerokit.runtime.cells import Changes, StateCell
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.subscription import Subscription
-from aerokit.vehicle.camera.camera import Camera
+from aerokit.connection.bus import Subscription
+from aerokit.connection.cells import Changes, StateCell
+from aerokit.connection.connection import Connection
+from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.part import CameraBlock
 from aerokit.vehicle.camera.shooting import PhotoInterval
+from aerokit.vehicle.commanding.guided import Guided, SetpointStream
+from aerokit.vehicle.commanding.posting import PostedOrder
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.files.logs import Logs
 from aerokit.vehicle.gimbal.control import GimbalControl
-from aerokit.vehicle.gimbal.gimbal import Gimbal
-from aerokit.vehicle.gimbal.gimbals import Gimbals
+from aerokit.vehicle.gimbal.gimbal import Gimbal, Gimbals
 from aerokit.vehicle.gimbal.rates import GimbalRates
-from aerokit.vehicle.orders.guided import Guided, SetpointStream
-from aerokit.vehicle.orders.posting import PostedOrder
+from aerokit.vehicle.missions.mission import MissionControl
+from aerokit.vehicle.missions.plans import FenceControl, RallyControl
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
-from aerokit.vehicle.plans.fence import FenceControl
-from aerokit.vehicle.plans.mission import MissionControl
-from aerokit.vehicle.plans.rally import RallyControl
 
 __all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
 

@@ -11,7 +11,7 @@ import anyio
 from call_stage import Stage
 from flight_harness import make_parts
 
-from aerokit.runtime import loop_watch
+from aerokit.connection import loop_watch
 
 __all__ = ["SETTLED_S", "look", "what_is_left"]
 
@@ -91,7 +91,9 @@ def _timers() -> Iterator[str]:
     loop: Any = asyncio.get_running_loop()
     for timer in loop._scheduled:
         module = getattr(timer._callback, "__module__", "")
-        is_ours = module.startswith(("aerokit.vehicle", "aerokit.runtime")) and module != loop_watch.__name__
+        is_ours = (
+            module.startswith(("aerokit.vehicle", "aerokit.connection")) and module != loop_watch.__name__
+        )
         if is_ours and not timer.cancelled():
             yield f"timer {timer._callback.__qualname__}"
 
@@ -106,6 +108,6 @@ def _locks(name: str, item: Any, seen: set[int]) -> Iterator[tuple[str, asyncio.
     elif isinstance(item, Mapping) and len(item) < 100:
         for key, value in item.items():
             yield from _locks(f"{name}[{key}]", value, seen)
-    elif type(item).__module__.startswith(("aerokit.vehicle", "aerokit.runtime")):
+    elif type(item).__module__.startswith(("aerokit.vehicle", "aerokit.connection")):
         for key, value in getattr(item, "__dict__", {}).items():
             yield from _locks(f"{name}.{key}", value, seen)

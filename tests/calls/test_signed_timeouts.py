@@ -12,9 +12,9 @@ from call_stage import AUTOPILOTS, Stage, open_stage
 from call_table import CALLS
 from test_cancellation import groups
 
+from aerokit.connection.cells import StateCell
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.mavlink.signing import SigningKey
-from aerokit.runtime.cells import StateCell
 from aerokit.testing import run_virtual
 
 KEY = SigningKey.from_passphrase("another one's")

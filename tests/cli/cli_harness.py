@@ -10,13 +10,12 @@ from typing import Any
 
 import anyio
 
-from aerokit.cli.exits import exit_code
-from aerokit.cli.main import make_parser
-from aerokit.cli.output import tell_error
+from aerokit.apps.cli.main import make_parser
+from aerokit.apps.cli.output import exit_code, tell_error
 from aerokit.errors import AerokitError
-from aerokit.links.link import Link
 from aerokit.sim import SimulatedVehicle, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport.link import Link
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "command-line.md"
 MISSION = """QGC WPL 110

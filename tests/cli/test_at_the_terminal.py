@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 from cli_harness import HOME, run_on, run_with
 
-from aerokit.cli import asking, main
-from aerokit.links.memory import memory_link_pair
+from aerokit.apps.cli import main
+from aerokit.apps.cli import terminal as asking
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import run_virtual
+from aerokit.transport.memory import memory_link_pair
 
 # ----------------------------------------------------------------------------------- countdown
 
@@ -190,9 +191,9 @@ def test_what_is_no_program_is_said_in_a_line(arguments: list[str], text: str, t
 def test_help_imports_no_command() -> None:
     """Nor anything else that takes long: somebody waits for it."""
     program = (
-        "import sys\nfrom aerokit.cli import main\ntry:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print([name for name in sys.modules if name.startswith(('aerokit.sim', 'aerokit.vehicle', 'aerokit.runtime',"
-        " 'aerokit.mavlink.messages', 'argcomplete', 'anyio', 'tqdm', 'serial'))])"
+        "import sys\nfrom aerokit.apps.cli import main\ntry:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print([name for name in sys.modules if name.startswith(('aerokit.sim', 'aerokit.vehicle',"
+        " 'aerokit.connection', 'aerokit.mavlink.messages', 'argcomplete', 'anyio', 'tqdm', 'serial'))])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("\n[]\n")

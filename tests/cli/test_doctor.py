@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import common
 from test_link_commands import GROUND_STATION, saying
 
 from aerokit import messages as m
-from aerokit.cli import doctor, main
-from aerokit.cli.doctor_computer import EXTRAS, check_installation, check_network_port, check_serial_port
+from aerokit.apps.cli import doctor, main
+from aerokit.apps.cli.doctor import EXTRAS, check_installation, check_network_port, check_serial_port
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
@@ -264,14 +264,12 @@ def test_the_computer(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_files_of_the_other_aerokit_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.installed.complaint", lambda *_, **__: "mixed")
+    monkeypatch.setattr("aerokit._internal.imports.complaint", lambda *_, **__: "mixed")
     assert any(each.level == "problem" and each.text == "mixed" for each in check_installation())
 
 
 def test_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "aerokit.cli.doctor_computer.find_spec", lambda name: None if name == "textual" else 1
-    )
+    monkeypatch.setattr("aerokit.apps.cli.doctor.find_spec", lambda name: None if name == "textual" else 1)
     lacking = [each for each in check_installation() if each.subject == "extras" and each.level == "note"]
     assert [each.text for each in lacking] == ["monitor is not whole: textual not installed"]
     assert "pip install 'aerokit-mavlink[monitor]'" in lacking[0].do

@@ -11,11 +11,12 @@ import pytest
 from cli_harness import HOME, MISSION, ctrl_c, run_on, run_with, until
 
 import aerokit
-from aerokit.cli import flown_plan, fly, main
-from aerokit.links.memory import memory_link_pair
+from aerokit.apps.cli import fly, main
+from aerokit.apps.cli import fly as flown_plan
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.sim import SimulatedCopter, SimulatedRover, SimulatedSub, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport.memory import memory_link_pair
 
 FLY = ("fly", "m.waypoints", "--yes")
 

@@ -13,13 +13,14 @@ import pytest
 from cli_harness import HOME, MISSION, ctrl_c, run_on, until
 
 import aerokit
-from aerokit.cli import flown_plan, fly
-from aerokit.cli.output import tell
-from aerokit.links.memory import memory_link_pair
+from aerokit.apps.cli import fly
+from aerokit.apps.cli import fly as flown_plan
+from aerokit.apps.cli.output import tell
 from aerokit.mavlink.enums import CopterMode
 from aerokit.missions import read_waypoint_file
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport.memory import memory_link_pair
 
 
 @pytest.fixture(autouse=True)

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from cli_harness import ctrl_c, records
 
-from aerokit.cli import main
-from aerokit.cli.hub import _endpoints
-from aerokit.cli.main import make_parser
+from aerokit.apps.cli import main
+from aerokit.apps.cli.hub import _endpoints
+from aerokit.apps.cli.main import make_parser
 from aerokit.errors import InvalidArgument
 from aerokit.hub import Endpoint
 from aerokit.mavlink.encoder import FrameEncoder

@@ -8,7 +8,7 @@ import sys
 import anyio
 import pytest
 
-from aerokit.cli.interrupt import on_interrupt
+from aerokit.apps.cli.terminal import on_interrupt
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there are no signals of this kind")
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from cli_harness import DOCUMENT, HOME, MISSION, documented, records, run_with
 
-from aerokit.cli import main
-from aerokit.cli.commands import COMMANDS
-from aerokit.cli.exits import describe
-from aerokit.cli.main import make_parser
+from aerokit.apps.cli import main
+from aerokit.apps.cli.commands import COMMANDS
+from aerokit.apps.cli.main import make_parser
+from aerokit.apps.cli.output import describe
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 SEEN: set[str] = set()

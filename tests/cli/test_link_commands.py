@@ -12,9 +12,8 @@ from cli_harness import HOME, ctrl_c, run_on, run_with
 from flight_harness import Wire
 
 from aerokit import messages as m
-from aerokit.cli import main
-from aerokit.cli.exits import TIMED_OUT
-from aerokit.links.memory import memory_link_pair
+from aerokit.apps.cli import main
+from aerokit.apps.cli.output import TIMED_OUT
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
@@ -22,6 +21,7 @@ from aerokit.mavlink.signing import SigningKey
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport.memory import memory_link_pair
 
 HARMLESS = {
     MavCmd.REQUEST_MESSAGE,

@@ -12,11 +12,11 @@ import pytest
 from cli_harness import HOME, run_on
 
 import aerokit
-from aerokit.cli.exits import exit_code
-from aerokit.links.memory import memory_link_pair
+from aerokit.apps.cli.output import exit_code
 from aerokit.mavlink.enums import CopterMode
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport.memory import memory_link_pair
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cli_harness import HOME, MISSION, run_with
 
-from aerokit.cli import main
+from aerokit.apps.cli import main
 from aerokit.sim import SimulatedCopter
 
 CHANGING = (

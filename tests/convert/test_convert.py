@@ -15,15 +15,15 @@ import pytest
 from defusedxml import ElementTree
 
 from aerokit import messages as m
-from aerokit.cli import main
-from aerokit.convert import convert
+from aerokit.apps.cli import main
 from aerokit.errors import FileFormatError, InvalidArgument
+from aerokit.logs.convert import convert
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import TlogWriter, read_tlog
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.exchange import Progress
 
 RECORDING = Path(__file__).parent.parent / "recordings" / "px4-quad.tlog"
 BEGIN = 1_700_000_000.25

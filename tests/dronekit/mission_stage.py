@@ -10,8 +10,7 @@ from flight_controller import FlightController
 from flight_controller_services import Item
 
 from aerokit.dronekit.commands import Command, CommandSequence
-from aerokit.dronekit.connect import connect
-from aerokit.dronekit.vehicle import Vehicle
+from aerokit.dronekit.vehicle import Vehicle, connect
 
 __all__ = [
     "FIRST",

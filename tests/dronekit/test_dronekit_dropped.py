@@ -19,8 +19,9 @@ import pytest
 from served_copter import served_copter
 
 import aerokit.dronekit as dronekit
-from aerokit.dronekit import mavlink, parameter_transfers
-from aerokit.links import tcp
+from aerokit.dronekit import mavlink
+from aerokit.dronekit import parameters as parameter_transfers
+from aerokit.transport import tcp
 
 LIMIT_S = 20.0
 SOURCES = Path(__file__).parent.parent.parent / "src"

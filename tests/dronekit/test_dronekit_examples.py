@@ -14,8 +14,7 @@ import pytest
 from pymavlink import mavutil
 from served_copter import served_copter
 
-from aerokit.dronekit.alias import uninstall
-from aerokit.dronekit.runner import run_script
+from aerokit.dronekit.runner import run_script, uninstall
 
 ROOT = Path(__file__).parent.parent.parent
 EXAMPLES = ROOT / "examples" / "dronekit"

@@ -10,7 +10,7 @@ from dronekit_stage import Stage, on_stage
 from flight_controller import FlightController
 
 from aerokit import dronekit
-from aerokit.dronekit import maintenance
+from aerokit.dronekit import flight_orders as maintenance
 
 CALIBRATION, MAG_CALIBRATION, REBOOT, CAPABILITIES = 241, 42424, 246, 520
 FAILED, IN_PROGRESS = 4, 5

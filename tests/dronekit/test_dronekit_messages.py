@@ -22,12 +22,11 @@ from pymavlink import mavutil
 from aerokit import messages
 from aerokit.dronekit.observers import message_of
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.frame import Frame, x25
 from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.from_pymavlink import from_pymavlink
+from aerokit.mavlink.pymavlink import from_pymavlink
 
 v10: Any = import_module("pymavlink.dialects.v10.ardupilotmega")
 v10_common: Any = import_module("pymavlink.dialects.v10.common")

@@ -13,9 +13,8 @@ from mission_stage import FIRST, HOME, LIMIT_S, SECOND, THIRD, Pair, connected, 
 from served_copter import served_copter
 
 from aerokit.dronekit.commands import CommandSequence
-from aerokit.dronekit.connect import connect
 from aerokit.dronekit.values import LocationGlobal
-from aerokit.dronekit.vehicle import Vehicle
+from aerokit.dronekit.vehicle import Vehicle, connect
 from aerokit.errors import InvalidArgument
 
 TAKE_OFF, LAND, RETURN, JUMP, SPEED = 22, 21, 20, 177, 178

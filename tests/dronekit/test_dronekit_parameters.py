@@ -356,7 +356,7 @@ def test_a_vehicle_without_parameters(fc: FlightController, monkeypatch: pytest.
 def test_a_download_that_failed_is_begun_again_by_who_waits(
     fc: FlightController, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("aerokit.dronekit.parameter_transfers.AGAIN_S", 0.01)
+    monkeypatch.setattr("aerokit.dronekit.parameters.AGAIN_S", 0.01)
     download, attempts = AsyncParameters.download, []
 
     async def fail_twice(parameters: AsyncParameters, **options: Any) -> Any:

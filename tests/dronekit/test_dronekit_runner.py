@@ -19,9 +19,9 @@ import pytest
 from served_copter import served_copter
 
 import aerokit.dronekit
-from aerokit.cli import main as aerokit_main
+from aerokit.apps.cli import main as aerokit_main
 from aerokit.dronekit import runner
-from aerokit.dronekit.alias import install, uninstall
+from aerokit.dronekit.runner import install, uninstall
 
 PROBE = """\
 import json, sys
@@ -75,7 +75,7 @@ def test_install_makes_every_import_of_programs_work() -> None:
         program,
     )
     assert program["dronekit"] is aerokit.dronekit
-    assert program["connect"] is aerokit.dronekit.connect
+    assert program["connect"] is aerokit.dronekit.vehicle
     assert program["LocationGlobalRelative"] is aerokit.dronekit.LocationGlobalRelative
     assert program["mavutil"].mavlink.MAV_CMD_NAV_WAYPOINT == 16
     assert sys.modules["dronekit.mavlink"] is sys.modules["aerokit.dronekit.mavlink"]

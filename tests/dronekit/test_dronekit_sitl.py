@@ -104,7 +104,7 @@ def test_with_sim_there_is_a_vehicle(
     monkeypatch.setattr(sys, "argv", [""])
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
-    from aerokit.dronekit.alias import uninstall
+    from aerokit.dronekit.runner import uninstall
 
     try:
         code = runner.main(["--sim", "--speedup", "10", str(program), f"tcp:127.0.0.1:{port}"], "aerokit run")

@@ -10,11 +10,11 @@ from typing import Any
 from flight_harness import Wire
 
 from aerokit import messages as m
+from aerokit.connection.bus import Subscription
 from aerokit.fleets.events import FleetEvent
 from aerokit.fleets.fleet import Fleet
 from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import CopterMode, MavCmd
-from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter, simulated_link
 
 HOME = (47.3977, 8.5456, 488.0)

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument
-from aerokit.fleets.apart import Route, conflicts_of, in_corridors, in_layers
-from aerokit.fleets.nearness import local_places, near_pairs
 from aerokit.fleets.paths import Path, PathPoint, Place, horizontal_distance, least_distance
+from aerokit.fleets.separation import Route, conflicts_of, in_corridors, in_layers, local_places, near_pairs
 
 metres = st.floats(-50, 50).map(lambda value: round(value, 2))
 places = st.tuples(metres, metres, st.floats(0, 30).map(lambda value: round(value, 2)))
@@ -186,7 +185,7 @@ def test_near_pairs_are_those_of_everybody_with_everybody(where: dict[str, Place
 
 
 def test_local_places_are_metres() -> None:
-    from aerokit import geo
+    from aerokit._internal import geo
 
     there = geo.offset(47.0, 8.0, 300.0, -400.0)
     local = local_places({"a": (47.0, 8.0, 1.0), "b": (*there, 11.0)})

@@ -20,8 +20,7 @@ from aerokit.errors import (
 )
 from aerokit.fleets.events import FleetEvent, MemberTakenOver, StateTold, Told
 from aerokit.fleets.members import MemberState
-from aerokit.fleets.policy import Failure, Rules
-from aerokit.fleets.results import FleetResult
+from aerokit.fleets.policy import Failure, FleetResult, Rules
 from aerokit.missions import Mission
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sync.generator import FILES, generate

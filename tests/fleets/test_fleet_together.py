@@ -17,7 +17,7 @@ from aerokit.errors import (
     SetpointStreamStopped,
     ValueUnknownError,
 )
-from aerokit.fleets.corrections import fragments, rtcm_messages
+from aerokit.fleets.actions import fragments, rtcm_messages
 from aerokit.fleets.events import FollowingStopped, PathsDecided, PolicyCarriedOut, TooClose
 from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState

@@ -17,8 +17,7 @@ from aerokit import messages as m
 from aerokit.errors import FileFormatError, FleetError, InvalidArgument, OperationRejected
 from aerokit.fleets.opening import fleet
 from aerokit.fleets.paths import Path, PathPoint, Place
-from aerokit.fleets.show import Show, state_at
-from aerokit.fleets.show_report import error_between, track_error
+from aerokit.fleets.shows.show import Show, error_between, state_at, track_error
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, simulated_link
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import log_files
 import pytest
 
-from aerokit.convert import convert
 from aerokit.errors import FileFormatError
-from aerokit.flights import failsafes, read_flight
-from aerokit.flights.columns import Columns
-from aerokit.flights.flight_controllers import BinFile
+from aerokit.logs.convert import convert
+from aerokit.logs.flights import failsafes, read_flight
+from aerokit.logs.flights.columns import Columns
+from aerokit.logs.flights.flight_controllers import BinFile
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message

@@ -12,13 +12,13 @@ import pytest
 
 from aerokit import messages as m
 from aerokit.errors import FileFormatError
-from aerokit.flights import Flight, failsafes, read_flight
-from aerokit.flights.flight_controllers import BinFile, UlogFile
-from aerokit.flights.texts import readable
-from aerokit.foxglove.topics import log_entry
+from aerokit.logs.convert.topics import log_entry
+from aerokit.logs.flights import Flight, failsafes, read_flight
+from aerokit.logs.flights.codes import readable
+from aerokit.logs.flights.flight_controllers import BinFile, UlogFile
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.tlog import TlogWriter, read_tlog
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.exchange import Progress
 from aerokit.vehicle.state.equipment import Battery
 
 RECORDINGS = Path(__file__).parent.parent / "recordings"

@@ -15,22 +15,18 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpOpcode, MavParamExtType
 from aerokit.missions import MissionItem
 from aerokit.parameters import Parameter, ParameterType
+from aerokit.protocols.blocks import Reassembly
 from aerokit.protocols.command import CommandExchange
 from aerokit.protocols.exchange import Exchange
 from aerokit.protocols.extended_parameters import SettingList, SettingReads, SettingWrite
-from aerokit.protocols.ftp import FtpClient, FtpRequest
-from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
+from aerokit.protocols.ftp import DATA_SIZE, FtpClient, FtpMessage, FtpRequest
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
-from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload
-from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.missions import MissionClear
+from aerokit.protocols.missions import MissionClear, MissionSetCurrent
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.parameter_read import ParameterReads
-from aerokit.protocols.parameter_write import ParameterWrites
-from aerokit.protocols.reassembly import Reassembly
+from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 
 __all__ = ["EXCHANGE_TARGETS"]
 

@@ -12,9 +12,8 @@ from collections.abc import Callable
 
 from aerokit.mavlink import STANDARD, Framer, Message
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.frame import MAGIC_V2
+from aerokit.mavlink.frame import MAGIC_V2, x25
 from aerokit.sim.parameters import Parameters
 from aerokit.sim.vehicle import SimulatedVehicle
 

@@ -7,15 +7,14 @@ import io
 from target import Target
 
 from aerokit.errors import InvalidArgument
-from aerokit.links import parse_address
-from aerokit.links.create import create_link
 from aerokit.mavlink import STANDARD, Framer
-from aerokit.mavlink.checksum import x25
-from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, x25
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.sim import RecordedVehicle
+from aerokit.transport import parse_address
+from aerokit.transport.create import create_link
 
 __all__ = ["WIRE_TARGETS"]
 

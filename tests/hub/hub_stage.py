@@ -13,7 +13,6 @@ import anyio.lowlevel
 
 from aerokit.errors import LinkLost
 from aerokit.hub import Endpoint
-from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -21,6 +20,7 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.mavlink.signing import Signing
+from aerokit.transport import Link, MemoryLink, Peer, memory_link_pair
 
 COPTER = Heartbeat(2, 3, 81, 0, 3)
 STATION = Heartbeat(6, 8, 0, 0, 4, 3)

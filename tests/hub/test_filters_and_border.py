@@ -6,8 +6,8 @@ import pytest
 
 from aerokit import Signing, SigningKey
 from aerokit.errors import InvalidArgument
-from aerokit.hub.border import Border
-from aerokit.hub.filters import Filters
+from aerokit.hub.guards import Border
+from aerokit.hub.outgoing import Filters
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame

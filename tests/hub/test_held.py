@@ -6,8 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.hub.held import MOST_BYTES, MOST_FRAMES, ORDERS_WAIT_S, Held, HeldFrames
-from aerokit.hub.kinds import _ANSWERS, _SENT_AGAIN_AND_AGAIN, Kind, kind_of
+from aerokit.hub.outgoing import (
+    _ANSWERS,
+    _SENT_AGAIN_AND_AGAIN,
+    MOST_BYTES,
+    MOST_FRAMES,
+    ORDERS_WAIT_S,
+    Held,
+    HeldFrames,
+    Kind,
+    kind_of,
+)
 from aerokit.mavlink.dialect import STANDARD
 
 

@@ -18,8 +18,8 @@ from wrong_types import misuses
 import aerokit
 from aerokit import Signing, SigningKey
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
-from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent, kinds
-from aerokit.links import Link, MemoryLink, Peer, memory_link_pair
+from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
+from aerokit.hub import outgoing as kinds
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import (
     Attitude,
@@ -33,6 +33,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.testing import run_virtual
+from aerokit.transport import Link, MemoryLink, Peer, memory_link_pair
 
 KEY = SigningKey.from_passphrase("border")
 ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

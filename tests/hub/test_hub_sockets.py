@@ -12,11 +12,11 @@ from hub_stage import COPTER, STATION, Program, until
 
 import aerokit
 from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
-from aerokit.links import create_link
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import CommandLong, Statustext
 from aerokit.sim import SimulatedCopter, open_simulator
+from aerokit.transport import create_link
 
 pytestmark = pytest.mark.anyio
 

@@ -14,16 +14,16 @@ from test_hub import virtual
 from test_hub_sockets import ORDER, of, to
 from test_routing import Stage, order
 
+from aerokit.connection.frame_receiver import MOST_PEERS, MOST_STRANGERS
+from aerokit.connection.routes import LIVE_FOR_S, MOVES_AFTER_S
 from aerokit.hub import Endpoint, Hub, HubEvent
 from aerokit.hub.routing import MOST_SENDERS
-from aerokit.links import Peer
-from aerokit.links.tcp import MAX_CLIENTS
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, ParamRequestList
-from aerokit.runtime.peers import MOST_PEERS, MOST_STRANGERS
-from aerokit.runtime.routes import LIVE_FOR_S, MOVES_AFTER_S
+from aerokit.transport import Peer
+from aerokit.transport.tcp import MAX_CLIENTS
 
 ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

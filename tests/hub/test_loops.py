@@ -12,11 +12,11 @@ from test_routing import COPTER, Network, Stage, networks, order
 import aerokit
 from aerokit.hub import Endpoint, Hub, HubEvent
 from aerokit.hub.senders import LOOP_MEMORY_S, LOOP_RUN
-from aerokit.links import memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Attitude, Heartbeat, SysStatus
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport import memory_link_pair
 
 SLOW_S = [0.05, 0.9, 1.2, 1.6, 5.0, 20.0]
 

@@ -18,11 +18,11 @@ import aerokit.sync
 from aerokit import Signing, SigningKey, Vehicle
 from aerokit.errors import ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.hub import Endpoint, Hub, HubEvent, shared
-from aerokit.links import FaultModel, FaultyLink, Link, memory_link_pair
 from aerokit.mavlink.messages import Attitude, CommandLong, ParamRequestList, ParamSet, SetupSigning
 from aerokit.missions import Mission, waypoint
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
-from aerokit.testing import run_virtual
+from aerokit.testing import FaultModel, FaultyLink, run_virtual
+from aerokit.transport import Link, memory_link_pair
 
 KEY = SigningKey.from_passphrase("border")
 DATA = random.Random(7).randbytes(6_000)

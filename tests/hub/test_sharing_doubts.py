@@ -10,10 +10,10 @@ import aerokit
 from aerokit import events
 from aerokit.hub import shared
 from aerokit.hub.attachment import _hold_above
-from aerokit.links import memory_link_pair
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.sim import SimulatedCopter, SimulatorServer
 from aerokit.testing import run_virtual
+from aerokit.transport import memory_link_pair
 
 
 @pytest.mark.parametrize("component", [190, 191])

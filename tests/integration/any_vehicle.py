@@ -15,10 +15,10 @@ import pytest
 from vehicle_kinds import KINDS, Kind
 
 from aerokit import Vehicle, connect
-from aerokit.links import Link, create_link, memory_link_pair
 from aerokit.sim import SimulatedVehicle, SimulatorServer, open_simulator, simulated_link
 from aerokit.sim.kinds import simulated
 from aerokit.sim.patience import wait_longer
+from aerokit.transport import Link, create_link, memory_link_pair
 
 __all__ = ["Choice", "connected", "ready", "served", "served_on_two"]
 

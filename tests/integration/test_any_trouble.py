@@ -20,13 +20,13 @@ from aerokit import Vehicle, connect, fleet
 from aerokit import messages as m
 from aerokit.errors import AerokitError, FleetError, HeartbeatTimeout, OperationRejected
 from aerokit.fleets.members import MemberState
-from aerokit.links import Link, create_link
 from aerokit.mavlink import Framer
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import VIRTUAL_BACKEND
+from aerokit.transport import Link, create_link
 
 pytestmark = pytest.mark.anyio
 

@@ -12,10 +12,9 @@ import pytest
 from any_vehicle import Choice, served_on_two
 
 from aerokit import connect, events
-from aerokit.links import FaultModel, FaultyLink
+from aerokit.events import LinkState
 from aerokit.missions import Mission, waypoint
-from aerokit.runtime.link_state import LinkState
-from aerokit.testing import VIRTUAL_BACKEND
+from aerokit.testing import VIRTUAL_BACKEND, FaultModel, FaultyLink
 
 pytestmark = pytest.mark.anyio
 

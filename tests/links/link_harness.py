@@ -12,8 +12,8 @@ import anyio
 import pytest
 
 from aerokit.errors import LinkLost
-from aerokit.links import Peer
 from aerokit.testing import VirtualClockLoop
+from aerokit.transport import Peer
 
 AsyncTest = TypeVar("AsyncTest", bound=Callable[..., Awaitable[None]])
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument
-from aerokit.links.address import LinkAddress, LinkKind, parse_address
+from aerokit.transport.address import LinkAddress, LinkKind, parse_address
 
 
 def udpin(host: str, port: int) -> LinkAddress:

@@ -12,8 +12,10 @@ from link_harness import Recorder, each_loop, eventually
 import aerokit
 import aerokit.sync
 from aerokit.errors import InvalidArgument
-from aerokit.links import (
-    FaultyLink,
+from aerokit.events import SILENT_AFTER_S
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.testing import FaultyLink
+from aerokit.transport import (
     Link,
     ReconnectingLink,
     TcpConnect,
@@ -25,9 +27,7 @@ from aerokit.links import (
     tcp,
     udp,
 )
-from aerokit.links.allowed import AllowedPeers
-from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.runtime.link_state import SILENT_AFTER_S
+from aerokit.transport.sockets import AllowedPeers
 
 
 @pytest.mark.parametrize(

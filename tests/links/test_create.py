@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from aerokit.errors import InvalidArgument
-from aerokit.links import (
+from aerokit.transport import (
     Link,
     Replay,
     SerialLink,

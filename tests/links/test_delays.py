@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aerokit.links.delays import Delays
+from aerokit.transport.reconnecting import Delays
 
 
 def test_twice_as_long_each_time_until_it_was_there() -> None:

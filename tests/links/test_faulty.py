@@ -11,11 +11,11 @@ from link_harness import Recorder, each_loop, each_traffic
 
 import aerokit
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
-from aerokit.links import FaultModel, FaultyLink, UdpConnect, UdpListen, memory_link_pair
-from aerokit.links.fault_model import Air, FaultyPath, split_frames
 from aerokit.mavlink import FrameEncoder, messages
 from aerokit.sim import SimulatedCopter, simulated_link
-from aerokit.testing import run_virtual
+from aerokit.testing import FaultModel, FaultyLink, run_virtual
+from aerokit.testing.fault_model import Air, FaultyPath, split_frames
+from aerokit.transport import UdpConnect, UdpListen, memory_link_pair
 
 shares = st.floats(0.0, 1.0)
 seconds = st.floats(0.0, 3.0)

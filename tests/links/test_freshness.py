@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.links.freshness import BEACON_EVERY_S, FRESH_S, Ears, Judge, Lateness
-from aerokit.links.zenoh_keys import Beacon, Stamp
+from aerokit.transport.zenoh.control_lease import BEACON_EVERY_S, FRESH_S, Ears, Judge, Lateness
+from aerokit.transport.zenoh.keys import Beacon, Stamp
 
 Event = tuple[float, int, str, Any]
 Holds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]

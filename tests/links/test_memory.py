@@ -6,8 +6,8 @@ import pytest
 from link_harness import Recorder, each_loop, each_traffic
 
 from aerokit.errors import BusyError, ConnectionClosed
-from aerokit.links import memory_link_pair
 from aerokit.testing import run_virtual
+from aerokit.transport import memory_link_pair
 
 
 @each_loop

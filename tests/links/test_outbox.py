@@ -14,10 +14,11 @@ from far_end import far_end
 from link_harness import Recorder, each_loop, eventually
 
 from aerokit import events, messages, open_connection
-from aerokit.links import FaultyLink, Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox
-from aerokit.links.outbox import WRITE_DEADLINE_S, Outbox
+from aerokit.connection.connection import Connection
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.runtime.connection import Connection
+from aerokit.testing import FaultyLink
+from aerokit.transport import Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox
+from aerokit.transport.outbox import WRITE_DEADLINE_S, Outbox
 
 pytestmark = pytest.mark.anyio
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from aerokit.errors import LinkLost, LinkOpenError
-from aerokit.links import Peer, PtyLink, parse_address
+from aerokit.transport import Peer, PtyLink, parse_address
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 

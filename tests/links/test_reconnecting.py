@@ -22,9 +22,9 @@ from aerokit.errors import (
     LinkOpenError,
     RecordingEnded,
 )
-from aerokit.links import Peer, ReconnectingLink, Replay, create_link
-from aerokit.links.base import BaseLink
-from aerokit.links.reconnecting import STEADY_S
+from aerokit.transport import Peer, ReconnectingLink, Replay, create_link
+from aerokit.transport.link import BaseLink
+from aerokit.transport.reconnecting import STEADY_S
 
 pytestmark = pytest.mark.anyio
 

@@ -11,9 +11,9 @@ import pytest
 from link_harness import Recorder, each_loop
 
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.links import Replay, replay
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.testing import run_virtual
+from aerokit.transport import Replay, replay
 
 START = 1_700_000_000.0
 

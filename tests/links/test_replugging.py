@@ -9,7 +9,7 @@ import pytest
 from far_end import FarEnd, far_end
 from link_harness import Recorder, each_loop, eventually
 
-from aerokit.links import ReconnectingLink, SerialLink, TcpConnect, TcpListen, UdpConnect, UdpListen
+from aerokit.transport import ReconnectingLink, SerialLink, TcpConnect, TcpListen, UdpConnect, UdpListen
 
 SOON = {"first_delay_s": 0.01, "longest_delay_s": 0.05}
 

@@ -16,7 +16,7 @@ from far_end import far_end
 from link_harness import Recorder, each_loop, each_traffic, eventually
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
-from aerokit.links import SerialLink, serial
+from aerokit.transport import SerialLink, serial
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
 
@@ -222,7 +222,7 @@ def test_close_works_without_a_running_loop() -> None:
 
 
 def test_pyserial_is_imported_only_when_a_port_is_opened() -> None:
-    program = "import aerokit.links, sys; sys.exit('serial' in sys.modules)"
+    program = "import aerokit.transport, sys; sys.exit('serial' in sys.modules)"
     path = os.pathsep.join(entry for entry in sys.path if entry)
     subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, "PYTHONPATH": path})
 

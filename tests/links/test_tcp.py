@@ -13,8 +13,9 @@ import pytest
 from link_harness import Recorder, each_loop, each_traffic, eventually
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
-from aerokit.links import FaultyLink, Peer, ReconnectingLink, TcpConnect, TcpListen, tcp
-from aerokit.links.sockets import Endpoint
+from aerokit.testing import FaultyLink
+from aerokit.transport import Peer, ReconnectingLink, TcpConnect, TcpListen, tcp
+from aerokit.transport.sockets import Endpoint
 
 HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 

@@ -11,7 +11,15 @@ import pytest
 from link_harness import LOOPS, Recorder, each_loop, each_of, each_traffic, eventually
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
-from aerokit.links import ReconnectingLink, TcpConnect, TcpListen, UdpBroadcast, UdpConnect, UdpListen, udp
+from aerokit.transport import (
+    ReconnectingLink,
+    TcpConnect,
+    TcpListen,
+    UdpBroadcast,
+    UdpConnect,
+    UdpListen,
+    udp,
+)
 
 HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 

@@ -13,13 +13,14 @@ from zenoh_harness import Told, client, reconnecting, serving
 from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
-from aerokit.links import create_link, needed
-from aerokit.links.handover import Handover
-from aerokit.links.zenoh_keys import Stamp
-from aerokit.links.zenoh_listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, SetPositionTargetLocalNed
+from aerokit.transport import create_link
+from aerokit.transport import link as needed
+from aerokit.transport.zenoh.keys import Stamp
+from aerokit.transport.zenoh.listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
+from aerokit.transport.zenoh.session import Handover
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
@@ -411,7 +412,7 @@ async def test_a_handover_goes_on_after_a_mistake() -> None:
 
 
 def test_the_told_of_the_harness_is_a_listener() -> None:
-    from aerokit.links import HelmListener
+    from aerokit.transport import HelmListener
 
     assert isinstance(Told, type)
     assert issubclass(Told, HelmListener)

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.links.helm import HELM_KEPT_S, READ_COMMANDS, READ_MESSAGES, Gate, Helm, is_read, refusals_in
 from aerokit.mavlink import messages
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -30,7 +29,16 @@ from aerokit.mavlink.messages import (
     SetPositionTargetLocalNed,
     Statustext,
 )
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
+from aerokit.transport.zenoh.control_lease import (
+    HELM_KEPT_S,
+    READ_COMMANDS,
+    READ_MESSAGES,
+    Gate,
+    Helm,
+    is_read,
+    refusals_in,
+)
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, CHANGED_BY_MESSAGE, QUESTIONS
 
 ARM = CommandLong(1, 1, MavCmd.COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0)
 ASK = CommandLong(1, 1, MavCmd.REQUEST_MESSAGE, 0, 148, 0, 0, 0, 0, 0, 0)

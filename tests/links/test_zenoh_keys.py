@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument
-from aerokit.links.zenoh_keys import Beacon, Place, Stamp, Told, check_name, read_sent_at, sent_at
+from aerokit.transport.zenoh.keys import Beacon, Place, Stamp, Told, check_name, read_sent_at, sent_at
 
 u32 = st.integers(0, 2**32 - 1)
 names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}", fullmatch=True)

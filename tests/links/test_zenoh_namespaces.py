@@ -15,7 +15,7 @@ pytest.importorskip("zenoh")
 
 VEHICLE = """
 import asyncio, sys
-from aerokit.links import create_link
+from aerokit.transport import create_link
 
 class Ears:
     def bytes_received(self, data, peer): print("heard", len(data), flush=True)
@@ -32,7 +32,7 @@ asyncio.run(main())
 """
 CLIENT = """
 import asyncio, sys
-from aerokit.links import create_link
+from aerokit.transport import create_link
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import CommandLong
 

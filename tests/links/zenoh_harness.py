@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 
 from link_harness import Recorder
 
-from aerokit.links import ReconnectingLink, ZenohConnect, ZenohListen, create_link
+from aerokit.transport import ReconnectingLink, ZenohConnect, ZenohListen, create_link
 
 __all__ = ["Told", "client", "reconnecting", "serving"]
 

@@ -15,8 +15,7 @@ from xml.sax.saxutils import quoteattr
 from pymavlink.generator import mavgen
 
 from aerokit.mavlink.definitions import FieldDefinition, MessageDefinition
-from aerokit.mavlink.generator import definitions
-from aerokit.mavlink.union import read_additions
+from aerokit.mavlink.generator import definitions, read_additions
 
 __all__ = ["NAMED", "added_module"]
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from wire_samples import random_message
 
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer
-from aerokit.mavlink.checksum import x25
-from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED, x25
 
 __all__ = [
     "LONGEST",

@@ -9,7 +9,7 @@ import pytest
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, enums, messages
-from aerokit.mavlink.checksum import x25, x25_in_python
+from aerokit.mavlink.frame import x25, x25_in_python
 
 
 def attitude(**changes: Any) -> Message:

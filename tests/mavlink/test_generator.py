@@ -14,7 +14,7 @@ import pytest
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import enums, generator, messages
 from aerokit.mavlink.definitions import DialectDefinition, merged_enums, read_xml
-from aerokit.mavlink.union import read_additions, with_added_enums, with_added_messages
+from aerokit.mavlink.generator import read_additions, with_added_enums, with_added_messages
 
 PACKAGES = {"messages": messages, "enums": enums}
 

@@ -9,7 +9,7 @@ import pytest
 from framer_harness import some_frames, unknown
 
 from aerokit.mavlink import Frame, FrameEncoder, Framer, framer
-from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.frame import x25
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.statistics import SourceLimit
 

@@ -18,9 +18,8 @@ from wire_samples import random_message
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Message, messages
-from aerokit.mavlink.from_pymavlink import from_pymavlink
+from aerokit.mavlink.pymavlink import from_pymavlink, to_pymavlink
 from aerokit.mavlink.signing import Signing, SigningKey
-from aerokit.mavlink.to_pymavlink import to_pymavlink
 
 ATTITUDE = Frame.parse(FrameEncoder(1, 1).encode(messages.Attitude(7, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0)))
 
@@ -45,7 +44,7 @@ def test_what_is_wrong_is_named() -> None:
 
 
 def test_pymavlink_is_imported_when_it_is_used() -> None:
-    modules = "aerokit.mavlink.to_pymavlink, aerokit.mavlink.from_pymavlink"
+    modules = "aerokit.mavlink.pymavlink, aerokit.mavlink.pymavlink"
     program = f"import sys, {modules}; print('pymavlink' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout == "False\n"

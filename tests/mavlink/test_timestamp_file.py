@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from aerokit._internal.files import write_whole
 from aerokit.errors import FileFormatError, InvalidArgument
-from aerokit.mavlink import Frame, FrameEncoder, Framer, timestamp_file
+from aerokit.mavlink import Frame, FrameEncoder, Framer
+from aerokit.mavlink import signing as timestamp_file
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.mavlink.signing import ONE_MINUTE, Refusal, Signing, SigningKey
-from aerokit.whole_file import write_whole
 
 KEY = SigningKey.from_passphrase("ours")
 NO_CLOCK = 0.0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.ardupilot_habits import written_out
-from aerokit.missions.commands import DEFAULT_XY
-from aerokit.missions.item import MissionItem
+from aerokit.missions.item import DEFAULT_XY, MissionItem
+from aerokit.missions.wire import written_out
 
 RELATIVE, MISSION = MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.MISSION
 

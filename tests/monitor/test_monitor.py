@@ -12,21 +12,20 @@ import pytest
 from flight_harness import Wire
 from textual.widgets import RichLog
 
-from aerokit.cli import main
-from aerokit.cli.events import _text
+from aerokit.apps.cli import main
+from aerokit.apps.cli.events import _text
+from aerokit.apps.monitor import app as monitor
+from aerokit.apps.monitor import watch as watch_module
+from aerokit.apps.monitor.app import Monitor, Question
+from aerokit.apps.monitor.lines import Canvas
+from aerokit.apps.monitor.watch import Watch, _words
+from aerokit.connection.opening import open_connection
+from aerokit.connection.tasks import Background
 from aerokit.errors import LinkLost
+from aerokit.events import LandedStateChanged, ParameterChanged
 from aerokit.mavlink.enums import MavCmd, MavLandedState
-from aerokit.monitor import app as monitor
-from aerokit.monitor import watch as watch_module
-from aerokit.monitor.app import Monitor
-from aerokit.monitor.braille import Canvas
-from aerokit.monitor.question import Question
-from aerokit.monitor.watch import Watch, _words
-from aerokit.runtime.background import Background
-from aerokit.runtime.events import LandedStateChanged, ParameterChanged
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter, simulated_link
-from aerokit.vehicle.vehicles import vehicles_on
+from aerokit.vehicle.connect import vehicles_on
 
 pytestmark = pytest.mark.anyio
 

@@ -15,18 +15,18 @@ from pathlib import Path
 
 import pytest
 
-from aerokit.cli.exits import INTERRUPTED
-from aerokit.cli.monitor import END_WITHIN_S
+from aerokit.apps.cli.monitor import END_WITHIN_S
+from aerokit.apps.cli.output import INTERRUPTED
 
 if sys.platform == "win32":
     pytest.skip("there are no pseudo-terminals", allow_module_level=True)
 
 SOURCES = Path(__file__).parents[2] / "src"
 LIMIT_S = 60.0
-MONITOR = "import sys; from aerokit.cli.main import main; sys.exit(main(['monitor', {address!r}]))"
+MONITOR = "import sys; from aerokit.apps.cli.main import main; sys.exit(main(['monitor', {address!r}]))"
 BLOCKED = f"""
 import time
-from aerokit.monitor.app import Monitor
+from aerokit.apps.monitor.app import Monitor
 Monitor.look = lambda self: time.sleep(3600)
 {MONITOR}
 """

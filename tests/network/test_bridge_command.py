@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from zenoh_network import eventually, free_port, router
 
-from aerokit.cli.main import make_parser
+from aerokit.apps.cli.main import make_parser
 from aerokit.sim import SimulatedCopter, SimulatedPlane, simulated_link
 
 zenoh: Any = pytest.importorskip("zenoh")

@@ -20,11 +20,11 @@ from test_state_schema import SCHEMA, faults
 from zenoh_network import HoldingProxy, eventually, free_port
 
 import aerokit
-from aerokit.cli.main import make_parser
+from aerokit.apps.cli.main import make_parser
+from aerokit.apps.network import publishing
+from aerokit.apps.network.broker import _OverLink
+from aerokit.apps.network.publishing import publisher_for
 from aerokit.errors import LinkOpenError
-from aerokit.network import publishing
-from aerokit.network.broker_link import _OverLink
-from aerokit.network.publishers import publisher_for
 from aerokit.sim import SimulatedCopter, simulated_link
 
 needs_a_broker()
@@ -145,7 +145,7 @@ async def test_no_broker() -> None:
 
 async def test_somebody_who_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     before = asyncio.all_tasks()
-    monkeypatch.setattr(sys.modules["aerokit.network.mqtt_publisher"], "CONNECT_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(sys.modules["aerokit.apps.network.mqtt_publisher"], "CONNECT_TIMEOUT_S", 0.2)
     silent = await asyncio.start_server(lambda _r, w: writers.append(w), "127.0.0.1", 0)
     writers: list[asyncio.StreamWriter] = []
     async with silent:

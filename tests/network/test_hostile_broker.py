@@ -10,10 +10,10 @@ import pytest
 from zenoh_network import eventually
 
 import aerokit
+from aerokit.apps.network import publishing
+from aerokit.apps.network.publishing import publisher_for
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import CommandLong
-from aerokit.network import publishing
-from aerokit.network.publishers import publisher_for
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytest.importorskip("paho.mqtt.client")

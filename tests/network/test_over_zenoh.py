@@ -13,9 +13,9 @@ from zenoh_network import HoldingProxy, eventually, free_port, router
 
 import aerokit
 from aerokit import VelocitySetpoint, events
+from aerokit.apps.network import found, publishing
 from aerokit.errors import CommandRejected, LinkOpenError
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint
-from aerokit.network import found, publishing
 from aerokit.sim import SimulatedCopter, open_simulator
 from aerokit.sim.patience import wait_longer
 

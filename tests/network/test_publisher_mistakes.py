@@ -8,7 +8,7 @@ import logging
 import pytest
 
 import aerokit
-from aerokit.network import Publisher, publishing
+from aerokit.apps.network import Publisher, publishing
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
 

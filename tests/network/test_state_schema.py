@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 import aerokit
+from aerokit.apps.network import Publisher, publishing
+from aerokit.apps.network.publishing import REPEAT_S
+from aerokit.apps.network.schema import ENUMS, document, rendered
 from aerokit.errors import ConnectionClosed, InvalidArgument
-from aerokit.network import Publisher, publishing
-from aerokit.network.publishing import REPEAT_S
-from aerokit.network.schema import ENUMS, document, rendered
 from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing import run_virtual
 from aerokit.vehicle.state import states
@@ -86,7 +86,7 @@ class Kept(Publisher):
 def test_the_file_is_what_the_types_say() -> None:
     path = Path(__file__).parents[2] / "docs" / "state.schema.json"
     assert path.read_text(encoding="utf-8") == rendered(), (
-        "python -m aerokit.network.schema > docs/state.schema.json"
+        "python -m aerokit.apps.network.schema > docs/state.schema.json"
     )
     assert json.loads(rendered()) == SCHEMA
 

@@ -8,10 +8,9 @@ from order_air import Crossing
 from order_flights import Flown
 from order_hub import HubSky
 
-from aerokit.hub.held import ORDERS_WAIT_S
-from aerokit.hub.kinds import Kind, kind_of
+from aerokit.hub.outgoing import ORDERS_WAIT_S, Kind, kind_of
 from aerokit.hub.switch import LOOK_AT_LEAST_EVERY_S
-from aerokit.vehicle.orders.order import QUESTIONS
+from aerokit.vehicle.commanding.order import QUESTIONS
 
 LATE_S = ORDERS_WAIT_S + LOOK_AT_LEAST_EVERY_S + 0.001
 ROUNDING_S = 1e-6

@@ -21,8 +21,7 @@ import aerokit
 from aerokit.errors import AerokitError
 from aerokit.fleets.events import PolicyOrdered
 from aerokit.fleets.fleet import Fleet
-from aerokit.fleets.policy import PolicyName
-from aerokit.fleets.results import FleetResult
+from aerokit.fleets.policy import FleetResult, PolicyName
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.protocols.command import command_long

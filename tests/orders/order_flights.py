@@ -16,7 +16,6 @@ from order_table import upload
 
 import aerokit
 from aerokit.errors import AerokitError
-from aerokit.links import Link
 from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import GlobalPositionInt
@@ -24,6 +23,7 @@ from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sim.px4.modes import POSITION, RTL
 from aerokit.sim.track import true_point
 from aerokit.testing import run_virtual
+from aerokit.transport import Link
 
 Simulated = SimulatedCopter | SimulatedPx4
 

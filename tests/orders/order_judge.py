@@ -21,8 +21,8 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.orders.helm import FIRST_HEARTBEAT_S
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
+from aerokit.vehicle.commanding.helm import FIRST_HEARTBEAT_S
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
 ENDS_FLIGHT = ("disarm", "land", "return_to_launch")
 KNOWN_S = 2.6

@@ -19,7 +19,7 @@ from order_table import ARM, REPOSITION, ROWS, SET_MODE, Row
 
 from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
 from aerokit.mavlink.enums import MavCmd
-from aerokit.protocols.repeatable import SENT_ONCE
+from aerokit.protocols.command import SENT_ONCE
 
 SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 BY_NAME = {row.name: row for row in ROWS}

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aerokit._internal.files import LARGEST_FILE
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters import CameraDefinition, SettingValue, load_definition, parse_definition
 from aerokit.parameters.setting import checked_setting, setting_bytes, setting_value, settings_equal
 from aerokit.sim import components
-from aerokit.whole_file import LARGEST_FILE
 
 OWN = Path(components.__file__).with_name("camera_definition.xml")
 CAMERA = load_definition(OWN)

@@ -21,8 +21,8 @@ from aerokit.parameters import (
     read_parameter_file,
     write_parameter_file,
 )
+from aerokit.parameters.encoding import number_text, parse_number
 from aerokit.parameters.files import FileFormat, parameter_file_text
-from aerokit.parameters.number_text import number_text, parse_number
 from aerokit.parameters.parameter import same_value, to_float32
 
 FORMATS: tuple[FileFormat, ...] = ("missionplanner", "mavproxy", "qgroundcontrol")

@@ -22,7 +22,7 @@ from aerokit.parameters import (
     load_metadata,
     parse_metadata,
 )
-from aerokit.parameters.px4_hash import px4_hash
+from aerokit.parameters.pack import px4_hash
 
 ARDUPILOT_XML = """<?xml version="1.0" encoding="utf-8"?>
 <!-- made by hand -->

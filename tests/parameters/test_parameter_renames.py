@@ -19,9 +19,8 @@ from aerokit.parameters import (
     to_known,
     translate_values,
 )
-from aerokit.parameters.older_names import OLDER, ONE_WAY, REPLACED
 from aerokit.parameters.parameter import check_name, to_float32
-from aerokit.parameters.rename_table import GROUPS
+from aerokit.parameters.rename_table import GROUPS, OLDER, ONE_WAY, REPLACED
 
 INT16, INT32, REAL32 = ParameterType.INT16, ParameterType.INT32, ParameterType.REAL32
 

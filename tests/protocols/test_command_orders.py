@@ -12,14 +12,16 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandLong
 from aerokit.protocols.command import (
+    ATTEMPTS,
     FLOAT32_MAX,
+    SENT_ONCE,
     CommandExchange,
+    attempts_of,
     command_int,
     command_long,
     command_name,
     result_name,
 )
-from aerokit.protocols.repeatable import ATTEMPTS, SENT_ONCE, attempts_of
 
 ARM = MavCmd.COMPONENT_ARM_DISARM
 ACCEPTED, DENIED, IN_PROGRESS = 0, 2, 5

@@ -16,8 +16,8 @@ from aerokit.mavlink.enums import MavParamExtType as T
 from aerokit.mavlink.enums import ParamAck
 from aerokit.mavlink.message import Message
 from aerokit.parameters.setting import Setting, SettingValue, setting_bytes, setting_value
+from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.extended_parameters import SettingAnswer, SettingList, SettingReads, SettingWrite
-from aerokit.protocols.round_trip import RoundTrip
 
 RTT_S = 0.1
 KINDS = (T.UINT32, T.REAL32, T.INT8, T.CUSTOM)

@@ -13,9 +13,8 @@ from pymavlink.mavftp import FTP_OP
 from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.ftp import FtpMessage, FtpRequest, path_bytes
-from aerokit.protocols.ftp_message import ERRNOS, file_error
-from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.exchange import RoundTrip
+from aerokit.protocols.ftp import ERRNOS, FtpMessage, FtpRequest, file_error, path_bytes
 
 Op = MavFtpOpcode
 bytes_of_data = st.binary(max_size=239)

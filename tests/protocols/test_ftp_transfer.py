@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 
 from aerokit.errors import FileError, FileTimeout
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.blocks import Reassembly
+from aerokit.protocols.exchange import Progress, RoundTrip
 from aerokit.protocols.ftp import DATA_SIZE, FtpSessionLost
 from aerokit.protocols.ftp_transfer import MOST_GAPS, MOST_REPEATED, FtpDownload, FtpUpload, is_virtual
-from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.protocols.transfer import Progress
 
 Op = MavFtpOpcode
 SIZES = [0, 1, DATA_SIZE - 1, DATA_SIZE, DATA_SIZE + 1, 2 * DATA_SIZE, 5000, 20 * DATA_SIZE]

@@ -13,10 +13,9 @@ from parameter_channel import framed
 
 from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.messages import LogData, LogEntry, LogRequestData, LogRequestEnd
-from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, SPACING_S, LogDownload, LogEnd
-from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.blocks import Reassembly
+from aerokit.protocols.exchange import RoundTrip
+from aerokit.protocols.logs import LOG_BLOCK, SPACING_S, LogDownload, LogEnd, LogList
 
 
 def make_list(first_id: int = 1, **options: Any) -> LogList:

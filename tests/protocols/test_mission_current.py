@@ -6,7 +6,7 @@ import pytest
 
 from aerokit.errors import OperationTimeout
 from aerokit.mavlink.messages import MissionCurrent
-from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.protocols.missions import MissionSetCurrent
 
 
 def told(*seqs: int, wanted: int) -> bool:

@@ -14,11 +14,9 @@ from aerokit.errors import MissionRejected, MissionTimeout, OperationTimeout
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire, to_wire_float
-from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.protocols.exchange import Progress, RoundTrip
 from aerokit.protocols.mission_download import MAX_RESTARTS, MissionDownload
-from aerokit.protocols.missions import MissionClear
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.missions import MissionClear, MissionSetCurrent
 
 HELD = items(50)
 WINDOWS: list[tuple[type[Store], int]] = [(ArduPilotModel, 10), (ArduPilotModel, 1), (Px4Model, 1)]

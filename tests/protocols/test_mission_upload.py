@@ -13,9 +13,8 @@ from aerokit import messages as m
 from aerokit.errors import MissionRejected, MissionTimeout
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.mavlink.message import Message
+from aerokit.protocols.exchange import Progress, RoundTrip
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.protocols.transfer import Progress
 
 MODELS = [ArduPilotModel, Px4Model]
 OLD = items(30, seed=7)

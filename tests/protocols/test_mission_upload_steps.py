@@ -10,9 +10,9 @@ from mission_vehicles import GCS, items
 from aerokit import messages as m
 from aerokit.errors import MissionRejected
 from aerokit.mavlink.enums import MavMissionResult as Result
+from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.mission_upload import MissionUpload, UploadEnd
 from aerokit.protocols.missions import BUSY_AGAIN_S, BUSY_S
-from aerokit.protocols.round_trip import RoundTrip
 
 RTT_S = 0.1
 

@@ -13,17 +13,14 @@ from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
 from aerokit.parameters import Parameter, ParameterType
+from aerokit.protocols.blocks import Reassembly
 from aerokit.protocols.exchange import Exchange
-from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload
-from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.missions import MissionClear
+from aerokit.protocols.missions import MissionClear, MissionSetCurrent
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.parameter_read import ParameterReads
-from aerokit.protocols.parameter_write import ParameterWrites
-from aerokit.protocols.reassembly import Reassembly
+from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 
 ACCEPTED, FENCE = MavMissionResult.ACCEPTED, MavMissionType.FENCE
 ITEM = MissionItem(16, 3, x=1, y=1, z=1.0)

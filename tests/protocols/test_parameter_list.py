@@ -14,9 +14,8 @@ from aerokit.errors import InvalidArgument, ParameterTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
+from aerokit.protocols.exchange import Progress, RoundTrip
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.protocols.transfer import Progress
 
 RTT_S = 0.1
 

@@ -14,10 +14,8 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import to_wire
-from aerokit.protocols.parameter_read import ParameterReads
-from aerokit.protocols.parameter_requests import Answer, rejection
-from aerokit.protocols.parameter_write import ParameterWrites
-from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.exchange import RoundTrip
+from aerokit.protocols.parameter_requests import Answer, ParameterReads, ParameterWrites, rejection
 
 RTT_S = 0.1
 INT32, INT8, REAL32 = ParameterType.INT32, ParameterType.INT8, ParameterType.REAL32

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aerokit.protocols.reassembly import Reassembly
+from aerokit.protocols.blocks import Reassembly
 
 
 def blocks(start: int = 0, **options: int) -> tuple[Reassembly, bytearray]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from aerokit.protocols.block_requests import AdaptiveWindow, BlockRequests
+from aerokit.protocols.blocks import AdaptiveWindow, BlockRequests
+from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.request_window import FEW, LONGEST_S, RequestWindow
-from aerokit.protocols.round_trip import RoundTrip
 
 
 def window_of(count: int, round_trip: RoundTrip) -> RequestWindow[int]:

@@ -16,18 +16,15 @@ from wire_diary import DIARY
 
 from aerokit.errors import AerokitError
 from aerokit.parameters import Parameter
+from aerokit.protocols.blocks import Reassembly
+from aerokit.protocols.exchange import Progress, RoundTrip
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
-from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.parameter_read import ParameterReads
-from aerokit.protocols.parameter_write import ParameterWrites
-from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 
 SEEDS = range(16)
 

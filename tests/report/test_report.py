@@ -17,15 +17,15 @@ import pytest
 
 import aerokit
 from aerokit import messages as m
-from aerokit.cli import main
-from aerokit.flights import Columns, Flight, failsafes, read_flight
-from aerokit.flights.flight import Said, Waypoint
+from aerokit.apps.cli import main
+from aerokit.logs.flights import Columns, Flight, failsafes, read_flight
+from aerokit.logs.flights.flight import Said, Waypoint
+from aerokit.logs.report.charts import points, rows_to_draw
+from aerokit.logs.report.figures import clock, length, span
+from aerokit.logs.report.writing import report_html
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.position import Position
-from aerokit.report.series import points, rows_to_draw
-from aerokit.report.words import clock, length, span
-from aerokit.report.writing import report_html
 from aerokit.testing import open_flight, run_virtual
 
 pytest.importorskip("plotly")

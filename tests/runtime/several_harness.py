@@ -10,12 +10,13 @@ from typing import Any
 from stream_splitter import Splitter
 
 from aerokit import events
-from aerokit.links import FaultModel, FaultyLink, Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import open_connection
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedVehicle, SimulatorServer
+from aerokit.testing import FaultModel, FaultyLink
+from aerokit.transport import Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
 
 DEAD = FaultModel(loss=1.0)
 GOOD = FaultModel()

@@ -16,15 +16,15 @@ from flight_harness import Flight, block_loop
 import aerokit
 from aerokit import LinkState, open_connection
 from aerokit import messages as m
+from aerokit.connection.cells import StateCell
+from aerokit.connection.connection import Connection
+from aerokit.connection.loop_watch import QUIET_TURNS, asleep_s
 from aerokit.errors import LinkLost, StaleValueError
-from aerokit.links import Peer
-from aerokit.links.base import BaseLink
+from aerokit.events import ComputerSlept, VehicleRebooted, VehicleSilent
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.runtime.cells import StateCell
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import ComputerSlept, VehicleRebooted, VehicleSilent
-from aerokit.runtime.loop_watch import QUIET_TURNS, asleep_s
-from aerokit.vehicle.state.told import MESSAGE_IDS, message_type
+from aerokit.transport import Peer
+from aerokit.transport.link import BaseLink
+from aerokit.vehicle.state.field import MESSAGE_IDS, message_type
 
 pytestmark = pytest.mark.anyio
 

@@ -8,7 +8,7 @@ import sys
 import anyio
 import pytest
 
-from aerokit.runtime.background import Background, to_its_end
+from aerokit.connection.tasks import Background, to_its_end
 
 pytestmark = pytest.mark.anyio
 

@@ -6,13 +6,13 @@ import logging
 
 import pytest
 
+from aerokit.connection.bus import Bus
+from aerokit.events import ArmedChanged, Event, ModeChanged
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, Heartbeat
-from aerokit.runtime.bus import Bus
-from aerokit.runtime.events import ArmedChanged, Event, ModeChanged
 
 HEARTBEAT = Heartbeat(2, 3, 0, 0, 4)
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from late_loop import BEGINS_AT, since_the_beginning
 
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
-from aerokit.runtime.cells import Source, StateCell
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
 

@@ -8,14 +8,13 @@ import pytest
 from test_routes import COPTER, PeersLink
 
 from aerokit import events
+from aerokit.connection import routes as routes_module
+from aerokit.connection.routes import LIVE_FOR_S, MOVES_AFTER_S, Claim, Routes, boot_time_ms
 from aerokit.mavlink import Frame, Framer
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.statistics import SourceStatistics
-from aerokit.runtime import routes as routes_module
-from aerokit.runtime.claims import Claim, boot_time_ms
-from aerokit.runtime.routes import LIVE_FOR_S, MOVES_AFTER_S, Routes
 
 HOME, SAME_HOST, ELSEWHERE = "1@copter", "2@copter", "1@stranger"
 

@@ -15,12 +15,12 @@ from pymavlink.dialects.v20 import minimal as pymavlink
 
 from aerokit import connect, open_connection
 from aerokit.errors import ConnectFailed, InvalidArgument, LinkLost
-from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.dialect import Dialect
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavType
 from aerokit.mavlink.messages import Attitude, Heartbeat, RequestDataStream
 from aerokit.sim import ExtraComponent, SimulatedCopter, simulated_link
+from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

@@ -15,6 +15,7 @@ import pytest
 from late_loop import BEGINS_AT
 
 from aerokit import Vehicle, VelocitySetpoint, connect, open_connection
+from aerokit.connection.connection import Connection
 from aerokit.errors import (
     BusyError,
     ConnectFailed,
@@ -23,14 +24,13 @@ from aerokit.errors import (
     LinkLost,
     LinkOpenError,
 )
-from aerokit.links import MemoryLink, Peer, memory_link_pair
+from aerokit.events import HeardTwice, LinkClosed
 from aerokit.mavlink import STANDARD, Dialect
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import HeardTwice, LinkClosed
 from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

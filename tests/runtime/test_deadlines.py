@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from aerokit.runtime.deadlines import Deadlines
+from aerokit.connection.tasks import Deadlines
 from aerokit.testing import run_virtual
 
 

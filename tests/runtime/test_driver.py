@@ -10,16 +10,16 @@ import pytest
 from flight_harness import block_loop
 
 from aerokit import open_connection
+from aerokit.connection.connection import Connection
+from aerokit.connection.exchanges import run_exchange
 from aerokit.errors import CommandTimeout, ConnectionClosed, InvalidArgument, LinkLost
-from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, CommandAck, CommandLong, Heartbeat, Ping
 from aerokit.protocols.exchange import Exchange
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.driver import run_exchange
+from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

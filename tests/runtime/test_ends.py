@@ -12,6 +12,7 @@ import anyio
 import pytest
 
 from aerokit import Vehicle, connect, events, open_connection
+from aerokit.connection.connection import Connection
 from aerokit.errors import (
     AerokitError,
     BusyError,
@@ -20,12 +21,11 @@ from aerokit.errors import (
     LinkLost,
     OperationTimeout,
 )
-from aerokit.links import MemoryLink, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, Heartbeat
-from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.transport import MemoryLink, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

@@ -15,6 +15,7 @@ from leak_check import run_and_do
 
 from aerokit import Vehicle, connect, events, open_connection
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
 from aerokit.errors import (
     CommandTimeout,
     ConnectionClosed,
@@ -23,14 +24,13 @@ from aerokit.errors import (
     OperationRejected,
     RecordingEnded,
 )
-from aerokit.links import Link, Peer, ReconnectingLink, TcpConnect, TcpListen
-from aerokit.links.base import BaseLink
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.framer import Framer
-from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, open_simulator, simulated_link
+from aerokit.transport import Link, Peer, ReconnectingLink, TcpConnect, TcpListen
+from aerokit.transport.link import BaseLink
 
 pytestmark = pytest.mark.anyio
 

@@ -17,13 +17,13 @@ import pytest
 from leak_check import CountingLoop, run_and_do
 
 from aerokit import Vehicle, VelocitySetpoint, connect, open_connection
+from aerokit.connection.connection import Connection
 from aerokit.errors import ConnectionClosed, LinkLost, SetpointStreamStopped
-from aerokit.links import MemoryLink
+from aerokit.events import Event
 from aerokit.mavlink.messages import Attitude
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import Event
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing.clock import run_virtual
+from aerokit.transport import MemoryLink
 
 Use = Callable[[Vehicle], Awaitable[object]]
 

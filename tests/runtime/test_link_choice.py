@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import messages as m
+from aerokit.connection.components import HardwareId
+from aerokit.connection.multilink.duplicates import Copies
+from aerokit.connection.multilink.link_choice import PROOFS, SILENT_S, LinkChoice
+from aerokit.connection.multilink.vehicle_clock import VehicleClock
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
-from aerokit.runtime.copies import Copies
-from aerokit.runtime.hardware_id import HardwareId
-from aerokit.runtime.link_candidate import PROOFS, SILENT_S
-from aerokit.runtime.link_choice import LinkChoice
-from aerokit.runtime.vehicle_clock import VehicleClock
 
 WHAT = (
     "heard",

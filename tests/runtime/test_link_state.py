@@ -7,13 +7,12 @@ import pytest
 from flight_harness import Flight
 
 from aerokit import LinkState, connect, events, open_connection
+from aerokit.connection.bus import Bus, Subscription
+from aerokit.connection.cells import StateCell
+from aerokit.connection.link_state import LinkStateWatch
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
-from aerokit.links import memory_link_pair
-from aerokit.runtime.bus import Bus
-from aerokit.runtime.cells import StateCell
-from aerokit.runtime.link_watch import LinkStateWatch
-from aerokit.runtime.subscription import Subscription
 from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.transport import memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

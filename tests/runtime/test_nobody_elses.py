@@ -12,12 +12,12 @@ from test_routes import ATTITUDE, COPTER, PeersLink, command
 
 import aerokit
 from aerokit import Signing, SigningKey, events, open_connection
+from aerokit.connection.connection import Connection
+from aerokit.connection.frame_receiver import MOST_PEERS, MOST_SENDERS, MOST_STRANGERS
+from aerokit.connection.routes import MOST_CLAIMS, MOST_ROUTES, Routes
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, SystemTime
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.peers import MOST_PEERS, MOST_SENDERS, MOST_STRANGERS
-from aerokit.runtime.routes import MOST_CLAIMS, MOST_ROUTES, Routes
 
 pytestmark = pytest.mark.anyio
 

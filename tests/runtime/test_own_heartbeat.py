@@ -15,11 +15,11 @@ from served_copter import served, served_copter
 import aerokit.sync
 from aerokit import OwnHeartbeat, dronekit
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.connection.own_heartbeat import BLOCKING_FED_WITHIN_S
 from aerokit.errors import InvalidArgument
+from aerokit.events import HeartbeatPaused, HeartbeatResumed
 from aerokit.mavlink.enums import MavType
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import HeartbeatPaused, HeartbeatResumed
-from aerokit.runtime.own_heartbeat import BLOCKING_FED_WITHIN_S
 from aerokit.sim import SimulatedCopter
 
 

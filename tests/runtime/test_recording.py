@@ -12,14 +12,14 @@ import pytest
 from pymavlink import mavutil
 
 from aerokit import Vehicle, connect, open_connection
+from aerokit.connection.frame_observers import Recording
 from aerokit.errors import BusyError, ConnectFailed, InvalidArgument, LinkLost, LinkOpenError
-from aerokit.links import Peer, create_link, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.tlog import read_tlog
-from aerokit.runtime.recording import Recording
 from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.transport import Peer, create_link, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

@@ -8,10 +8,11 @@ import anyio
 import pytest
 
 from aerokit import connect, events, open_connection
+from aerokit.connection.connection import Connection
+from aerokit.connection.frame_receiver import MOST_PEERS
 from aerokit.errors import ConnectFailed
-from aerokit.links import MemoryLink, Peer
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import x25
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import (
@@ -22,8 +23,7 @@ from aerokit.mavlink.messages import (
     RequestDataStream,
     Timesync,
 )
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.peers import MOST_PEERS
+from aerokit.transport import MemoryLink, Peer
 
 pytestmark = pytest.mark.anyio
 

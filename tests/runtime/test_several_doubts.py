@@ -12,21 +12,20 @@ from several_harness import GOOD, News, Radios, Told, over
 import aerokit
 from aerokit import events
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.connection.multilink.link_choice import PATIENCE_S, STEADY_S, LinkChoice
+from aerokit.connection.multilink.link_questions import UNWANTED_HZ
+from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, LinkLost, LinkOpenError
-from aerokit.links import FaultModel, Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
-from aerokit.mavlink.checksum import x25
+from aerokit.events import LinkState
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.frame import Frame, x25
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.link_choice import PATIENCE_S, STEADY_S, LinkChoice
-from aerokit.runtime.link_questions import UNWANTED_HZ
-from aerokit.runtime.link_state import LinkState
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter
-from aerokit.testing import VIRTUAL_BACKEND
+from aerokit.testing import VIRTUAL_BACKEND, FaultModel
+from aerokit.transport import Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

@@ -12,10 +12,9 @@ from several_harness import News, Radios, Told, over
 import aerokit
 from aerokit import events
 from aerokit import messages as m
+from aerokit.connection.components import HardwareId
+from aerokit.connection.multilink.link_choice import PROOFS, UNNAMED_AFTER, LinkChoice
 from aerokit.errors import AerokitError
-from aerokit.runtime.hardware_id import HardwareId
-from aerokit.runtime.link_candidate import PROOFS, UNNAMED_AFTER
-from aerokit.runtime.link_choice import LinkChoice
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND
 

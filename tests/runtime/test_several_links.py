@@ -11,16 +11,16 @@ from several_harness import DEAD, GOOD, News, Radios, Told, over
 import aerokit
 from aerokit import events
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import open_connection
 from aerokit.errors import AerokitError, InvalidArgument, LinkLost, LinkOpenError
+from aerokit.events import LinkState
 from aerokit.hub import shared
-from aerokit.links import FaultModel, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.missions import Mission, waypoint
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.link_state import LinkState
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, SimulatorServer
-from aerokit.testing import VIRTUAL_BACKEND
+from aerokit.testing import VIRTUAL_BACKEND, FaultModel
+from aerokit.transport import memory_link_pair
 
 pytestmark = pytest.mark.anyio
 
@@ -316,7 +316,7 @@ async def test_links_that_cannot_be_opened() -> None:
 
 
 async def test_one_address_in_a_list_is_one_link() -> None:
-    near, far = aerokit.links.memory_link_pair()
+    near, far = aerokit.transport.memory_link_pair()
     async with SimulatorServer(a_copter(), far), open_connection([near]) as connection:
         assert connection.links is None
         async with aerokit.connect(connection) as vehicle:

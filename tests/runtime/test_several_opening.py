@@ -10,11 +10,11 @@ import pytest
 from several_harness import News
 
 from aerokit import events
+from aerokit.connection.opening import open_connection
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.links import Link, MemoryLink, SeveralLinks, memory_link_pair
-from aerokit.runtime.link_state import LinkState
-from aerokit.runtime.opening import open_connection
+from aerokit.events import LinkState
 from aerokit.testing import VIRTUAL_BACKEND
+from aerokit.transport import Link, MemoryLink, SeveralLinks, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

@@ -12,6 +12,7 @@ import anyio
 import pytest
 
 from aerokit import Signing, SigningKey, Vehicle, connect, events, open_connection
+from aerokit.connection.connection import Connection
 from aerokit.errors import (
     BusyError,
     CommandTimeout,
@@ -21,13 +22,13 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.links import memory_link_pair
-from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, read_tlog, timestamp_file
+from aerokit.mavlink import Frame, FrameEncoder, Framer, Message, read_tlog
+from aerokit.mavlink import signing as timestamp_file
 from aerokit.mavlink.messages import Attitude, Heartbeat, RadioStatus, SetupSigning
 from aerokit.mavlink.signing import Refusal
-from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.sim.channel import Channel
+from aerokit.transport import memory_link_pair
 from aerokit.vehicle.connect import connect as connect_vehicle
 
 pytestmark = pytest.mark.anyio

@@ -5,9 +5,8 @@ from __future__ import annotations
 import anyio
 import pytest
 
+from aerokit.connection.bus import Detach, Overflow, Sink, Subscription
 from aerokit.errors import ConnectionClosed, InvalidArgument, OperationTimeout, SubscriptionOverflow
-from aerokit.runtime.bus import Detach, Sink
-from aerokit.runtime.subscription import Overflow, Subscription
 
 pytestmark = pytest.mark.anyio
 

@@ -9,14 +9,14 @@ import anyio
 import pytest
 
 from aerokit import connect, open_connection
+from aerokit.connection.connection import Connection
 from aerokit.errors import ConnectionClosed, InvalidArgument, LinkLost
-from aerokit.links import MemoryLink, Peer, memory_link_pair
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList, PlayTune
-from aerokit.runtime.connection import Connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 from flight_harness import Flight, open_flight
 
-from aerokit.serve import ServeApp, make_app
+from aerokit.apps.serve import ServeApp, make_app
 
 TOKEN = "a-token-of-24-characters"
 HOST = "127.0.0.1:8080"

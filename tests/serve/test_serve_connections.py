@@ -15,10 +15,10 @@ from serve_stage import TOKEN
 from websockets.typing import Subprotocol
 
 import aerokit
-import aerokit.serve.connections as connections
-from aerokit.cli.serve import config_of
-from aerokit.serve import make_app
-from aerokit.serve.connections import MAX_STRANGERS
+import aerokit.apps.serve.guard as connections
+from aerokit.apps.cli.serve import config_of
+from aerokit.apps.serve import make_app
+from aerokit.apps.serve.guard import MAX_STRANGERS
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio

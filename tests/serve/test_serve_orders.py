@@ -9,10 +9,10 @@ import pytest
 from flight_harness import open_flight
 from serve_stage import HOST, TOKEN, open_stage
 
+from aerokit.apps.serve import make_app
+from aerokit.apps.serve.orders import ORDERS
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.serve import make_app
-from aerokit.serve.orders import ORDERS
 
 pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -155,7 +155,7 @@ async def test_an_order_is_given_once() -> None:
 
 
 async def test_nor_when_its_result_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.serve.orders.MOST_KEPT", 3)
+    monkeypatch.setattr("aerokit.apps.serve.orders.MOST_KEPT", 3)
     async with open_stage() as stage:
         await stage.give("arm", Idempotency_Key="the-same-key")
         await stage.give("disarm")
@@ -169,8 +169,8 @@ async def test_nor_when_its_result_is_forgotten(monkeypatch: pytest.MonkeyPatch)
 async def test_a_flood_of_keys_fills_no_memory_and_every_one_is_used_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("aerokit.serve.orders.MOST_KEPT", 5)
-    monkeypatch.setattr("aerokit.serve.orders.MOST_KEYS", 20)
+    monkeypatch.setattr("aerokit.apps.serve.orders.MOST_KEPT", 5)
+    monkeypatch.setattr("aerokit.apps.serve.orders.MOST_KEYS", 20)
     async with open_stage() as stage:
         for number in range(40):
             await stage.give("disarm", Idempotency_Key=f"flood-{number:04}")

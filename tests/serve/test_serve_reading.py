@@ -14,11 +14,11 @@ from starlette.applications import Starlette
 from starlette.routing import Mount, Route, WebSocketRoute
 
 import aerokit
+from aerokit.apps.serve import make_app
+from aerokit.apps.serve.app import STATIC
+from aerokit.apps.serve.stream import MOST_SOCKETS, MOST_VIEWERS, MOST_WAITING
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Mission, return_to_launch, take_off
-from aerokit.serve import make_app
-from aerokit.serve.app import STATIC
-from aerokit.serve.stream import MOST_SOCKETS, MOST_VIEWERS, MOST_WAITING
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio

@@ -8,13 +8,13 @@ from typing import TypeVar
 
 from hypothesis import strategies as st
 
-from aerokit.links.fault_model import FaultModel, FaultyPath
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.protocols.exchange import Exchange
 from aerokit.sim import SimulatedCopter, SimulatedLog, SimulatedPx4
 from aerokit.sim.streams import Streams
+from aerokit.testing.fault_model import FaultModel, FaultyPath
 
 ResultT = TypeVar("ResultT")
 Vehicle = SimulatedCopter | SimulatedPx4

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 import aerokit.sim
 from aerokit.errors import LinkLost
-from aerokit.links import Peer
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavDataStream
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, Wind, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.transport import Peer
 
 KINDS = [
     kind

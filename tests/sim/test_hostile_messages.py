@@ -7,8 +7,8 @@ import math
 import pytest
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import x25
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey

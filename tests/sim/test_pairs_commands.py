@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from protocol_pair import KINDS, Pair, radios, seeds, vehicle_of
 
 from aerokit.errors import CommandRejected
-from aerokit.links.fault_model import FaultModel
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, Timesync
 from aerokit.protocols.command import CommandExchange, command_long
 from aerokit.protocols.exchange import Exchange
+from aerokit.testing.fault_model import FaultModel
 
 # Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.
 few = settings(max_examples=8, phases=[Phase.generate])

@@ -10,15 +10,13 @@ from hypothesis import strategies as st
 from protocol_pair import KINDS, LOGS, Pair, radios, seeds, vehicle_of
 
 from aerokit.errors import FileError
-from aerokit.links.fault_model import FaultModel
 from aerokit.mavlink.enums import MavFtpOpcode
 from aerokit.parameters import unpack_parameters
-from aerokit.protocols.ftp import FtpClient, FtpRequest
-from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
+from aerokit.protocols.blocks import Reassembly
+from aerokit.protocols.ftp import DATA_SIZE, FtpClient, FtpMessage, FtpRequest
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
-from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
-from aerokit.protocols.reassembly import Reassembly
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd, LogList
+from aerokit.testing.fault_model import FaultModel
 
 # Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.
 few = settings(max_examples=6, phases=[Phase.generate])

@@ -8,12 +8,11 @@ from hypothesis import strategies as st
 from protocol_pair import KINDS, Pair, radios, seeds, vehicle_of
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
-from aerokit.links.fault_model import FaultModel
 from aerokit.parameters import Parameter
-from aerokit.parameters.px4_hash import px4_hash
+from aerokit.parameters.pack import px4_hash
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.parameter_read import ParameterReads
-from aerokit.protocols.parameter_write import ParameterWrites
+from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
+from aerokit.testing.fault_model import FaultModel
 
 each = pytest.mark.parametrize("kind", KINDS)
 # Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.

@@ -10,14 +10,13 @@ from hypothesis import strategies as st
 from mission_client import CIRCLE, RALLY, VERTEX, WAYPOINT, item
 from protocol_pair import KINDS, Pair, radios, seeds, vehicle_of
 
-from aerokit.links.fault_model import FaultModel
 from aerokit.mavlink.enums import MavFrame, MavMissionType
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
-from aerokit.protocols.mission_current import MissionSetCurrent
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.missions import MissionClear
+from aerokit.protocols.missions import MissionClear, MissionSetCurrent
+from aerokit.testing.fault_model import FaultModel
 
 # Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.
 few = settings(max_examples=6, phases=[Phase.generate])

@@ -16,7 +16,7 @@ from aerokit.missions import Mission
 from aerokit.missions.navigation import waypoint
 from aerokit.sim import SimulatedRover, simulated_link
 from aerokit.sim.ardupilot.telemetry_state import heartbeat
-from aerokit.vehicle.orders.setpoints import VelocitySetpoint
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 

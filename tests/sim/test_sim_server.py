@@ -11,7 +11,6 @@ import pytest
 from late_loop import since_the_beginning
 
 from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError
-from aerokit.links import Link, Peer, TcpConnect, TcpListen, UdpConnect, UdpListen, memory_link_pair
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -19,6 +18,7 @@ from aerokit.mavlink.enums import MavCmd, MavDataStream
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
+from aerokit.transport import Link, Peer, TcpConnect, TcpListen, UdpConnect, UdpListen, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 

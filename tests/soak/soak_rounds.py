@@ -14,7 +14,7 @@ from pathlib import Path
 import anyio
 
 import aerokit
-from aerokit.runtime.events import LinkRestored
+from aerokit.events import LinkRestored
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
 from aerokit.sim.patience import wait_longer
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aerokit.flights import read_flight
+from aerokit.logs.flights import read_flight
 from aerokit.position import Position
 from aerokit.sim.picture import draw_svg
 from aerokit.sim.track import Track, TrackPoint

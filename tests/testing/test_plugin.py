@@ -328,8 +328,7 @@ def test_importing_it_is_cheap() -> None:
     own = {name for name in done.stdout.split() if name.startswith("aerokit")}
     assert own == {
         "aerokit",
-        "aerokit.installed",
-        "aerokit.lazy",
+        "aerokit._internal.imports",
         "aerokit.testing",
         "aerokit.testing.plugin",
     }

@@ -6,8 +6,9 @@ from typing import Any
 
 from flight_harness import Flight, Px4Flight, Wire
 
-from aerokit import Position, geo
+from aerokit import Position
 from aerokit import messages as m
+from aerokit._internal import geo
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.navigation import take_off, waypoint
 from aerokit.sim import HOME as SIMULATED_HOME

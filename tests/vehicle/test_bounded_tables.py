@@ -8,16 +8,16 @@ from __future__ import annotations
 import pytest
 from flight_harness import Flight, open_flight
 
-from aerokit.dronekit.parameter_transfers import ParameterValues
+from aerokit.connection.bus import Bus
+from aerokit.dronekit.parameters import ParameterValues
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import AvailableModes, Heartbeat, ParamRequestRead, ParamValue, Statustext
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.parameter import MOST_PARAMETERS
+from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.runtime.bus import Bus
 from aerokit.sim.channel import Channel
 from aerokit.sim.hearing import MOST_PEERS
 from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler

@@ -12,7 +12,7 @@ from flight_harness import Flight, now
 from aerokit.errors import FileError, InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
+from aerokit.protocols.ftp import DATA_SIZE, FtpMessage
 from aerokit.vehicle.files import files
 
 pytestmark = pytest.mark.anyio

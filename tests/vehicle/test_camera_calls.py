@@ -21,7 +21,7 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 from aerokit.sim.components.storage import GREY_JPEG
-from aerokit.vehicle.camera.lens import AutoFocus
+from aerokit.vehicle.camera.controls import AutoFocus
 
 pytestmark = pytest.mark.anyio
 

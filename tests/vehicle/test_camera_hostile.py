@@ -16,15 +16,14 @@ from flight_harness import Flight, Px4Flight, open_flight, open_px4
 
 import aerokit
 from aerokit import messages as m
-from aerokit.cli.camera import _file_name, _show
+from aerokit.apps.cli.camera import _file_name, _show
 from aerokit.errors import AerokitError, NotSupported, OperationTimeout
 from aerokit.events import ImageCaptured
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCamera, SimulatedCopter
-from aerokit.vehicle.camera.capture import Capture
-from aerokit.vehicle.camera.geotag import captures_csv
+from aerokit.vehicle.camera.capture import Capture, captures_csv
 
 pytestmark = pytest.mark.anyio
 

@@ -20,8 +20,8 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
+from aerokit.events import VehicleRebooted
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
-from aerokit.runtime.events import VehicleRebooted
 from aerokit.sim import BootTimeline, ExtraComponent, SimulatedCopter
 
 pytestmark = pytest.mark.anyio

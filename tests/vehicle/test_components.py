@@ -12,6 +12,8 @@ import pytest
 
 import aerokit
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import open_connection
 from aerokit.errors import (
     CommandRejected,
     FileFormatError,
@@ -21,8 +23,6 @@ from aerokit.errors import (
 )
 from aerokit.events import ComponentFound, StreamSlow, VehicleFound
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal, SimulatedPx4, simulated_link
 from aerokit.vehicle.components.component import Component
 

@@ -10,9 +10,9 @@ from wire_diary import DIARY
 
 from aerokit.autopilots import autopilot_for
 from aerokit.mavlink import messages
+from aerokit.vehicle.state.field import message_type
 from aerokit.vehicle.state.states import SOURCES
 from aerokit.vehicle.state.telemetry import Telemetry
-from aerokit.vehicle.state.told import message_type
 
 HEARTBEATS = {
     "copter": messages.Heartbeat(2, 3, 81, 4, 3),

@@ -11,11 +11,11 @@ from typing import NoReturn
 import anyio
 import pytest
 
+from aerokit._internal.files import LARGEST_FILE
 from aerokit.errors import FileFormatError, FileTimeout, OperationRejected
 from aerokit.parameters import parse_definition
 from aerokit.sim.components.camera_parameters import own_definition
-from aerokit.vehicle.components.remote_file import fetch
-from aerokit.whole_file import LARGEST_FILE
+from aerokit.vehicle.components.session import fetch
 
 pytestmark = pytest.mark.anyio
 PATIENCE_S = 5.0

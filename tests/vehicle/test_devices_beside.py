@@ -11,10 +11,10 @@ import pytest
 
 import aerokit
 from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import open_connection
 from aerokit.errors import CommandRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal, SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio

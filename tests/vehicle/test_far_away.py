@@ -9,7 +9,7 @@ from flight_harness import Flight
 from aerokit import Position
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Mission, RallyPoints, rally_point, waypoint
-from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 pytestmark = pytest.mark.anyio
 

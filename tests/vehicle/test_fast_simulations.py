@@ -12,7 +12,7 @@ from flight_harness import block_loop
 from aerokit import Vehicle, VelocitySetpoint, connect
 from aerokit import messages as m
 from aerokit.errors import SetpointStreamStopped
-from aerokit.runtime.events import VehicleRebooted
+from aerokit.events import VehicleRebooted
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.sim.patience import wait_longer
 

@@ -12,7 +12,7 @@ from aerokit import messages as m
 from aerokit.errors import CommandRejected, InvalidArgument, MissionRejected, NotSupported
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, waypoint
-from aerokit.missions.storage import Storage
+from aerokit.missions.compare import Storage
 from aerokit.position import Position
 
 pytestmark = pytest.mark.anyio

@@ -23,13 +23,12 @@ from aerokit.errors import (
     InvalidArgument,
     VerificationFailed,
 )
-from aerokit.links import FaultModel, FaultyLink
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.exchange import Progress
 from aerokit.protocols.ftp import FtpMessage
-from aerokit.protocols.transfer import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
-from aerokit.testing import run_virtual
+from aerokit.testing import FaultModel, FaultyLink, run_virtual
 from aerokit.vehicle.files.files import FileEntry
 
 pytestmark = pytest.mark.anyio

@@ -8,8 +8,10 @@ import anyio
 import pytest
 from flight_harness import Flight, in_the_air, now, open_flight, speed_of
 
-from aerokit import Position, geo
+from aerokit import Position
 from aerokit import messages as m
+from aerokit._internal import geo
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
     HeartbeatTimeout,
@@ -18,10 +20,9 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavResult
-from aerokit.runtime.cells import Source, StateCell
 from aerokit.sim import SimulatedCopter
-from aerokit.vehicle.orders import flight
-from aerokit.vehicle.orders.setpoints import VelocitySetpoint
+from aerokit.vehicle.commanding import flight
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 

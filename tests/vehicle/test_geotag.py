@@ -13,9 +13,8 @@ from PIL import Image
 from aerokit import Position
 from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
 from aerokit.sim.components.storage import GREY_JPEG
-from aerokit.vehicle.camera import geotag
-from aerokit.vehicle.camera.capture import Capture
-from aerokit.vehicle.camera.geotag import captures_csv, geotag_file, geotagged, write_captures
+from aerokit.vehicle.camera import capture as geotag
+from aerokit.vehicle.camera.capture import Capture, captures_csv, geotag_file, geotagged, write_captures
 
 PLACE = Position(-35.3632621, 149.1652374, altitude_amsl_m=634.25, altitude_relative_m=50.0)
 CAPTURE = Capture(

@@ -14,6 +14,7 @@ from flight_harness import Flight, Wire, in_the_air, open_flight
 import aerokit
 from aerokit import Position
 from aerokit import messages as m
+from aerokit.connection.cells import Source
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -24,7 +25,6 @@ from aerokit.errors import (
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
-from aerokit.runtime.cells import Source
 from aerokit.sim import SimulatedCopter, SimulatedGimbal, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.sim.commands import CommandHandler
 

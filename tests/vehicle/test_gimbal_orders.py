@@ -12,6 +12,7 @@ from gimbal_stage import CONFIGURE, MOUNT, PITCHYAW, REQUEST, beside, copter_wit
 
 from aerokit import Position
 from aerokit import messages as m
+from aerokit.connection.cells import Source
 from aerokit.errors import (
     BusyError,
     CommandRejected,
@@ -25,9 +26,8 @@ from aerokit.errors import (
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavCmd, MavMountMode, MavResult
-from aerokit.runtime.cells import Source
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
-from aerokit.vehicle.gimbal.hearing import MOST
+from aerokit.vehicle.gimbal.discovery import MOST
 
 pytestmark = pytest.mark.anyio
 

@@ -24,8 +24,8 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION
-from aerokit.vehicle.orders.guided import SetpointStream
-from aerokit.vehicle.orders.setpoints import (
+from aerokit.vehicle.commanding.guided import SetpointStream
+from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
     BodyVelocitySetpoint,

@@ -10,12 +10,12 @@ from typing import Any, cast
 import pytest
 
 from aerokit.autopilots import Mode, autopilot_for
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.vehicle.orders.helm import KNOWN_S, MODE_GRACE_S, Helm
-from aerokit.vehicle.orders.order import CHANGED_BY_COMMAND, QUESTIONS, Order, Sending
+from aerokit.vehicle.commanding.helm import KNOWN_S, MODE_GRACE_S, Helm
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, QUESTIONS, Order, Sending
 from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")

@@ -13,7 +13,7 @@ from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.sim import SimulatedCopter, SimulatedPx4
-from aerokit.vehicle.orders.late_arming import LATE_S
+from aerokit.vehicle.commanding.cleanup import LATE_S
 
 pytestmark = pytest.mark.anyio
 

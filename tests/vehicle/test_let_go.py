@@ -13,8 +13,8 @@ from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, Se
 from aerokit.mavlink.enums import CopterMode
 from aerokit.mavlink.messages import Heartbeat, SetMode
 from aerokit.sim import SimulatedCopter, simulated_link
-from aerokit.vehicle.orders.setpoints import VelocitySetpoint
-from aerokit.vehicle.vehicles import vehicles_on
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+from aerokit.vehicle.connect import vehicles_on
 
 pytestmark = pytest.mark.anyio
 

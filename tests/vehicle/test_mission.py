@@ -13,6 +13,7 @@ from plan_flights import long_mission, short_mission
 
 from aerokit import events
 from aerokit import messages as m
+from aerokit.connection.bus import Subscription
 from aerokit.errors import (
     CommandRejected,
     HeartbeatTimeout,
@@ -24,7 +25,6 @@ from aerokit.mavlink.enums import CopterMode, MavCmd, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch
-from aerokit.runtime.subscription import Subscription
 from aerokit.sim.ardupilot.mission_run import MissionRun
 
 pytestmark = pytest.mark.anyio

@@ -24,9 +24,9 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
-from aerokit.missions.storage import Storage
+from aerokit.missions.compare import Storage
 from aerokit.position import Position
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.exchange import Progress
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio

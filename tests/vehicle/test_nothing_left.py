@@ -12,14 +12,15 @@ from flight_harness import Flight, attached_sinks, in_the_air, open_flight, wait
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit import Position, Vehicle, geo
+from aerokit import Position, Vehicle
 from aerokit import messages as m
+from aerokit._internal import geo
 from aerokit.errors import AerokitError
+from aerokit.events import ModeChanged
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
-from aerokit.runtime.events import ModeChanged
 from aerokit.sim import SimulatedCopter
 from aerokit.testing.clock import run_virtual
-from aerokit.vehicle.orders.setpoints import BodyVelocitySetpoint, VelocitySetpoint
+from aerokit.vehicle.commanding.setpoints import BodyVelocitySetpoint, VelocitySetpoint
 
 Action = Callable[[Flight], Awaitable[object]]
 

@@ -6,7 +6,7 @@ import pytest
 
 from aerokit.errors import ParameterRejected
 from aerokit.parameters import Parameter, ParameterType
-from aerokit.vehicle.parameters.results import outcome_of
+from aerokit.vehicle.parameters.writing import outcome_of
 
 INT, REAL = ParameterType.INT32, ParameterType.REAL32
 

@@ -23,18 +23,18 @@ from aerokit.errors import (
     ParameterRejected,
     ParameterTimeout,
 )
-from aerokit.links import FaultModel, FaultyLink
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterType
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.exchange import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.testing import FaultModel, FaultyLink
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.parameters.access import LEAST_TO_PACK, MOST_TO_READ_BACK
-from aerokit.vehicle.parameters.cache import default_directory
-from aerokit.vehicle.parameters.names import Found, found_among
 from aerokit.vehicle.parameters.parameters import Parameters
+from aerokit.vehicle.parameters.store import default_directory
+from aerokit.vehicle.parameters.writing import Found, found_among
 
 pytestmark = pytest.mark.anyio
 

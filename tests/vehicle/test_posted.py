@@ -12,6 +12,7 @@ from flight_harness import Flight, in_the_air, now
 
 from aerokit import messages as m
 from aerokit.autopilots import Mode, autopilot_for
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -22,11 +23,10 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.vehicle.orders.helm import MODE_GRACE_S, Helm
-from aerokit.vehicle.orders.order import Subject, subjects_of
-from aerokit.vehicle.orders.posted import OWN_MODES_S, Posted
-from aerokit.vehicle.orders.posting import MODE_ATTEMPTS
+from aerokit.vehicle.commanding.helm import MODE_GRACE_S, Helm
+from aerokit.vehicle.commanding.order import Subject, subjects_of
+from aerokit.vehicle.commanding.posted import OWN_MODES_S, Posted
+from aerokit.vehicle.commanding.posting import MODE_ATTEMPTS
 from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")

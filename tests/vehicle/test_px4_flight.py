@@ -9,11 +9,12 @@ import anyio
 import pytest
 from flight_harness import Px4Flight, now, open_px4
 
-from aerokit import Position, geo
+from aerokit import Position
 from aerokit import messages as m
+from aerokit._internal import geo
+from aerokit.connection.cells import StateCell
 from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.runtime.cells import StateCell
 from aerokit.sim.px4.modes import POSITION, custom_mode
 
 pytestmark = pytest.mark.anyio

@@ -10,7 +10,7 @@ from aerokit import messages as m
 from aerokit import missions
 from aerokit.errors import OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
-from aerokit.protocols.mission_current import MissionSetCurrent
+from aerokit.protocols.missions import MissionSetCurrent
 from aerokit.sim.px4.modes import POSITION
 
 pytestmark = pytest.mark.anyio

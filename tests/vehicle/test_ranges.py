@@ -12,8 +12,8 @@ from flight_harness import Flight
 
 from aerokit import Position
 from aerokit import messages as m
+from aerokit._internal.arguments import check_range
 from aerokit.errors import InvalidArgument
-from aerokit.vehicle.checks import check_range
 
 pytestmark = pytest.mark.anyio
 

@@ -11,9 +11,9 @@ from flight_harness import Flight, open_flight, open_px4
 
 from aerokit import messages as m
 from aerokit.errors import InvalidArgument
+from aerokit.events import StreamSlow, StreamUnavailable
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
 from aerokit.mavlink.message import Message
-from aerokit.runtime.events import StreamSlow, StreamUnavailable
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio

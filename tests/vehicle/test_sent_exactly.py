@@ -22,13 +22,13 @@ from aerokit.errors import (
     OperationTimeout,
     SetpointStreamStopped,
 )
+from aerokit.events import VehicleSilent
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.runtime.events import VehicleSilent
 from aerokit.sim import SimulatedCopter, SimulatedRover, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
-from aerokit.vehicle.orders.progress import await_progress
-from aerokit.vehicle.orders.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
-from aerokit.vehicle.talk.commands import UNDER_WAY_S, CommandSender
+from aerokit.vehicle.commanding.progress import await_progress
+from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
+from aerokit.vehicle.session.commands import UNDER_WAY_S, CommandSender
 
 pytestmark = pytest.mark.anyio
 

@@ -13,6 +13,7 @@ import pytest
 
 import aerokit
 from aerokit import messages as m
+from aerokit._internal.files import LARGEST_FILE
 from aerokit.errors import (
     FileError,
     FileFormatError,
@@ -29,7 +30,6 @@ from aerokit.parameters import Setting
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal, simulated_link
 from aerokit.sim.components.camera_parameters import DEFINITION_PATH, own_definition
 from aerokit.vehicle.components.settings import Settings
-from aerokit.whole_file import LARGEST_FILE
 
 pytestmark = pytest.mark.anyio
 LISTED = 12

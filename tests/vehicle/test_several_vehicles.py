@@ -12,11 +12,11 @@ from flight_harness import Wire, now
 
 import aerokit
 from aerokit import messages as m
+from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, CommandTimeout, ConnectFailed
+from aerokit.events import ArmedChanged, ModeChanged, StatusTextReceived, VehicleFound, VehicleSilent
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavAutopilot, MavCmd, MavResult, MavState, MavType
-from aerokit.runtime.events import ArmedChanged, ModeChanged, StatusTextReceived, VehicleFound, VehicleSilent
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import ExtraComponent, SimulatedCopter, SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio

@@ -10,12 +10,12 @@ import aerokit
 import aerokit.sync
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavPowerStatus
+from aerokit.vehicle.session.rates import subscription_rate_hz
 from aerokit.vehicle.state.equipment import Power
+from aerokit.vehicle.state.field import By, Told
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
 from aerokit.vehicle.state.table import documentation, rendered
 from aerokit.vehicle.state.telemetry import Telemetry
-from aerokit.vehicle.state.told import By, Told
-from aerokit.vehicle.talk.rates import subscription_rate_hz
 
 
 def test_default_rates() -> None:

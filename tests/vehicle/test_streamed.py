@@ -7,13 +7,13 @@ import threading
 import pytest
 
 from aerokit.autopilots import autopilot_for
+from aerokit.connection.bus import Bus
 from aerokit.mavlink import FrameEncoder, Framer, Message, messages
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import offset_of
-from aerokit.runtime.bus import Bus
+from aerokit.vehicle.state.field import MESSAGE_IDS, message_type
 from aerokit.vehicle.state.states import LAZY, SOURCES
 from aerokit.vehicle.state.telemetry import Telemetry
-from aerokit.vehicle.state.told import MESSAGE_IDS, message_type
 
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
 CHANNELS: dict[str, int] = {f"chan{number}_raw": 1500 for number in range(1, 19)}

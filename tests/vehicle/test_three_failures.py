@@ -18,9 +18,9 @@ from flight_harness import Flight, block_loop, now, open_flight
 
 from aerokit import messages as m
 from aerokit.errors import CommandTimeout
+from aerokit.events import StatusTextReceived
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
-from aerokit.runtime.events import StatusTextReceived
 
 pytestmark = pytest.mark.anyio
 

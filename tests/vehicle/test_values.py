@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from aerokit import enums, messages
 from aerokit.errors import InvalidArgument
 from aerokit.position import Position
-from aerokit.vehicle.state import gimbal
+from aerokit.vehicle.state import equipment as gimbal
 from aerokit.vehicle.state.condition import EstimatorHealth, SensorHealth
 from aerokit.vehicle.state.equipment import GpsReceiver
 from aerokit.vehicle.state.movement import Attitude, Home, Velocity

@@ -16,10 +16,9 @@ from flight_harness import open_flight, open_px4
 import aerokit
 from aerokit import messages as m
 from aerokit.errors import FileError, FileTimeout, InvalidArgument
-from aerokit.links import FaultModel, FaultyLink
-from aerokit.protocols.transfer import Progress
+from aerokit.protocols.exchange import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
-from aerokit.testing import run_virtual
+from aerokit.testing import FaultModel, FaultyLink, run_virtual
 from aerokit.vehicle.files.files import FileEntry
 from aerokit.vehicle.files.log_paths import log_path
 from aerokit.vehicle.files.logs import LogEntry

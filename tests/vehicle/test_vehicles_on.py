@@ -8,11 +8,11 @@ import anyio
 import pytest
 
 import aerokit
+from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, ConnectionClosed
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
-from aerokit.vehicle.overview import overview
-from aerokit.vehicle.vehicles import vehicles_on
+from aerokit.vehicle.connect import vehicles_on
+from aerokit.vehicle.vehicle import overview
 
 pytestmark = pytest.mark.anyio
 

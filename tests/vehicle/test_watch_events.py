@@ -13,10 +13,10 @@ import pytest
 from flight_harness import Flight, block_loop, in_the_air, now, open_flight
 
 from aerokit import messages as m
+from aerokit.connection.bus import Subscription
+from aerokit.connection.cells import Source
 from aerokit.errors import LinkLost, OperationTimeout, StaleValueError, ValueUnknownError
-from aerokit.mavlink.enums import CopterMode
-from aerokit.runtime.cells import Source
-from aerokit.runtime.events import (
+from aerokit.events import (
     ArmedChanged,
     Event,
     LandedStateChanged,
@@ -29,7 +29,7 @@ from aerokit.runtime.events import (
     VehicleRebooted,
     VehicleSilent,
 )
-from aerokit.runtime.subscription import Subscription
+from aerokit.mavlink.enums import CopterMode
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio

@@ -11,14 +11,14 @@ from typing import Any, cast
 import pytest
 
 from aerokit import Position
+from aerokit.connection.cells import Source, StateCell
+from aerokit.connection.connection import Connection
+from aerokit.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
 from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
-from aerokit.vehicle.orders.bridge import Bridge
-from aerokit.vehicle.orders.progress import Stillness
-from aerokit.vehicle.orders.setpoints import (
+from aerokit.vehicle.commanding.context import Bridge
+from aerokit.vehicle.commanding.progress import Stillness
+from aerokit.vehicle.commanding.setpoints import (
     FAR,
     SLOW_M_S,
     BodyVelocitySetpoint,
@@ -27,9 +27,9 @@ from aerokit.vehicle.orders.setpoints import (
     VelocitySetpoint,
     wants_motion,
 )
+from aerokit.vehicle.session.session import Talk
+from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.movement import LocalPosition
-from aerokit.vehicle.talk.talk import Talk
-from aerokit.vehicle.talk.watch import LinkWatch, VehicleWatch
 
 HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
 

@@ -13,9 +13,9 @@ from flight_harness import Flight, in_the_air
 from wrong_types import Misuse, misuses, misuses_of, refusal_of
 
 import aerokit
+from aerokit.connection.connection import Connection
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.runtime.connection import Connection
 
 pytestmark = pytest.mark.anyio
 

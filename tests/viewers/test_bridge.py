@@ -17,14 +17,14 @@ import anyio
 import pytest
 
 from aerokit import messages as m
+from aerokit.apps.foxglove import FoxgloveBridge, foxglove_bridge
+from aerokit.apps.foxglove import bridge as bridge_module
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import open_connection
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.foxglove import FoxgloveBridge, foxglove_bridge
-from aerokit.foxglove import bridge as bridge_module
-from aerokit.links.sockets import is_free
 from aerokit.mavlink.message import Message
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.opening import open_connection
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
+from aerokit.transport.sockets import is_free
 
 client = pytest.importorskip("websockets.asyncio.client")
 pytest.importorskip("foxglove")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from aerokit import messages as m
-from aerokit.foxglove import topics
+from aerokit.logs.convert import topics
 from aerokit.position import Position
 from aerokit.vehicle.state.condition import StatusText
 from aerokit.vehicle.state.movement import Attitude, Home, Velocity

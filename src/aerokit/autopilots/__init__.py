@@ -29,7 +29,7 @@ from aerokit.autopilots.base import (
 )
 from aerokit.autopilots.modes import Mode, ModeTable, is_armed
 from aerokit.autopilots.px4 import Px4, px4_custom_mode
-from aerokit.autopilots.version import AutopilotVersion
+from aerokit.autopilots.telemetry import AutopilotVersion
 from aerokit.mavlink.enums import MavAutopilot
 
 if TYPE_CHECKING:

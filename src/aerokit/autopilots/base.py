@@ -6,19 +6,20 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from aerokit.autopilots.health import (
+from aerokit._internal.values import Snapshot
+from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
+from aerokit.autopilots.telemetry import (
     ATTITUDE_AND_HEIGHT,
     ESTIMATES,
     POS_HORIZ_ABS,
     PREARM_CHECK,
     SENSORS,
+    AutopilotVersion,
     names_of,
+    version_text,
 )
-from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable, base_mode_name
-from aerokit.autopilots.version import AutopilotVersion, version_text
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavCmd, MavProtocolCapability
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

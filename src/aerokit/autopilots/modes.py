@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aerokit._internal.values import Snapshot
+from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavModeFlag
-from aerokit.snapshot import Snapshot
-from aerokit.wording import did_you_mean, shown
 
 __all__ = ["CUSTOM_MODE_ENABLED", "Mode", "ModeTable", "base_mode_name", "is_armed"]
 

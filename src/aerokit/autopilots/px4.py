@@ -16,8 +16,8 @@ from aerokit.autopilots.base import (
     TakeOff,
     whole_numbers,
 )
-from aerokit.autopilots.health import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
+from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 

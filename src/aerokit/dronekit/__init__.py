@@ -27,9 +27,8 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.imports import lazy_exports
 from aerokit.dronekit import monotonic, util
-from aerokit.dronekit.alias import install
-from aerokit.dronekit.connect import connect, default_still_waiting_callback
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit has it
 from aerokit.dronekit.observers import HasObservers
 from aerokit.dronekit.util import ErrprinterHandler
@@ -47,7 +46,6 @@ from aerokit.dronekit.values import (
     Version,
     Wind,
 )
-from aerokit.lazy import lazy_names
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,7 +59,8 @@ if TYPE_CHECKING:
     from aerokit.dronekit.commands import Command, CommandSequence
     from aerokit.dronekit.gimbal import Gimbal
     from aerokit.dronekit.parameters import Parameters
-    from aerokit.dronekit.vehicle import Vehicle
+    from aerokit.dronekit.runner import install
+    from aerokit.dronekit.vehicle import Vehicle, connect, default_still_waiting_callback
 
 basestring: tuple[type[str], type[bytes]] = (str, bytes)
 """For ``isinstance``, in programs that Python 2 also ran."""
@@ -108,21 +107,20 @@ __all__ = [
     "util",
 ]
 
-_LATER = {
-    "Channels": "aerokit.dronekit.channels",
-    "ChannelsOverride": "aerokit.dronekit.channels",
-    "Command": "aerokit.dronekit.commands",
-    "CommandSequence": "aerokit.dronekit.commands",
-    "Gimbal": "aerokit.dronekit.gimbal",
-    "Locations": "aerokit.dronekit.attributes",
-    "Parameters": "aerokit.dronekit.parameters",
-    "Vehicle": "aerokit.dronekit.vehicle",
-    "ardupilotmega": "pymavlink.dialects.v10.ardupilotmega",
-    "mavutil": "pymavlink.mavutil",
-    "mavwp": "pymavlink.mavwp",
-}
-"""Where a name is from that is imported when a program first uses it: what is behind them takes most of the time."""
-
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
-__getattr__, __dir__ = lazy_names(__name__, _LATER, __all__)
+__getattr__, __dir__, _ = lazy_exports(
+    __name__,
+    {
+        "aerokit.dronekit.attributes": ("Locations",),
+        "aerokit.dronekit.channels": ("Channels", "ChannelsOverride"),
+        "aerokit.dronekit.commands": ("Command", "CommandSequence"),
+        "aerokit.dronekit.gimbal": ("Gimbal",),
+        "aerokit.dronekit.parameters": ("Parameters",),
+        "aerokit.dronekit.runner": ("install",),
+        "aerokit.dronekit.vehicle": ("Vehicle", "connect", "default_still_waiting_callback"),
+        "pymavlink.dialects.v10.ardupilotmega": ("ardupilotmega",),
+        "pymavlink.mavutil": ("mavutil",),
+        "pymavlink.mavwp": ("mavwp",),
+    },
+)

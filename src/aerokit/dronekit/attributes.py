@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.autopilots.health import PREARM_CHECK
 from aerokit.autopilots.modes import is_armed
+from aerokit.autopilots.telemetry import PREARM_CHECK
+from aerokit.connection.components import is_autopilot
 from aerokit.dronekit.core import VehicleCore, core_of
 from aerokit.dronekit.flight_orders import CurrentCommand, mode_name
 from aerokit.dronekit.observers import HasObservers
@@ -26,7 +27,6 @@ from aerokit.dronekit.values import (
 )
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, MavProtocolCapability
-from aerokit.runtime.components import is_autopilot
 from aerokit.vehicle.state.movement import place
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.override_release import RELEASE_UPPER
+from aerokit.dronekit.line import RELEASE_UPPER
 from aerokit.dronekit.privates import Python2Mapping
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsRaw

@@ -14,16 +14,14 @@ from typing import TYPE_CHECKING, Any, overload
 
 from pymavlink.dialects.v20.ardupilotmega import MAVLink_mission_item_message
 
+from aerokit._internal.values import Snapshot
 from aerokit.dronekit.core import core_of
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
 from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission
-from aerokit.missions.ardupilot_habits import written_out
-from aerokit.missions.commands import canonical_frame
-from aerokit.missions.item import MissionItem
-from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps, to_wire_float
-from aerokit.snapshot import Snapshot
+from aerokit.missions.item import MissionItem, canonical_frame
+from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps, to_wire_float, written_out
 from aerokit.sync.reply import reply_of
 
 if TYPE_CHECKING:

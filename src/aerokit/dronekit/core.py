@@ -15,14 +15,14 @@ from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
-from aerokit.protocols.repeatable import attempts_of
+from aerokit.protocols.command import attempts_of
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from aerokit.connection.tasks import Background
     from aerokit.dronekit.line import Order, Work
     from aerokit.dronekit.mavlink import MAVConnection
-    from aerokit.runtime.background import Background
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 __all__ = ["Core", "Latest", "Readiness", "VehicleCore", "core_of"]

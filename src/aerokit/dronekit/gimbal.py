@@ -12,7 +12,7 @@ from aerokit.dronekit.privates import GimbalPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
 from aerokit.errors import InvalidArgument
 from aerokit.position import Position
-from aerokit.vehicle.state.gimbal import GimbalAttitude
+from aerokit.vehicle.state.equipment import GimbalAttitude
 
 if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore

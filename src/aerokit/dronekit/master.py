@@ -11,21 +11,20 @@ from typing import TYPE_CHECKING, Any
 from pymavlink import mavutil
 
 from aerokit.autopilots.modes import is_armed
+from aerokit.connection.components import is_autopilot
 from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import message_of
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
-from aerokit.mavlink.from_pymavlink import from_pymavlink
-from aerokit.mavlink.message_factory import MessageFactory
-from aerokit.runtime.components import is_autopilot
+from aerokit.mavlink.pymavlink import MessageFactory, from_pymavlink
 
 if TYPE_CHECKING:
     from aerokit.dronekit.line import Line
-    from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.messages import Heartbeat
+    from aerokit.transport.link import Peer
 
 __all__ = ["Inbox", "Master"]
 

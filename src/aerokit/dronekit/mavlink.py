@@ -13,25 +13,24 @@ from contextvars import ContextVar
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
+from aerokit.connection.opening import open_connection
+from aerokit.connection.own_heartbeat import OwnHeartbeat
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.line import Line
+from aerokit.dronekit.line import Line, OverrideRelease
 from aerokit.dronekit.observers import message_of
-from aerokit.dronekit.override_release import OverrideRelease
 from aerokit.errors import AerokitError, ConnectionClosed, InvalidArgument, LinkOpenError
-from aerokit.links.address import ACCEPTED_FORMS, parse_address
-from aerokit.links.reconnecting import ReconnectingLink
-from aerokit.runtime.opening import open_connection
-from aerokit.runtime.own_heartbeat import OwnHeartbeat
 from aerokit.sync.loop_thread import LoopThread
+from aerokit.transport.address import ACCEPTED_FORMS, parse_address
+from aerokit.transport.reconnecting import ReconnectingLink
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from aerokit.connection.connection import Connection
     from aerokit.dronekit.master import Master
-    from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
-    from aerokit.runtime.connection import Connection
     from aerokit.sync.loop_thread import Held
+    from aerokit.transport.link import Peer
 
 __all__ = ["APIException", "MAVConnection", "MAVWriter", "mavudpin_multi"]
 
@@ -245,7 +244,7 @@ def _check_address(ip: object) -> None:
     try:
         parse_address(ip)
     except InvalidArgument as error:
-        from aerokit.links.address_error import AddressError
+        from aerokit.transport.address import AddressError
 
         raise AddressError(str(error)) from None
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from aerokit.errors import AerokitError
 
 if TYPE_CHECKING:
+    from aerokit.connection.bus import Detach
     from aerokit.dronekit.line import Line
     from aerokit.dronekit.listener_thread import ListenerThread
-    from aerokit.links.link import Peer
     from aerokit.mavlink.frame import Frame
-    from aerokit.runtime.bus import Detach
+    from aerokit.transport.link import Peer
 
 __all__ = [
     "EVERY_NAME",
@@ -274,6 +274,6 @@ def _pymavlink() -> tuple[Any, Callable[..., Any]]:
     """Imported for the first listener to messages."""
     from pymavlink import mavutil
 
-    from aerokit.mavlink.to_pymavlink import to_pymavlink
+    from aerokit.mavlink.pymavlink import to_pymavlink
 
     return mavutil, to_pymavlink

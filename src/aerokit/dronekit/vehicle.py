@@ -5,54 +5,62 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable, Iterable
 from contextlib import asynccontextmanager, nullcontext
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import anyio
 
+from aerokit.connection.own_heartbeat import OwnHeartbeat
+from aerokit.connection.tasks import Background
 from aerokit.dronekit.attributes import NO_MODE
 from aerokit.dronekit.channels import Channels
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit's name
 from aerokit.dronekit.flight import FlightMethods
-from aerokit.dronekit.flight_orders import mode_name
+from aerokit.dronekit.flight_orders import Maintenance, mode_name
 from aerokit.dronekit.gimbal import Gimbal
 from aerokit.dronekit.line import weakly
-from aerokit.dronekit.maintenance import Maintenance
 from aerokit.dronekit.observers import MessageListeners, decorator_of
 from aerokit.dronekit.parameters import Parameters
 from aerokit.dronekit.privates import Shadowable, VehiclePrivates
+from aerokit.dronekit.util import ErrprinterHandler
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import CommandLong
-from aerokit.runtime.background import Background
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable
 
-    from typing_extensions import Self
+    from typing_extensions import Self, TypeVar
 
     from aerokit import sync
+    from aerokit.connection.connection import Connection
     from aerokit.dronekit.commands import CommandSequence, WaypointLoader
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.dronekit.observers import AttributeListener
-    from aerokit.mavlink.message_factory import MessageFactory
-    from aerokit.runtime.connection import Connection
+    from aerokit.mavlink.pymavlink import MessageFactory
     from aerokit.sync.loop_thread import Held
     from aerokit.vehicle.state.condition import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["Vehicle"]
+    VehicleT = TypeVar("VehicleT", bound="Vehicle", default="Vehicle")
+
+__all__ = ["Vehicle", "connect", "default_still_waiting_callback"]
 
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
+
 FIRST_VALUES_S, NO_MORE_S = 1.0, 0.4
 """So long they are waited for: programs that read them as soon as they are connected expect values. Not every vehicle
 has all of them: when one has come, the next is not waited for longer than the second time."""
+
 CONNECT_S = 30.0
 """How long a vehicle is waited for when the program sets no limit."""
+
 MOST_HZ = 1000.0
+
 LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO, logging.INFO, logging.DEBUG)
 """MAV_SEVERITY → level of the logger ``autopilot``."""
 
@@ -190,7 +198,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         ``target_system`` becomes this vehicle's, in the message itself; ``target_component`` stays. Never blocks.
         InvalidArgument, a ValueError: a field is wrong; APIException: the link is down. Nothing was sent.
         """
-        from aerokit.mavlink.from_pymavlink import from_pymavlink
+        from aerokit.mavlink.pymavlink import from_pymavlink
 
         self._dk.check_link()
         target = self._dk.target_system
@@ -315,3 +323,99 @@ async def _request_capabilities(aio: AsyncVehicle) -> None:
             return
         aio.send(CommandLong(aio.system_id, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
         await anyio.sleep(1.0)
+
+
+def default_still_waiting_callback(atts: Iterable[str]) -> None:
+    """Log what is still waited for, at level DEBUG of the logger ``dronekit``."""
+    logging.getLogger("dronekit").debug("Still waiting for data from vehicle: %s", ",".join(sorted(atts)))
+
+
+def connect(
+    ip: str,
+    _initialize: bool = True,
+    wait_ready: bool | str | Iterable[str] | None = None,
+    timeout: float = 30,
+    still_waiting_callback: Callable[[Any], object] = default_still_waiting_callback,
+    still_waiting_interval: float = 1,
+    status_printer: Callable[[str], object] | None = None,
+    vehicle_class: Callable[[MAVConnection], VehicleT] | None = None,
+    rate: float | None = 4,
+    baud: int = 115200,
+    heartbeat_timeout: float = 30,
+    source_system: int = 255,
+    source_component: int = 0,
+    use_native: bool = False,
+    release_overrides: bool = True,
+    heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
+) -> VehicleT:
+    """Connect to a vehicle and return it once it was heard.
+
+    Args:
+        ip: connection string: ``'127.0.0.1:14550'`` and ``'udp:…'`` listen, ``'tcp:127.0.0.1:5760'``,
+            ``'/dev/ttyACM0'``, ``'com14'`` … (docs/addresses.md).
+        wait_ready: True waits for ``parameters``, ``gps_0``, ``armed``, ``mode`` and ``attitude``; a list of names for
+            these; nothing is waited for otherwise.
+        timeout: seconds for ``wait_ready``.
+        still_waiting_callback: called with the set of missing names.
+        still_waiting_interval: how often, in seconds.
+        status_printer: called with every text of the autopilot, on the listener thread, until the vehicle is closed.
+        vehicle_class: a subclass of :class:`Vehicle`.
+        rate: Hz of the data streams that are asked for; None asks for none.
+        baud: of a serial port whose string names none, bits per second.
+        heartbeat_timeout: seconds to wait for the first heartbeat (0: 30), and in flight until orders and waits raise
+            (0: never).
+        source_system: our own system id, 1 to 255.
+        source_component: our own component id, 0 to 255.
+        use_native: accepted; means nothing.
+        release_overrides: give RC channels that are still overridden back to the radio when the connection ends. False
+            leaves them as DroneKit does, until the vehicle gives them up (ArduPilot: RC_OVERRIDE_TIME).
+        heartbeat: what our own HEARTBEAT says, and how long it is sent without a sign of the program: reading an
+            attribute, an order, a wait, a listener that is called (60 seconds; :class:`aerokit.OwnHeartbeat`). None:
+            none is sent.
+
+    Raises:
+        OSError: the link cannot be opened (ConnectionRefusedError, socket.gaierror, serial.SerialException …).
+        ValueError: an argument is wrong; a connection string that names no link is an OSError, too.
+        APIException: no vehicle was heard in time; the text says what was heard instead.
+        TimeoutError: ``wait_ready`` was not satisfied in time. Whatever fails, nothing stays open.
+    """
+    from aerokit.dronekit.mavlink import MAVConnection
+
+    try:
+        handler = MAVConnection(
+            ip,
+            baud=baud,
+            source_system=source_system,
+            source_component=source_component,
+            use_native=use_native,
+            heartbeat=heartbeat,
+        )
+    except (OSError, ValueError) as error:
+        raise error.with_traceback(None) from None  # where in here it came from says nothing to a program
+    handler.overrides.is_wanted = release_overrides
+    try:
+        vehicle = cast("VehicleT", Vehicle(handler)) if vehicle_class is None else vehicle_class(handler)
+        if status_printer is not None:
+            _print_texts(handler, status_printer)
+            handler.listener_thread.keep(vehicle, has_listeners=True)
+        if _initialize:
+            vehicle.initialize(rate=rate, heartbeat_timeout=heartbeat_timeout)
+        if wait_ready:
+            names = (wait_ready,) if isinstance(wait_ready, (bool, str)) else wait_ready
+            vehicle.wait_ready(
+                *names,
+                timeout=timeout,
+                still_waiting_callback=still_waiting_callback,
+                still_waiting_interval=still_waiting_interval,
+            )
+    except BaseException:
+        handler.close()
+        raise
+    return vehicle
+
+
+def _print_texts(handler: MAVConnection, status_printer: Callable[[str], object]) -> None:
+    """Through the logger ``autopilot``, whose level decides, as with DroneKit; until the connection is closed."""
+    logger, printer = logging.getLogger("autopilot"), ErrprinterHandler(status_printer)
+    logger.addHandler(printer)
+    handler.on_close(lambda: logger.removeHandler(printer))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.runtime.events import Event
+from aerokit.events import Event
 
 if TYPE_CHECKING:
-    from aerokit.fleets.apart import Deconfliction
+    from aerokit.fleets.separation import Deconfliction
 
 __all__ = [
     "FleetEvent",

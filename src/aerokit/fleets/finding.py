@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.connection.components import found_by
+from aerokit.connection.opening import no_vehicle_reason
 from aerokit.errors import ConnectFailed
-from aerokit.runtime.components import found_by
-from aerokit.runtime.diagnosis import no_vehicle_reason
-from aerokit.runtime.events import VehicleFound
+from aerokit.events import VehicleFound
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from aerokit.runtime.connection import Connection
+    from aerokit.connection.connection import Connection
 
 __all__ = ["find_systems", "telling_who_is_missing"]
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
+from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,18 +8,18 @@ from typing import Any
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument, OperationRejected
-from aerokit.fleets.apart import Deconfliction, conflicts_of
+from aerokit.fleets.action import FleetPart
+from aerokit.fleets.distances import Around, altitude_amsl, position_of
 from aerokit.fleets.events import PathsDecided
 from aerokit.fleets.members import Member
-from aerokit.fleets.part import FleetPart
 from aerokit.fleets.paths import Path, PathPoint
-from aerokit.fleets.results import FleetResult
-from aerokit.fleets.whereabouts import Around, altitude_amsl, position_of
+from aerokit.fleets.policy import FleetResult
+from aerokit.fleets.separation import Deconfliction, conflicts_of
 from aerokit.missions.mission import Mission
-from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
-from aerokit.wording import shown
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 __all__ = ["Missions"]
 

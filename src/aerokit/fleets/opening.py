@@ -6,21 +6,20 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Literal
 
-from aerokit.arguments import checked
-from aerokit.async_block import async_block
+from aerokit._internal.arguments import checked
+from aerokit._internal.async_block import async_block
+from aerokit._internal.wording import shown
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import open_connection
 from aerokit.errors import InvalidArgument
-from aerokit.fleets.crew import Crew
+from aerokit.fleets.action import Crew
 from aerokit.fleets.distances import DistanceWatch
 from aerokit.fleets.finding import find_systems
 from aerokit.fleets.fleet import Fleet
-from aerokit.fleets.keeping import Keepers
-from aerokit.fleets.members import Member
+from aerokit.fleets.members import Keepers, Member
 from aerokit.fleets.policy import Failure, PolicyName, PolicyOrder, Rules
-from aerokit.links.link import Link
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.opening import open_connection
+from aerokit.transport.link import Link
 from aerokit.vehicle.vehicle import Vehicle
-from aerokit.wording import shown
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from typing_extensions import Self

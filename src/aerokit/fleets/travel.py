@@ -8,18 +8,17 @@ from typing import Literal
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
-from aerokit.fleets.apart import Deconfliction, Route, in_corridors, in_layers
+from aerokit.fleets.action import FleetPart
+from aerokit.fleets.distances import Around, altitude_amsl, position_of
 from aerokit.fleets.events import PathsDecided
 from aerokit.fleets.members import Member
-from aerokit.fleets.part import FleetPart
-from aerokit.fleets.results import FleetResult
-from aerokit.fleets.whereabouts import Around, altitude_amsl, position_of
+from aerokit.fleets.policy import FleetResult
+from aerokit.fleets.separation import Deconfliction, Route, in_corridors, in_layers
 from aerokit.position import Position
-from aerokit.vehicle.checks import check_range
-from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
-from aerokit.wording import shown
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 __all__ = ["Travel", "WayApart"]
 

@@ -6,26 +6,24 @@ from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING
 
-from aerokit.hub.border import Border
-from aerokit.hub.filters import Filters
-from aerokit.hub.identity import IdentityGuard
-from aerokit.hub.kinds import Kind
+from aerokit.connection.frame_receiver import MOST_PEERS, Peers
+from aerokit.hub.guards import Border, IdentityGuard
+from aerokit.hub.outgoing import Filters, Kind
 from aerokit.hub.port import NEVER, Port, Totals
 from aerokit.hub.values import EndpointStatistics
-from aerokit.links import ReconnectingLink, create_link
-from aerokit.runtime.peers import MOST_PEERS, Peers
+from aerokit.transport import ReconnectingLink, create_link
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.errors import LinkLost
-    from aerokit.hub.held import Held
+    from aerokit.hub.outgoing import Held
     from aerokit.hub.switch import Switch
     from aerokit.hub.values import Endpoint, HubEventKind
-    from aerokit.links.link import Link, Peer
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
+    from aerokit.transport.link import Link, Peer
 
     Tell = Callable[["Attachment", HubEventKind, str], object]
 

@@ -8,36 +8,39 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checked, checks_arguments
+from aerokit._internal.async_block import async_block
+from aerokit.connection.frame_observers import Recording
+from aerokit.connection.tasks import Background
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkError
 from aerokit.hub.attachment import Attachment, check_filters
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.switch import Switch
 from aerokit.hub.values import Endpoint, HubEvent
-from aerokit.links.delays import Delays
-from aerokit.links.link import Link
 from aerokit.mavlink.dialect import STANDARD
-from aerokit.runtime.background import Background
-from aerokit.runtime.recording import Recording
+from aerokit.transport.link import Link
+from aerokit.transport.reconnecting import Delays
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Iterable
+    from collections.abc import AsyncIterator, Callable, Iterable
     from types import TracebackType
 
     from typing_extensions import Self
 
+    from aerokit.connection.connection import Connection
     from aerokit.hub.port import Port
     from aerokit.hub.values import EndpointStatistics, HubEventKind
     from aerokit.mavlink.dialect import Dialect
-    from aerokit.runtime.connection import Connection
 
-__all__ = ["Hub"]
+__all__ = ["Hub", "shared"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 CLOSE_TIMEOUT_S = 2.0
+
 FLUSH_EVERY_S = 1.0
+
 _QUIET_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "restored")
 
 
@@ -301,3 +304,24 @@ async def _closed(attachments: list[Attachment]) -> None:
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
         for attachment in attachments:
             await attachment.wait_closed()
+
+
+@checked
+@async_block
+async def shared(connection: Connection, endpoints: Iterable[str | Endpoint | Link]) -> AsyncIterator[Hub]:
+    """Share an open connection with other programs for the time of the ``async with`` block; gives the hub that does.
+
+    ``aerokit.connect(…, share=[…])`` does the same. See `Hub.share`.
+
+    Args:
+        connection: of this program; it stays open.
+        endpoints: where the others are, or come: ``["tcpin:127.0.0.1:5760"]``.
+
+    Raises:
+        InvalidArgument: an address is wrong, or two endpoints have one name.
+        LinkOpenError: an endpoint could not be opened.
+        ConnectionClosed, LinkLost: the connection has ended.
+    """
+    async with Hub(endpoints, dialect=connection.bus.dialect) as hub:
+        await hub.share(connection)
+        yield hub

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.hub.held import Held, HeldFrames
-from aerokit.hub.kinds import Kind, kind_of
+from aerokit.hub.outgoing import Held, HeldFrames, Kind, kind_of
 
 if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable
 
     from aerokit.hub.attachment import Attachment
-    from aerokit.hub.border import Border
-    from aerokit.hub.identity import IdentityGuard
+    from aerokit.hub.guards import Border, IdentityGuard
     from aerokit.hub.routing import Node, Plan
-    from aerokit.links.link import Link, Peer
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.transport.link import Link, Peer
 
 __all__ = ["JOINED_BYTES", "NEVER", "Port", "Totals"]
 

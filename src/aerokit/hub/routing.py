@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from aerokit.connection.routes import LIVE_FOR_S, SWEEP_AFTER_S
 from aerokit.hub.senders import (
     DUPLICATE_WINDOW_S,
     LOOP_MEMORY_S,
@@ -18,7 +19,6 @@ from aerokit.hub.senders import (
     Recent,
     Sender,
 )
-from aerokit.runtime.routes import LIVE_FOR_S, SWEEP_AFTER_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,18 +7,18 @@ import logging
 from typing import TYPE_CHECKING
 
 from aerokit.errors import AerokitError, BusyError, LinkLost
-from aerokit.hub.border import Border
+from aerokit.events import HeardTwice
+from aerokit.hub.guards import Border
 from aerokit.hub.targets import Targets
-from aerokit.links.link import Link, Peer
 from aerokit.mavlink.frame import MAGIC_V1, SIGNATURE_LENGTH, Frame
-from aerokit.runtime.events import HeardTwice
+from aerokit.transport.link import Link, Peer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from aerokit.links.link import Receiver
+    from aerokit.connection.connection import Connection
     from aerokit.mavlink.signing import Signing
-    from aerokit.runtime.connection import Connection
+    from aerokit.transport.link import Receiver
 
 __all__ = ["SharedLink"]
 

@@ -13,12 +13,12 @@ from aerokit.mavlink.frame import MAGIC_V2
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.connection.frame_observers import Recording
     from aerokit.hub.port import Port
     from aerokit.hub.routing import Plan
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
-    from aerokit.runtime.recording import Recording
 
 __all__ = ["LOOK_EVERY_S", "Switch"]
 

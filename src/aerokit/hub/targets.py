@@ -1,11 +1,13 @@
-"""``Targets``: for whom a frame is, read from its bytes without decoding the message."""
+"""``Targets``: for whom a frame is, read from its bytes without decoding the message.
+
+A table instead of the definitions: to import all of those takes a third of a second, and it would be in mid-flight.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.hub.kinds import Kind, kind_of
-from aerokit.hub.target_table import STANDARD_OFFSETS
+from aerokit.hub.outgoing import Kind, kind_of
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.message import offset_of
@@ -15,7 +17,83 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-__all__ = ["NOWHERE", "Targets"]
+__all__ = ["NOWHERE", "STANDARD_OFFSETS", "Targets"]
+
+STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
+    (0, None): (5,),
+    (0, 1): (
+        21,
+        43,
+        45,
+        47,
+        121,
+        122,
+        123,
+        156,
+        161,
+        176,
+        183,
+        186,
+        216,
+        218,
+        258,
+        321,
+        323,
+        12900,
+        12903,
+        12905,
+        12915,
+    ),
+    (1, 2): (110,),
+    (2, 3): (20, 40, 41, 44, 51, 66, 80, 266, 267, 268, 320, 345, 385),
+    (3, 4): (248,),
+    (4, None): (11,),
+    (4, 5): (
+        23,
+        37,
+        38,
+        117,
+        155,
+        184,
+        185,
+        386,
+        387,
+        400,
+        401,
+        412,
+        413,
+        421,
+        11000,
+        11002,
+        11035,
+        12902,
+        50005,
+    ),
+    (6, 7): (151, 154, 214, 420),
+    (8, 9): (77, 160, 256, 11004, 50004),
+    (10, None): (69,),
+    (10, 11): (119,),
+    (12, None): (48,),
+    (12, 13): (4, 157, 158, 201, 354),
+    (14, 15): (175,),
+    (16, 17): (70, 111, 11033, 12919),
+    (18, 19): (50,),
+    (20, 21): (287, 288),
+    (24, 25): (54, 292),
+    (26, None): (179,),
+    (28, 29): (12904,),
+    (30, 31): (75, 76, 284, 12901),
+    (32, 33): (39, 73, 282, 388),
+    (36, 37): (82, 296),
+    (38, 39): (285,),
+    (40, 41): (200, 513),
+    (41, 42): (139,),
+    (42, None): (180,),
+    (50, 51): (84, 86, 286),
+    (52, None): (243,),
+    (79, 80): (126,),
+}
+"""Offset in the payload of the target's system id, and of its component id if there is one → message ids."""
 
 NOWHERE = 1 << 16
 """A place behind the end of every frame: there is no such field."""

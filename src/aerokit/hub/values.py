@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Literal
 
+from aerokit._internal.values import Snapshot
+from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
-from aerokit.links.address import parse_address
-from aerokit.links.link import Link
-from aerokit.snapshot import Snapshot
-from aerokit.wording import shown
+from aerokit.transport.address import parse_address
+from aerokit.transport.link import Link
 
 if TYPE_CHECKING:
-    from aerokit.links.allowed import Peers
     from aerokit.mavlink.signing import Signing
+    from aerokit.transport.sockets import Peers
 
 __all__ = ["Endpoint", "EndpointStatistics", "HubEvent", "HubEventKind"]
 

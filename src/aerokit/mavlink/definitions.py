@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from aerokit._internal.files import read_bounded
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.checksum import x25
+from aerokit.mavlink.frame import x25
 from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
-from aerokit.whole_file import read_bounded
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

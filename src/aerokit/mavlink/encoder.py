@@ -6,8 +6,7 @@ from struct import Struct
 from typing import TYPE_CHECKING
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.checksum import x25
-from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED, x25
 from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:

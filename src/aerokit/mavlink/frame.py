@@ -1,20 +1,27 @@
 """`Frame`: one checked frame off the wire, payload not decoded.
 
 https://mavlink.io/en/guide/serialization.html#packet_format
+
+https://mavlink.io/en/guide/serialization.html#checksum
 """
 
 from __future__ import annotations
 
-__all__ = ["MAGIC_V1", "MAGIC_V2", "SIGNED", "Frame", "is_whole_frame"]
+from collections.abc import Callable
+
+__all__ = ["MAGIC_V1", "MAGIC_V2", "SIGNED", "Frame", "is_whole_frame", "x25", "x25_in_python"]
 
 MAGIC_V1 = 0xFE
 """First byte of a MAVLink 1 frame."""
+
 MAGIC_V2 = 0xFD
 """First byte of a MAVLink 2 frame."""
+
 SIGNED = 0x01
 """The one incompatibility flag that exists: the frame ends with 13 bytes of signature."""
 
 HEADER_LENGTH = 9  # without the magic byte
+
 SIGNATURE_LENGTH = 13
 
 
@@ -102,3 +109,32 @@ def is_whole_frame(data: bytes) -> bool:
     if data[0] == MAGIC_V1:
         return len(data) == data[1] + 8
     return data[2] <= SIGNED and len(data) == data[1] + 12 + SIGNATURE_LENGTH * data[2]
+
+
+def x25_in_python() -> Callable[[bytes], int]:
+    """Make the function without any library, for platforms where pymavlink comes without ``fastcrc``."""
+    table: list[int] = []
+    for byte in range(256):
+        for _ in range(8):
+            byte = (byte >> 1) ^ 0x8408 if byte & 1 else byte >> 1
+        table.append(byte)
+
+    def x25(data: bytes) -> int:
+        crc = 0xFFFF
+        for byte in data:
+            crc = (crc >> 8) ^ table[(crc ^ byte) & 0xFF]
+        return crc
+
+    return x25
+
+
+def _fastest() -> Callable[[bytes], int]:
+    try:
+        from fastcrc.crc16 import mcrf4xx
+    except ImportError:
+        return x25_in_python()
+    return mcrf4xx
+
+
+x25: Callable[[bytes], int] = _fastest()
+"""The checksum of some bytes, 0..65535."""

@@ -14,9 +14,8 @@ from itertools import chain
 from struct import Struct
 from struct import error as StructError  # noqa: N812
 
-from aerokit.mavlink.checksum import x25
 from aerokit.mavlink.dialect import STANDARD, Dialect
-from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame, x25
 from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
 
 __all__ = ["MOST_SOURCES", "Framer"]

@@ -1,6 +1,10 @@
-"""Writes the committed modules of `messages` and `enums`: the XML of pymavlink's package, and what `additions` has.
+"""What the standard has beyond pymavlink's XML, worked into the definitions that were read from there.
 
-    python -m aerokit.mavlink.generator            # write them
+pymavlink carries ArduPilot's fork of the standard. The folder ``additions`` has the difference, in the same XML; where
+both say something of units, enums, values and what is superseded, the standard's word counts. Texts are pymavlink's
+where it has any. What ArduPilot alone has stays.
+
+python -m aerokit.mavlink.generator            # write them
     python -m aerokit.mavlink.generator --check    # compare: 0 the same, or skipped for other XML; 1 different
 
 The output depends on the XML alone, so that a difference is a change of the standard, of our additions to it or of the
@@ -15,14 +19,110 @@ import importlib.util
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.definitions import EnumDefinition, MessageDefinition, merged_enums, read_xml
+from aerokit.mavlink.definitions import (
+    DialectDefinition,
+    EntryDefinition,
+    EnumDefinition,
+    FieldDefinition,
+    MessageDefinition,
+    merged_enums,
+    read_xml,
+)
 from aerokit.mavlink.rendering import render_enum_row, render_enum_stub, render_message
-from aerokit.mavlink.union import read_additions, with_added_enums, with_added_messages
 
-__all__ = ["definitions", "differences", "fingerprint", "generate", "generated_fingerprint", "xml_folder"]
+__all__ = [
+    "definitions",
+    "differences",
+    "fingerprint",
+    "generate",
+    "generated_fingerprint",
+    "read_additions",
+    "with_added_enums",
+    "with_added_messages",
+    "xml_folder",
+]
+
+UNION_FOLDER = Path(__file__).parent / "additions"
+
+FLOORS = ("minimal", "standard", "common")
+"""The standard's files from below; what two of them name is at home in the lower one."""
+
+DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
+
+
+def read_additions() -> list[DialectDefinition]:
+    """The definitions of the folder, each file by itself."""
+    return [read_xml(UNION_FOLDER / f"{stem}.xml") for stem in ("minimal", "common", "development")]
+
+
+def with_added_messages(
+    messages: Sequence[MessageDefinition], additions: Sequence[DialectDefinition]
+) -> list[MessageDefinition]:
+    """Messages of pymavlink in their order, then those that are new."""
+    merged = {message.id: message for message in messages}
+    for added in (message for dialect in additions for message in dialect.messages):
+        known = merged.get(added.id)
+        if known is not None:
+            added = _settled(replace(known, fields=_fields(known, added)), added)
+        merged[added.id] = added
+    return list(merged.values())
+
+
+def with_added_enums(
+    enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]
+) -> list[EnumDefinition]:
+    """Enums of pymavlink in their order, then those that are new. Of two names for a value the standard's is first.
+
+    New entries do not change the names that the others have in Python.
+    """
+    merged = {enum.name: enum for enum in enums}
+    for added in (enum for dialect in additions for enum in dialect.enums):
+        known = merged.get(added.name)
+        if known is not None:
+            entries = _entries(known, added)
+            added = _settled(replace(known, entries=entries, own_prefix=known.prefix), added)
+        merged[added.name] = added
+    return list(merged.values())
+
+
+def _settled(known: DefinedT, added: DefinedT) -> DefinedT:
+    """With the remarks and the home of both."""
+    home = min(
+        known.origin, added.origin, key=lambda stem: FLOORS.index(stem) if stem in FLOORS else len(FLOORS)
+    )
+    return replace(known, origin=home, remarks=added.remarks or known.remarks)
+
+
+def _fields(known: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
+    fields = {field.name: field for field in known.fields}
+    for field in added.fields:
+        before = fields.get(field.name)
+        if before is not None:
+            field = replace(before, units=field.units, enum=field.enum, invalid=field.invalid)
+        fields[field.name] = field
+    return tuple(fields.values())
+
+
+def _entries(known: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
+    theirs = {entry.name: entry for entry in known.entries}
+    ours = {entry.name: _entry(theirs.get(entry.name, entry), entry) for entry in added.entries}
+    return tuple(sorted({**ours, **theirs, **ours}.values(), key=lambda entry: entry.value))
+
+
+def _entry(known: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
+    params = {param[0]: param for param in (*known.params, *added.params)}
+    return replace(
+        known,
+        value=added.value,
+        params=tuple(params[index] for index in sorted(params)),
+        remarks=added.remarks or known.remarks,
+    )
+
 
 MODULES: dict[str, tuple[str, ...]] = {
     "minimal": ("minimal",),
@@ -51,11 +151,13 @@ COMMON_MORE = "common_more"
 FOLDER = Path(__file__).parent
 
 _MARK = "XML fingerprint: "
+
 _HEADER = (
     "# Generated by aerokit.mavlink.generator from pymavlink's XML and additions/: do not edit.\n# "
     + _MARK
     + "{}\n"
 )
+
 _MESSAGES_HEAD = '''# The classes are immutable for whoever uses them; only the code in this file assigns their fields.
 # mypy: disable-error-code="misc, assignment, override, method-assign"
 # pyright: reportAttributeAccessIssue=false, reportIncompatibleMethodOverride=false
@@ -77,6 +179,7 @@ if TYPE_CHECKING:
 _new = object.__new__
 
 '''
+
 _ENUMS_HEAD = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of ``{name}.xml``{more}: https://mavlink.io/en/messages/{name}.html.
 
@@ -90,6 +193,7 @@ from aerokit.mavlink.enumeration import make_enum
 
 _TABLE: dict[str, tuple[bool, str, tuple[tuple[str, int], ...]]] = {{
 '''
+
 _ENUMS_TAIL = """}
 
 __all__ = [*_TABLE]
@@ -105,6 +209,7 @@ def __getattr__(name: str) -> type[int]:
 def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_TABLE))
 """
+
 _ENUMS_INIT = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
@@ -132,6 +237,7 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_MODULES))
 '''
+
 _MESSAGES_INIT = '''# pyright: reportUnsupportedDunderAll=false
 """Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
@@ -257,8 +363,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 # ------------------------------------------------------------------------------------------- files
-
-
 def _stems() -> list[str]:
     return [stem for stems in MODULES.values() for stem in stems]
 

@@ -2,6 +2,9 @@
 
 A signature says that who sent the frame has the key, and that the frame is not an old one played again; nothing is
 encrypted. No clock here: the time comes as an argument. https://mavlink.io/en/guide/message_signing.html
+
+It is written here, and not by a program or a connection, because no frame may leave with a time stamp that is not on
+the disk yet: only who makes the signature knows when that is.
 """
 
 from __future__ import annotations
@@ -11,29 +14,34 @@ from enum import Enum
 from hashlib import sha256
 from hmac import compare_digest
 from os import PathLike
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from aerokit.errors import InvalidArgument
+from aerokit._internal.files import write_whole
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
 
-if TYPE_CHECKING:
-    from aerokit.mavlink.timestamp_file import TimestampFile
-
-__all__ = ["Refusal", "Signing", "SigningKey", "is_signed_with_a_key", "timestamp_at"]
+__all__ = ["Refusal", "Signing", "SigningKey", "TimestampFile", "is_signed_with_a_key", "timestamp_at"]
 
 KEY_LENGTH = 32
+
 TICKS_PER_S = 100_000
 """A tick of a time stamp is 10 microseconds."""
+
 EPOCH_S = 1_420_070_400
 """Time stamps begin in 2015; this is then in seconds since 1970."""
+
 LAST_TIMESTAMP = (1 << 48) - 1
+
 ONE_MINUTE = 60 * TICKS_PER_S
+
 MOST_STREAMS = 1024
 """So many (system id, component id, link id) are remembered; only who has the key makes any."""
+
 ALWAYS_UNSIGNED = frozenset((109, 166))
 """RADIO_STATUS and RADIO: telemetry radios put them between the frames, and have no key."""
 
 _HASH_LENGTH = 6
+
 _NO_KEY = bytes(KEY_LENGTH)
 
 AllowUnsigned = Callable[[Frame], bool]
@@ -169,8 +177,6 @@ class Signing:
         """How many frames were refused, for each reason."""
         self._kept: TimestampFile | None = None
         if keep is not None:
-            from aerokit.mavlink.timestamp_file import TimestampFile  # with pathlib: few programs need it
-
             self._kept = TimestampFile(keep, LAST_TIMESTAMP)
             self.timestamp = max(self.timestamp, self._kept.timestamp)
         self._keyed = sha256(key.secret)
@@ -285,3 +291,46 @@ class Signing:
 
     def __repr__(self) -> str:
         return f"<Signing {self.key.fingerprint} link {self.link_id}, {self.frames_refused} frames refused>"
+
+
+_LONGEST = 64
+
+
+class TimestampFile:
+    """Holds one number: all time stamps that were used are below it.
+
+    FileFormatError for other contents, OSError when it cannot be read or written. What goes wrong later does not stop a
+    flight: ``error`` has it, until the file has been written again.
+    """
+
+    def __init__(self, path: str | PathLike[str], most: int) -> None:
+        self._path, self._most = Path(path), most
+        self.timestamp: int = self._read()
+        """The number in the file; 0 when there was none."""
+        self.error: OSError | None = None
+        """Why it could not be written the last time."""
+        self._write(self.timestamp)
+
+    def reserve(self, timestamp: int, ahead: int) -> None:
+        """See to it that the file holds more than this number, ``ahead`` more if it has to be written."""
+        if timestamp < self.timestamp:
+            return
+        self.timestamp = min(timestamp + ahead, self._most)
+        try:
+            self._write(self.timestamp)
+            self.error = None
+        except OSError as error:
+            self.error = error
+
+    def _write(self, timestamp: int) -> None:
+        write_whole(self._path, f"{timestamp}\n")
+
+    def _read(self) -> int:
+        try:
+            with self._path.open("rb") as file:
+                text = file.read(_LONGEST).decode("ascii", "replace")
+        except FileNotFoundError:
+            return 0
+        if not (text.strip().isdecimal() and int(text) <= self._most):
+            raise FileFormatError(f"{self._path} holds no time stamp of signing: {text[:40]!r}")
+        return int(text)

@@ -29,25 +29,24 @@ if TYPE_CHECKING:
         jump_tag,
         jump_to_tag,
         land_start,
-        set_relay,
-        set_servo,
-        vtol_transition,
-    )
-    from aerokit.missions.camera import (
         point_gimbal,
         region_of_interest,
         region_of_interest_none,
         set_camera_trigger_distance,
+        set_relay,
+        set_servo,
         start_video,
         stop_photos,
         stop_video,
         take_photo,
         take_photos,
         trigger_camera,
+        vtol_transition,
     )
-    from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
+    from aerokit.missions.compare import Storage
+    from aerokit.missions.fence import Fence, FenceCircle, FencePolygon, RallyPoints
     from aerokit.missions.item import MissionItem
-    from aerokit.missions.mission import Mission
+    from aerokit.missions.mission import Mission, Plan
     from aerokit.missions.navigation import (
         land,
         loiter_time,
@@ -62,10 +61,7 @@ if TYPE_CHECKING:
         vtol_take_off,
         waypoint,
     )
-    from aerokit.missions.plan import Plan
     from aerokit.missions.plan_file import format_plan, parse_plan, read_plan_file, write_plan_file
-    from aerokit.missions.rally import RallyPoints
-    from aerokit.missions.storage import Storage
     from aerokit.missions.waypoint_file import (
         format_waypoints,
         parse_waypoints,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
-from aerokit.missions.commands import (
+from aerokit.missions.item import (
     DEFAULT_XY,
     DESTINATIONS,
     FENCE_COMMANDS,
@@ -16,9 +16,9 @@ from aerokit.missions.commands import (
     LOCAL_FRAMES,
     NUMBERS,
     RALLY_COMMANDS,
+    MissionItem,
     xy_scale,
 )
-from aerokit.missions.item import MissionItem
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

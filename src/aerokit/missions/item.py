@@ -1,17 +1,199 @@
-"""``MissionItem``: one line of a mission, a fence or rally points, as MISSION_ITEM_INT has it."""
+"""``MissionItem``: one line of a mission, a fence or rally points, as MISSION_ITEM_INT has it.
+
+https://mavlink.io/en/services/mission.html and https://mavlink.io/en/messages/common.html#mav_commands
+"""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+from aerokit._internal.geo import check_place
+from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavFrame
-from aerokit.missions.commands import DEFAULT_XY, canonical_frame, command_name, xy_scale
+from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Position
-from aerokit.snapshot import Snapshot
 
-__all__ = ["MissionItem"]
+__all__ = [
+    "DEFAULT_XY",
+    "DESTINATIONS",
+    "FENCE_COMMANDS",
+    "GLOBAL_FRAMES",
+    "HIGHEST_M",
+    "LOCAL_FRAMES",
+    "NUMBERS",
+    "PLACES",
+    "RALLY_COMMANDS",
+    "MissionItem",
+    "action",
+    "altitude_and_frame",
+    "canonical_frame",
+    "command_name",
+    "has_place",
+    "heading",
+    "in_range",
+    "place",
+    "whole",
+    "xy_scale",
+]
+
+DEFAULT_XY = 0x7FFFFFFF
+"""INT32_MAX in x or y: "not given", as NaN is in the other parameters."""
+
+FENCE_COMMANDS = frozenset(
+    {
+        MavCmd.NAV_FENCE_RETURN_POINT,
+        MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION,
+        MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
+        MavCmd.NAV_FENCE_CIRCLE_INCLUSION,
+        MavCmd.NAV_FENCE_CIRCLE_EXCLUSION,
+    }
+)
+
+RALLY_COMMANDS = frozenset({MavCmd.NAV_RALLY_POINT})
+
+DESTINATIONS = frozenset(
+    {
+        MavCmd.NAV_WAYPOINT,
+        MavCmd.NAV_LOITER_UNLIM,
+        MavCmd.NAV_LOITER_TURNS,
+        MavCmd.NAV_LOITER_TIME,
+        MavCmd.NAV_LAND,
+        MavCmd.NAV_TAKEOFF,
+        MavCmd.NAV_CONTINUE_AND_CHANGE_ALT,
+        MavCmd.NAV_LOITER_TO_ALT,
+        MavCmd.NAV_SPLINE_WAYPOINT,
+        MavCmd.NAV_VTOL_TAKEOFF,
+        MavCmd.NAV_VTOL_LAND,
+        MavCmd.NAV_PAYLOAD_PLACE,
+        MavCmd.CONDITION_GATE,
+        *FENCE_COMMANDS,
+        *RALLY_COMMANDS,
+    }
+)
+"""Commands whose altitude means nothing without a frame that says what it is above."""
+
+PLACES = frozenset(
+    {
+        *DESTINATIONS,
+        MavCmd.NAV_FOLLOW,
+        MavCmd.DO_ORBIT,
+        MavCmd.DO_FIGURE_EIGHT,
+        MavCmd.NAV_ROI,
+        MavCmd.NAV_PATHPLANNING,
+        MavCmd.DO_SET_HOME,
+        MavCmd.DO_RETURN_PATH_START,
+        MavCmd.DO_LAND_START,
+        MavCmd.DO_REPOSITION,
+        MavCmd.DO_SET_ROI_LOCATION,
+        MavCmd.DO_SET_ROI,
+        MavCmd.OVERRIDE_GOTO,
+        MavCmd.PAYLOAD_PREPARE_DEPLOY,
+        *range(MavCmd.WAYPOINT_USER_1, MavCmd.SPATIAL_USER_5 + 1),
+    }
+)
+"""Commands whose x and y are latitude and longitude when the frame is a global one."""
+
+NUMBERS: dict[int, tuple[int, ...]] = {
+    MavCmd.NAV_WAYPOINT: (1, 2, 3),
+    MavCmd.NAV_LOITER_UNLIM: (3,),
+    MavCmd.NAV_LOITER_TURNS: (1, 3),
+    MavCmd.NAV_LOITER_TIME: (1, 3),
+    MavCmd.NAV_LAND: (1, 2),
+    MavCmd.NAV_TAKEOFF: (1,),
+    MavCmd.NAV_CONTINUE_AND_CHANGE_ALT: (1,),
+    MavCmd.NAV_LOITER_TO_ALT: (2,),
+    MavCmd.NAV_ROI: (1,),
+    MavCmd.NAV_SPLINE_WAYPOINT: (1,),
+    MavCmd.NAV_GUIDED_ENABLE: (1,),
+    MavCmd.NAV_DELAY: (1, 2, 3, 4),
+    MavCmd.NAV_PAYLOAD_PLACE: (1,),
+    MavCmd.CONDITION_DELAY: (1,),
+    MavCmd.CONDITION_DISTANCE: (1,),
+    MavCmd.CONDITION_YAW: (1, 2, 3, 4),
+    MavCmd.DO_JUMP: (1, 2),
+    MavCmd.DO_CHANGE_SPEED: (1, 2),
+    MavCmd.DO_SET_HOME: (1,),
+    MavCmd.DO_SET_RELAY: (1, 2),
+    MavCmd.DO_REPEAT_RELAY: (1, 2, 3),
+    MavCmd.DO_SET_SERVO: (1, 2),
+    MavCmd.DO_REPEAT_SERVO: (1, 2, 3, 4),
+    MavCmd.DO_SET_REVERSE: (1,),
+    MavCmd.DO_SET_ROI: (1,),
+    MavCmd.DO_DIGICAM_CONTROL: (1, 2, 3, 4),
+    MavCmd.DO_MOUNT_CONTROL: (1, 2, 3),
+    MavCmd.DO_SET_CAM_TRIGG_DIST: (1, 2, 3),
+    MavCmd.DO_FENCE_ENABLE: (1,),
+    MavCmd.DO_PARACHUTE: (1,),
+    MavCmd.DO_GRIPPER: (1, 2),
+    MavCmd.DO_SET_CAM_TRIGG_INTERVAL: (1,),
+    MavCmd.DO_GUIDED_LIMITS: (1, 2, 3, 4),
+    MavCmd.DO_ENGINE_CONTROL: (1,),
+    MavCmd.SET_CAMERA_MODE: (1, 2),
+    MavCmd.SET_CAMERA_ZOOM: (1, 2),
+    MavCmd.SET_CAMERA_FOCUS: (1, 2),
+    MavCmd.JUMP_TAG: (1,),
+    MavCmd.DO_JUMP_TAG: (1, 2),
+    MavCmd.IMAGE_START_CAPTURE: (1, 2, 3),
+    MavCmd.IMAGE_STOP_CAPTURE: (1,),
+    MavCmd.VIDEO_START_CAPTURE: (1,),
+    MavCmd.VIDEO_STOP_CAPTURE: (1,),
+    MavCmd.DO_VTOL_TRANSITION: (1,),
+    MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION: (1,),
+    MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: (1,),
+    MavCmd.NAV_FENCE_CIRCLE_INCLUSION: (1,),
+    MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: (1,),
+    MavCmd.DO_WINCH: (1, 2),
+    MavCmd.NAV_SCRIPT_TIME: (1, 2),
+}
+"""The parameters 1 to 4 of common commands for which the standard gives NaN no meaning."""
+
+_ALIKE: dict[int, int] = {
+    MavFrame.GLOBAL_INT: MavFrame.GLOBAL,
+    MavFrame.GLOBAL_RELATIVE_ALT_INT: MavFrame.GLOBAL_RELATIVE_ALT,
+    MavFrame.GLOBAL_TERRAIN_ALT_INT: MavFrame.GLOBAL_TERRAIN_ALT,
+}
+
+GLOBAL_FRAMES = frozenset({*_ALIKE, *_ALIKE.values()})
+
+LOCAL_FRAMES = frozenset(
+    {
+        MavFrame.LOCAL_NED,
+        MavFrame.LOCAL_ENU,
+        MavFrame.LOCAL_OFFSET_NED,
+        MavFrame.LOCAL_FRD,
+        MavFrame.LOCAL_FLU,
+    }
+)
+
+_STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
+
+
+def canonical_frame(frame: int) -> int:
+    """The frame without "_INT", which the standard deprecated: in MISSION_ITEM_INT both mean the same."""
+    return _ALIKE.get(frame, frame)
+
+
+def has_place(command: int) -> bool:
+    """Whether x and y of this command are a latitude and a longitude; commands of other dialects count as such."""
+    return command in PLACES or command not in _STANDARD_COMMANDS
+
+
+def xy_scale(command: int, frame: int) -> int:
+    """By how much x and y are multiplied in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1.
+
+    ArduPilot decides by the command, PX4 by the frame; where they would differ, PX4 refuses the item.
+    """
+    if not has_place(command):
+        return 1
+    if frame in GLOBAL_FRAMES:
+        return 10_000_000
+    return 10_000 if frame in LOCAL_FRAMES else 1
+
+
+def command_name(command: int) -> str:
+    """The standard's name without its MAV_CMD prefix, or the number as text."""
+    return MavCmd(command).name if command in _STANDARD_COMMANDS else f"command {command}"
 
 
 class MissionItem(Snapshot):
@@ -76,3 +258,89 @@ class MissionItem(Snapshot):
 
     def __hash__(self) -> int:
         return hash(self._key())
+
+
+HIGHEST_M = 83_000.0
+"""ArduPilot stores no altitude beyond (its LOCATION_ALT_MAX_M)."""
+
+Altitudes = tuple["float | None", "float | None", "float | None"]
+
+
+def place(
+    command: int,
+    latitude_deg: float | None,
+    longitude_deg: float | None,
+    altitudes: Altitudes,
+    *parameters: float,
+) -> MissionItem:
+    """An item at a place; ``altitudes`` are those relative to home, above the sea, above the terrain: one is given.
+
+    Without latitude and longitude it is 0°, 0°, by which ArduPilot means where the vehicle is then.
+    """
+    z, frame = altitude_and_frame(*altitudes)
+    if latitude_deg is None and longitude_deg is None:
+        return MissionItem(command, frame, *_four(parameters), z=z)
+    if latitude_deg is None or longitude_deg is None:
+        raise InvalidArgument("latitude_deg and longitude_deg: give both or none of them")
+    in_range("latitude_deg", latitude_deg, -90, 90)
+    in_range("longitude_deg", longitude_deg, -180, 180)
+    check_place(latitude_deg, longitude_deg)
+    x, y = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
+    return MissionItem(command, frame, *_four(parameters), x, y, z)
+
+
+def altitude_and_frame(
+    relative_m: float | None, amsl_m: float | None, terrain_m: float | None
+) -> tuple[float, MavFrame]:
+    """The one altitude that is given, and the frame that says what it is above."""
+    given = {
+        name: (value, frame)
+        for name, value, frame in (
+            ("altitude_relative_m", relative_m, MavFrame.GLOBAL_RELATIVE_ALT),
+            ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),
+            ("altitude_terrain_m", terrain_m, MavFrame.GLOBAL_TERRAIN_ALT),
+        )
+        if value is not None
+    }
+    if len(given) != 1:
+        raise InvalidArgument(
+            "give exactly one of altitude_relative_m (above home), altitude_amsl_m (above mean sea level) and"
+            f" altitude_terrain_m (above the ground), not {' and '.join(given) or 'none'}"
+        )
+    ((name, (value, frame)),) = given.items()
+    in_range(name, value, -HIGHEST_M, HIGHEST_M)
+    return float(value), frame
+
+
+def action(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
+    """An item without a place, in the frame that PX4 wants for those: MISSION."""
+    return MissionItem(command, MavFrame.MISSION, *_four(parameters), z=z)
+
+
+def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[float, ...] = ()) -> float:
+    """The value; :class:`InvalidArgument` unless it is a number from low to high, or one of ``or_``."""
+    if (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and (low <= value <= high or value in or_)
+    ):
+        return float(value)
+    others = "".join(f", or {other:g}" for other in or_)
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{others}")
+
+
+def whole(name: str, value: object, low: int, high: int) -> float:
+    """The value; :class:`InvalidArgument` unless it is a whole number from low to high."""
+    if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
+        return float(value)
+    raise InvalidArgument(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")
+
+
+def heading(name: str, value: float | None) -> float:
+    """The heading in degrees, NaN (the standard's "not given") for None."""
+    return math.nan if value is None else in_range(name, value, -360, 360)
+
+
+def _four(parameters: tuple[float, ...]) -> tuple[float, float, float, float]:
+    one, two, three, four = (*parameters, 0.0, 0.0, 0.0, 0.0)[:4]
+    return one, two, three, four

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, overload
 
+from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.missions.check import check_items
-from aerokit.missions.compare import items_differences
+from aerokit.missions.compare import Storage, items_differences
+from aerokit.missions.fence import Fence, RallyPoints
 from aerokit.missions.item import MissionItem
-from aerokit.missions.storage import Storage
 from aerokit.missions.wire import with_home, without_home
 from aerokit.position import Position
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from typing_extensions import Self
 
-__all__ = ["Mission"]
+__all__ = ["Mission", "Plan"]
 
 
 class Mission(Snapshot):
@@ -82,3 +82,35 @@ class Mission(Snapshot):
     def __getitem__(self, index: slice) -> tuple[MissionItem, ...]: ...
     def __getitem__(self, index: int | slice) -> MissionItem | tuple[MissionItem, ...]:
         return self.items[index]  # type: ignore[return-value]
+
+
+class Plan(Snapshot):
+    """A mission with its fence and its rally points, as QGroundControl keeps them in one ``.plan`` file.
+
+    ``mission.home`` is the planned home position. ``firmware_type`` is a MAV_AUTOPILOT and ``vehicle_type`` a
+    MAV_TYPE, for which it was planned; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are what the
+    planner reckons with. ``source`` is the text of the file it was read from: writing changes in it only what has
+    become different, so that surveys and whatever else stands there stay. It is not compared.
+    """
+
+    mission: Mission = Mission()
+    fence: Fence = Fence()
+    rally: RallyPoints = RallyPoints()
+    firmware_type: int = 0
+    vehicle_type: int = 2
+    cruise_speed_m_s: float = 15.0
+    hover_speed_m_s: float = 5.0
+    source: str = ""
+
+    def _key(self) -> tuple[Any, ...]:
+        return tuple(self.to_dict().values())[:-1]
+
+    def __eq__(self, other: object) -> bool:
+        return self._key() == other._key() if isinstance(other, Plan) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{name}={value!r}" for name, value in self.to_dict().items() if name != "source")
+        return f"Plan({fields})"

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions.places import action, heading, in_range, place
+from aerokit.missions.item import action, heading, in_range, place
 
 if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem

@@ -10,20 +10,15 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.files import read_text, write_whole
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.commands import canonical_frame
-from aerokit.missions.fence import Fence, FenceCircle, FencePolygon
-from aerokit.missions.item import MissionItem
-from aerokit.missions.json_values import JsonValue, load_json
-from aerokit.missions.mission import Mission
-from aerokit.missions.plan import Plan
-from aerokit.missions.plan_items import json_number, merged_entries, read_entries
-from aerokit.missions.rally import RallyPoints
-from aerokit.missions.text_files import read_text
+from aerokit.missions.fence import Fence, FenceCircle, FencePolygon, RallyPoints
+from aerokit.missions.item import MissionItem, canonical_frame
+from aerokit.missions.mission import Mission, Plan
+from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries
 from aerokit.missions.wire import in_degrees
 from aerokit.position import Position
-from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     import os

@@ -5,26 +5,88 @@ https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/plan.html
 Altitudes: ``frame`` and the last of ``params`` are what is flown. ``AltitudeMode``, ``Altitude`` and
 ``AMSLAltAboveTerrain`` are what the planner shows; they count where the last of ``params`` is null.
 Jumps lead to the ``doJumpId`` of an item, which QGroundControl counts from 1.
+
+The file does not keep these items; this makes the ones that QGroundControl sends: the mark where the landing begins,
+then what is switched off (speed, photos, video), the approach, the landing.
 """
 
 from __future__ import annotations
 
 import copy
+import json
 import math
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
+from aerokit.errors import FileFormatError
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.commands import canonical_frame, has_place, xy_scale
-from aerokit.missions.item import MissionItem
-from aerokit.missions.plan_landing import LANDING_PATTERNS, landing_items
+from aerokit.missions.item import MissionItem, canonical_frame, has_place, xy_scale
 from aerokit.missions.wire import from_degrees, in_degrees
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from aerokit.missions.json_values import JsonValue
+__all__ = [
+    "LANDING_PATTERNS",
+    "JsonValue",
+    "json_number",
+    "landing_items",
+    "load_json",
+    "merged_entries",
+    "read_entries",
+    "simple_entry",
+]
 
-__all__ = ["json_number", "merged_entries", "read_entries", "simple_entry"]
+LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": MavCmd.NAV_VTOL_LAND}
+
+
+def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
+    """The items of a ComplexItem that is one of :data:`LANDING_PATTERNS`."""
+    command = LANDING_PATTERNS[pattern["complexItemType"].value]
+    relative = pattern["altitudesAreRelative"].boolean()
+    frame = MavFrame.GLOBAL_RELATIVE_ALT if relative else MavFrame.GLOBAL
+    approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
+    heading = 0.0 if command == MavCmd.NAV_LAND else math.nan
+    return (
+        MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
+        *_switched_off(pattern),
+        _approach(pattern, frame, approach),
+        MissionItem(command, frame, 0.0, 0.0, 0.0, heading, *_place(pattern["landCoordinate"])),
+    )
+
+
+def _switched_off(pattern: JsonValue) -> list[MissionItem]:
+    items = []
+    if _flag(pattern, "useDoChangeSpeed"):
+        speed = pattern["finalApproachSpeed"].number(0)
+        items.append(MissionItem(MavCmd.DO_CHANGE_SPEED, MavFrame.MISSION, 0.0, speed, -1.0))
+    if _flag(pattern, "stopTakingPhotos"):
+        items.append(MissionItem(MavCmd.DO_SET_CAM_TRIGG_DIST, MavFrame.MISSION))
+        items.append(MissionItem(MavCmd.IMAGE_STOP_CAPTURE, MavFrame.MISSION))
+    if _flag(pattern, "stopVideoPhotos"):
+        items.append(MissionItem(MavCmd.VIDEO_STOP_CAPTURE, MavFrame.MISSION))
+    return items
+
+
+def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
+    """Circling down, and then on from the circle's edge; or a mere waypoint. Older files have circles only."""
+    if not _flag(pattern, "useLoiterToAlt", default=True):
+        return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
+    radius = pattern["loiterRadius"].number(0)
+    turn = radius if pattern["loiterClockwise"].boolean() else -radius
+    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, 1.0, turn, 0.0, 1.0, *_place(place))
+
+
+def _flag(pattern: JsonValue, key: str, *, default: bool = False) -> bool:
+    value = pattern.child(key)
+    return default if value is None else value.boolean()
+
+
+def _place(value: JsonValue) -> tuple[int, int, float]:
+    latitude, longitude, altitude = value.elements(3)
+    x, y = round(latitude.number(-90, 90) * 1e7), round(longitude.number(-180, 180) * 1e7)
+    return x, y, altitude.number()
+
 
 _FRAME_OF_MODE = {
     1: MavFrame.GLOBAL_RELATIVE_ALT,
@@ -32,6 +94,7 @@ _FRAME_OF_MODE = {
     3: MavFrame.GLOBAL,
     4: MavFrame.GLOBAL_TERRAIN_ALT,
 }
+
 _MODE_OF_FRAME: dict[int, int] = {
     MavFrame.GLOBAL: 2,
     MavFrame.GLOBAL_RELATIVE_ALT: 1,
@@ -178,3 +241,112 @@ def _number(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[Missio
             if simple["command"] == MavCmd.DO_JUMP:
                 simple["params"][0] = json_number(items[index].param1 + 1)
         first += size
+
+
+def load_json(text: str, name: str) -> JsonValue:
+    """The document in ``text``; :class:`FileFormatError` names the line when it is no JSON."""
+    try:
+        return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise FileFormatError(f"{name}: {where}: no JSON: {error.msg}") from error
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{name}: no JSON: {error}") from error
+
+
+def _no_constant(text: str) -> None:
+    raise ValueError(f"{text} is none of its numbers")
+
+
+class JsonValue:
+    """One value of a document; every reading method raises :class:`FileFormatError` when it is of another kind."""
+
+    __slots__ = ("name", "path", "value")
+
+    def __init__(self, value: Any, name: str, path: str) -> None:
+        self.value: Any = value
+        self.name: str = name
+        self.path: str = path
+
+    def error(self, expected: str) -> FileFormatError:
+        """The complaint that this value is not what was expected."""
+        # Piece by piece, so that a large value is not written out to be cut off.
+        found = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
+        found = found if len(found) <= 40 else f"{found[:37]}..."
+        return FileFormatError(f"{self.name}: {self.path or 'the document'} = {found}: expected {expected}")
+
+    def child(self, key: str) -> JsonValue | None:
+        """The value of a key of an object, None when there is no such key."""
+        members = self.members()
+        path = f"{self.path}.{key}" if self.path else key
+        return JsonValue(members[key], self.name, path) if key in members else None
+
+    def __getitem__(self, key: str) -> JsonValue:
+        child = self.child(key)
+        if child is None:
+            where = self.path or "the document"
+            raise FileFormatError(f"{self.name}: {where} has no {key!r}, which is required")
+        return child
+
+    def members(self) -> dict[str, Any]:
+        """An object."""
+        if not isinstance(self.value, dict):
+            raise self.error("an object")
+        return self.value
+
+    def elements(self, *sizes: int) -> list[JsonValue]:
+        """The elements of an array, which has one of these sizes."""
+        if not isinstance(self.value, list):
+            raise self.error("an array")
+        if sizes and len(self.value) not in sizes:
+            raise self.error(
+                f"an array of {' or '.join(map(str, sizes))} values, and it has {len(self.value)}"
+            )
+        return list(self._elements())
+
+    def _elements(self) -> Iterator[JsonValue]:
+        for index, value in enumerate(self.value):
+            yield JsonValue(value, self.name, f"{self.path}[{index}]")
+
+    def number(self, low: float = -math.inf, high: float = math.inf, *, null: bool = False) -> float:
+        """A finite number in that range, NaN for null where it is allowed."""
+        if self.value is None and null:
+            return math.nan
+        value = self._as_float()
+        if not math.isfinite(value) or not low <= value <= high:
+            bounds = (
+                f" from {low:g} to {high:g}"
+                if math.isfinite(high)
+                else f" from {low:g} on"
+                if low == 0
+                else ""
+            )
+            raise self.error(f"a number{bounds}" + ", or null" * null)
+        return value
+
+    def integer(self, low: int, high: int) -> int:
+        """A whole number in that range; 3.0 counts as one."""
+        value = self.number()
+        if not value.is_integer() or not low <= value <= high:
+            raise self.error(f"a whole number from {low} to {high}")
+        return int(value)
+
+    def boolean(self) -> bool:
+        """True or false."""
+        if not isinstance(self.value, bool):
+            raise self.error("true or false")
+        return self.value
+
+    def one_of(self, *choices: object) -> None:
+        """Raise unless it is one of these values."""
+        if self.value not in choices or isinstance(self.value, bool):
+            raise self.error(" or ".join(json.dumps(choice) for choice in choices))
+
+    def _as_float(self) -> float:
+        """The number, infinity for what is none."""
+        if not isinstance(self.value, (int, float)) or isinstance(self.value, bool):
+            return math.inf
+        try:
+            return float(self.value)
+        except OverflowError:
+            return math.inf

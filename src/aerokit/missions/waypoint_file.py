@@ -13,15 +13,13 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from aerokit._internal.files import read_text, write_whole
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.commands import canonical_frame, xy_scale
-from aerokit.missions.item import MissionItem
+from aerokit.missions.item import MissionItem, canonical_frame, xy_scale
 from aerokit.missions.mission import Mission
-from aerokit.missions.text_files import read_text
 from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
 from aerokit.position import Position
-from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     import os

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.commands import DEFAULT_XY, xy_scale
-from aerokit.missions.item import MissionItem
+from aerokit.missions.item import DEFAULT_XY, DESTINATIONS, GLOBAL_FRAMES, MissionItem, has_place, xy_scale
 from aerokit.position import Position
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
 __all__ = [
     "from_degrees",
@@ -24,6 +23,7 @@ __all__ = [
     "to_wire_float",
     "with_home",
     "without_home",
+    "written_out",
 ]
 
 
@@ -156,3 +156,22 @@ def shift_jumps(items: Iterable[MissionItem], by: int) -> tuple[MissionItem, ...
     return tuple(
         item.replace(param1=item.param1 + by) if item.command == MavCmd.DO_JUMP else item for item in items
     )
+
+
+def written_out(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
+    """The items of a mission made for ArduPilot, for another autopilot.
+
+    Commands without a place, which ArduPilot takes in any frame, come in MAV_FRAME_MISSION, the only one that PX4 takes
+    them in. 0°, 0° is "where the vehicle is" for ArduPilot: it becomes where the item before leads, at first ``here``:
+    latitude and longitude in degrees, None: not known.
+    """
+    place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
+    for item in items:
+        if item.frame in GLOBAL_FRAMES and not has_place(item.command):
+            item = item.replace(frame=int(MavFrame.MISSION))
+        if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
+            if place is not None and item.x == item.y == 0:
+                item = item.replace(x=place[0], y=place[1])
+            elif DEFAULT_XY not in (item.x, item.y):
+                place = round(item.x), round(item.y)
+        yield item

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         load_definition,
         parse_definition,
     )
-    from aerokit.parameters.differences import ParameterDifference, ParameterValues, diff
     from aerokit.parameters.files import (
         FileFormat,
         ParameterFile,
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
         translate_values,
     )
     from aerokit.parameters.setting import Setting, SettingValue
+    from aerokit.parameters.table import ParameterDifference, ParameterValues, diff
 
 __all__ = [
     "CameraDefinition",

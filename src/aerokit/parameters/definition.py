@@ -12,13 +12,13 @@ from itertools import islice
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from aerokit._internal.files import LARGEST_FILE, read_bounded, too_large, unpacked
+from aerokit._internal.values import Snapshot
+from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
-from aerokit.parameters.number_text import parse_number
+from aerokit.parameters.encoding import parse_number
 from aerokit.parameters.setting import SettingValue, checked_setting, setting_key, settings_equal
-from aerokit.snapshot import Snapshot
-from aerokit.whole_file import LARGEST_FILE, read_bounded, too_large, unpacked
-from aerokit.wording import did_you_mean, shown
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

@@ -10,19 +10,22 @@ https://mavlink.io/en/services/parameter.html#parameter-encoding
 from __future__ import annotations
 
 import math
+import re
 from struct import Struct
 from typing import TypeVar
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.messages import ParamSet, ParamValue
-from aerokit.parameters.parameter import Parameter, ParameterType
+from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 
 __all__ = [
     "UNKNOWN_INDEX",
     "from_bits",
     "from_wire",
+    "number_text",
     "parameter_of",
+    "parse_number",
     "set_message",
     "to_bits",
     "to_wire",
@@ -34,6 +37,7 @@ UNKNOWN_INDEX = 0xFFFF
 """``param_index`` of a PARAM_VALUE that is not part of the list: ArduPilot and PX4 send it after PARAM_SET."""
 
 _FLOAT = Struct("<f")
+
 _FORMATS = {
     1: Struct("<B"),
     2: Struct("<b"),
@@ -42,6 +46,7 @@ _FORMATS = {
     5: Struct("<I"),
     6: Struct("<i"),
 }
+
 _M = TypeVar("_M", ParamSet, ParamValue)
 
 
@@ -114,8 +119,6 @@ def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValu
 
 
 # ------------------------------------------------------------------------------------------ bits
-
-
 class _ExactParamSet(ParamSet):
     """One whose ``param_value`` is a signalling NaN, which no Python float can carry."""
 
@@ -153,3 +156,38 @@ def _exact_bits(message: ParamSet | ParamValue) -> bytes:
 def _cast(number: float, type_: ParameterType) -> int | float:
     whole = type_.is_integer and math.isfinite(number) and number == int(number)
     return int(number) if whole else number
+
+
+_INTEGER = re.compile(r"[+-]?[0-9]{1,999}")
+
+_HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]{1,999}")
+
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+def number_text(value: float) -> str:
+    """``0.1`` for the 32-bit number nearest to 0.1, ``3`` for 3.0; all digits of an int.
+
+    Raises OverflowError beyond 32-bit numbers, and ValueError for NaN.
+    """
+    if isinstance(value, int):
+        return str(int(value))
+    if value == int(value) and abs(value) < 1e9:
+        return "-0.0" if str(value) == "-0.0" else str(int(value))
+    number = to_float32(value)
+    candidates = (f"{number:.{digits}g}" for digits in range(6, 10))
+    return next(text for text in candidates if to_float32(float(text)) == number)
+
+
+def parse_number(text: str) -> int | float:
+    """An int or a float; ValueError for anything else, NaN and infinities included."""
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    if _HEXADECIMAL.fullmatch(text):
+        return int(text, 16)
+    if not _DECIMAL.fullmatch(text):
+        raise ValueError(text)
+    number = float(text)
+    if math.isinf(number):  # 1e999
+        raise ValueError(text)
+    return number

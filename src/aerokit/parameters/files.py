@@ -12,12 +12,11 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal
 
+from aerokit._internal.files import read_bounded, write_whole
 from aerokit.errors import FileFormatError, InvalidArgument
-from aerokit.parameters.differences import ParameterValues, plain_values
-from aerokit.parameters.number_text import number_text, parse_number
+from aerokit.parameters.encoding import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
-from aerokit.parameters.table import ParameterTable
-from aerokit.whole_file import read_bounded, write_whole
+from aerokit.parameters.table import ParameterTable, ParameterValues, plain_values
 
 __all__ = [
     "FileFormat",

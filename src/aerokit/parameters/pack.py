@@ -9,15 +9,18 @@ https://mavlink.io/en/services/parameter_ftp.html
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import zlib
+from collections.abc import Container, Iterable, Iterator, Mapping
 from struct import Struct
 from typing import NamedTuple, NoReturn
 
 from aerokit.errors import InvalidArgument, RemoteProtocolError
+from aerokit.parameters.encoding import to_bits
 from aerokit.parameters.parameter import NAME_LENGTH, Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
 
 __all__ = [
+    "HASH_NAME",
     "HEADER",
     "MAGIC",
     "PACK_PATH",
@@ -26,6 +29,7 @@ __all__ = [
     "PackHeader",
     "pack_parameters",
     "pack_served",
+    "px4_hash",
     "read_entry",
     "read_header",
     "unpack_parameters",
@@ -33,12 +37,16 @@ __all__ = [
 
 PACK_PATH = "@PARAM/param.pck"
 """Where vehicles serve and take the file."""
+
 PACK_PATH_WITH_DEFAULTS = "@PARAM/param.pck?withdefaults=1"
 """The same for reading, with the defaults of those parameters that have been changed."""
 
 MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
+
 HEADER = Struct("<HHH")
+
 _HAS_DEFAULT = 0x10
+
 _LONGEST = 0xFFFF
 
 # The file has codes of its own, those of ArduPilot's variables, not of MAV_PARAM_TYPE.
@@ -48,6 +56,7 @@ _CODES = {
     3: (ParameterType.INT32, Struct("<i")),
     4: (ParameterType.REAL32, Struct("<f")),
 }
+
 _CODE_OF = {
     ParameterType.INT8: 1,
     ParameterType.UINT8: 2,
@@ -145,8 +154,6 @@ def pack_served(
 
 
 # --------------------------------------------------------------------------------------- reading
-
-
 def read_header(data: bytes) -> PackHeader:
     """The header of any file; RemoteProtocolError when it is shorter than that."""
     if len(data) < HEADER.size:
@@ -214,8 +221,6 @@ def _checked(found: list[Parameter], count: int) -> list[Parameter]:
 
 
 # --------------------------------------------------------------------------------------- writing
-
-
 def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator[Parameter]:
     return iter(parameters.values() if isinstance(parameters, Mapping) else parameters)
 
@@ -240,3 +245,22 @@ def _common_length(name: bytes, last: bytes) -> int:
             break
         common += 1
     return common
+
+
+HASH_NAME = "_HASH_CHECK"
+"""The name under which PX4 gives it, as a UINT32 with index 65535; asking for it by name costs one message."""
+
+_ALL_ONES = 0xFFFFFFFF
+
+
+def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
+    """What ``_HASH_CHECK`` would be for this table, sorted by name as PX4 has it.
+
+    CRC-32 (without the usual inversions) over each name and the four bytes of its value. PX4 leaves out *volatile*
+    parameters, those that it changes by itself; ``volatile`` are their names
+    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`). Without them the result differs, so a
+    cache keeps the vehicle's own number beside its table.
+    """
+    counted = (table[name] for name in sorted(table) if name not in volatile)
+    data = b"".join(p.name.encode() + to_bits(p.value, p.type, bytewise=True) for p in counted)
+    return zlib.crc32(data, _ALL_ONES) ^ _ALL_ONES

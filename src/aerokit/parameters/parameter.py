@@ -7,9 +7,9 @@ from enum import IntEnum
 from struct import Struct
 from typing import SupportsFloat, SupportsIndex
 
+from aerokit._internal.values import Snapshot
+from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
-from aerokit.snapshot import Snapshot
-from aerokit.wording import shown
 
 __all__ = [
     "MOST_PARAMETERS",

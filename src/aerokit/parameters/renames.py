@@ -2,7 +2,7 @@
 
 The vehicle converts its own values when it is updated; programs and files with the old names are what this is for.
 What cannot be said one to one is not converted: :func:`replacement_of` says what does its work now. The facts are in
-:mod:`aerokit.parameters.rename_table` (4.7, SI units) and :mod:`aerokit.parameters.older_names` (before).
+:mod:`aerokit.parameters.rename_table` (4.7, SI units) and :mod:`aerokit.parameters.rename_table` (before).
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ from decimal import Decimal
 from functools import lru_cache
 from types import MappingProxyType
 
-from aerokit.parameters.number_text import number_text
-from aerokit.parameters.older_names import OLDER, ONE_WAY, REPLACED
+from aerokit._internal.values import Snapshot
+from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
-from aerokit.parameters.rename_table import GROUPS, INVERTED, OTHER_NEW_NAMES
-from aerokit.snapshot import Snapshot
+from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
 
 __all__ = [
     "ParameterRenamedWarning",

@@ -9,11 +9,11 @@ import math
 import struct
 from struct import Struct
 
+from aerokit._internal.values import Snapshot
+from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters.parameter import ParameterType, checked_value
-from aerokit.snapshot import Snapshot
-from aerokit.wording import shown
 
 __all__ = [
     "LONGEST_VALUE",

@@ -20,14 +20,13 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.parameters.setting import Setting, setting_bytes, setting_value, settings_equal
-from aerokit.protocols.early_answers import EarlyAnswers
+from aerokit.protocols.exchange import PATIENCE_S, EarlyAnswers, OnProgress, Transfer, ranges
 from aerokit.protocols.request_window import RequestWindow
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer, ranges
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.parameters.setting import SettingValue
-    from aerokit.protocols.round_trip import RoundTrip
+    from aerokit.protocols.exchange import RoundTrip
 
 __all__ = ["SettingAnswer", "SettingList", "SettingReads", "SettingWrite", "setting_of"]
 

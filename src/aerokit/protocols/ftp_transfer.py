@@ -16,14 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
-from aerokit.protocols.block_requests import BlockRequests
-from aerokit.protocols.ftp import SEQUENCES, FtpClient, FtpExchange
-from aerokit.protocols.ftp_message import DATA_SIZE, FtpMessage
-from aerokit.protocols.round_trip import RoundTrip
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress
+from aerokit.protocols.blocks import BlockRequests
+from aerokit.protocols.exchange import PATIENCE_S, OnProgress, RoundTrip
+from aerokit.protocols.ftp import DATA_SIZE, SEQUENCES, FtpClient, FtpExchange, FtpMessage
 
 if TYPE_CHECKING:
-    from aerokit.protocols.reassembly import Reassembly
+    from aerokit.protocols.blocks import Reassembly
 
 __all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.exchange import RoundTrip
 
 __all__ = ["MessageStream"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.values import Snapshot
 from aerokit.errors import MissionTimeout
 from aerokit.mavlink.enums import MavMissionResult
 from aerokit.mavlink.messages import (
@@ -16,14 +17,13 @@ from aerokit.mavlink.messages import (
     MissionRequestList,
 )
 from aerokit.missions.wire import from_wire
+from aerokit.protocols.exchange import ranges
 from aerokit.protocols.missions import (
     BUSY_AGAIN_S,
     BUSY_S,
     FORGOTTEN_S,
     MissionExchange,
 )
-from aerokit.protocols.transfer import ranges
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.values import Snapshot
 from aerokit.errors import MissionTimeout
 from aerokit.mavlink.enums import MavMissionResult
 from aerokit.mavlink.messages import (
@@ -15,14 +16,13 @@ from aerokit.mavlink.messages import (
     MissionWritePartialList,
 )
 from aerokit.missions.wire import to_wire, to_wire_float
+from aerokit.protocols.exchange import ranges
 from aerokit.protocols.missions import (
     BUSY_AGAIN_S,
     BUSY_S,
     FORGOTTEN_S,
     MissionExchange,
 )
-from aerokit.protocols.transfer import ranges
-from aerokit.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message

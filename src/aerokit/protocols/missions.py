@@ -6,16 +6,23 @@ among them here.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+import struct
+import zlib
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from aerokit.errors import MissionRejected, MissionTimeout
+from aerokit.errors import MissionRejected, MissionTimeout, OperationTimeout
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
-from aerokit.mavlink.messages import MissionAck, MissionClearAll
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
+from aerokit.mavlink.messages import MissionAck, MissionClearAll, MissionCurrent
+from aerokit.mavlink.messages import MissionSetCurrent as SetCurrentMessage
+from aerokit.protocols.exchange import PATIENCE_S, OnProgress, Transfer
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.round_trip import RoundTrip
+    from aerokit.missions.item import MissionItem
+    from aerokit.protocols.command import Standing
+    from aerokit.protocols.exchange import RoundTrip
 
 __all__ = [
     "BUSY_AGAIN_S",
@@ -23,22 +30,29 @@ __all__ = [
     "FORGOTTEN_S",
     "MissionClear",
     "MissionExchange",
+    "MissionSetCurrent",
+    "mission_checksum",
 ]
 
 ResultT = TypeVar("ResultT")
 
 BUSY_S = 9.0
 """How long a vehicle may be busy with a transfer that nobody goes on with: ArduPilot waits 8 s, PX4 5 s."""
+
 BUSY_AGAIN_S = 1.0
 """How often a busy vehicle is asked again."""
+
 FEW_ATTEMPTS, SAME_ATTEMPTS = 5, 7
+
 FORGOTTEN_S = 4.5
 """After so long a silence a vehicle may have given the transfer up (PX4 after 5 s, ArduPilot after 8)."""
+
 NAMES: dict[int, str] = {
     MavMissionType.MISSION: "mission",
     MavMissionType.FENCE: "fence",
     MavMissionType.RALLY: "rally points",
 }
+
 RESULTS: dict[int, str] = {
     MavMissionResult.ERROR: "an error it does not explain, or it is busy with another transfer",
     MavMissionResult.UNSUPPORTED_FRAME: "the coordinate frame is not supported",
@@ -169,3 +183,100 @@ class MissionClear(MissionExchange[None]):
             f"{self.kind}: no answer to MISSION_CLEAR_ALL, sent {self._attempt} times"
             f" in {now - self._started_at:.1f} s; whether it was cleared is not known"
         )
+
+
+LOOK_S = 0.1
+
+TOLD_EVERY_S = 1.0
+"""MISSION_CURRENT is streamed at 1 Hz, and sent when it changes."""
+
+
+class MissionSetCurrent(Transfer[None]):
+    """There is no acknowledgement: PX4 sends MISSION_CURRENT when the item has changed, else at its next turn.
+
+    ``told`` is the item that the vehicle told last: from the item wanted to the one after it, it flies on by itself.
+    With a ``standing``, it is sent again only after a HEARTBEAT that came since, and while that is not against it.
+    """
+
+    expects: tuple[type[Message], ...] = (MissionCurrent,)
+
+    # from start() on
+    _sent_at: float
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        seq: int,
+        told: int | None = None,
+        *,
+        standing: Standing | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(target_system, target_component, **options)
+        self._seq = seq
+        self._told = told
+        self._standing = standing
+        self._attempts = 0
+
+    def start(self, now: float) -> None:
+        """Send it."""
+        self._begin(now)
+        self._send(now)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take a MISSION_CURRENT; one that was under way may come first."""
+        if not isinstance(message, MissionCurrent) or not self._is_from_target(message):
+            return
+        if message.seq == self._seq or self._has_passed(message.seq):
+            self._finish(None)
+        self._told = message.seq
+
+    def expire(self, now: float) -> None:
+        """Send it again, or give up."""
+        end = "" if self._standing is None else self._standing.end
+        if end or self._is_out_of_patience(now):
+            told = "nothing" if self._told is None else f"item {self._told}"
+            self._fail(
+                OperationTimeout(
+                    f"MISSION_SET_CURRENT {self._seq} was not confirmed in {now - self._started_at:.1f} s"
+                    f" ({self._attempts} attempts); MISSION_CURRENT told {told} (numbers on the wire)"
+                    + (f"; not sent again: {end}" if end else "")
+                )
+            )
+        elif self._standing is not None and self._standing.told_at < self._sent_at:
+            self.deadline = now + LOOK_S
+        else:
+            self._send(now)
+
+    def _has_passed(self, seq: int) -> bool:
+        """Whether it has gone to our item and run through it: not what flying on from where it was comes to."""
+        told = self._told
+        return told is not None and (told <= self._seq < seq or self._seq < seq < told)
+
+    def _send(self, now: float) -> None:
+        self._attempts += 1
+        self._sent_at = now
+        self._outbox.append(SetCurrentMessage(self.target_system, self.target_component, self._seq))
+        left = self._started_at + self._patience_s - now
+        self.deadline: float | None = now + min(
+            max(self.round_trip.timeout_s(), TOLD_EVERY_S), max(left, 0.01)
+        )
+
+
+ITEM = struct.Struct("<BHB4fiif")
+
+INVERT = 0xFFFFFFFF
+
+
+def mission_checksum(items: Iterable[MissionItem]) -> int:
+    """CRC-32, begun with 0 and not inverted, over frame, command, autocontinue and the seven numbers of each item.
+
+    PX4 (since 1.15) tells it as ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as ``mission_id``, ``fence_id``,
+    ``rally_points_id`` in MISSION_CURRENT (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
+    """
+    checksum = INVERT
+    for item in items:
+        numbers = (item.param1, item.param2, item.param3, item.param4, int(item.x), int(item.y), item.z)
+        checksum = zlib.crc32(ITEM.pack(item.frame, item.command, item.autocontinue, *numbers), checksum)
+    return checksum ^ INVERT

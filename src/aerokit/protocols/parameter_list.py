@@ -10,32 +10,54 @@ from typing import TYPE_CHECKING
 from aerokit.errors import ParameterTimeout
 from aerokit.mavlink.enums import MavParamError
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamValue
-from aerokit.parameters import Parameter, ParameterTable
+from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
-from aerokit.parameters.parameter import MOST_PARAMETERS
-from aerokit.parameters.px4_hash import HASH_NAME
-from aerokit.protocols.parameter_update import updated
+from aerokit.parameters.pack import HASH_NAME
+from aerokit.parameters.parameter import MOST_PARAMETERS, same_value
+from aerokit.protocols.exchange import PATIENCE_S, OnProgress, Transfer, ranges
 from aerokit.protocols.request_window import RequestWindow
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer, ranges
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.round_trip import RoundTrip
+    from aerokit.protocols.exchange import RoundTrip
 
-__all__ = ["ParameterList"]
+__all__ = ["ParameterList", "updated"]
+
+
+def updated(known: Parameter, told: Parameter, bytewise: bool) -> Parameter:
+    """What is known of a parameter after a PARAM_VALUE outside a list.
+
+    Where values travel as numbers, such a message tells less than a list or a file. ArduPilot calls an integer a float
+    in its answer to PARAM_SET when it holds its default, and an INT32 beyond 2**24 has lost its last bits.
+    """
+    value, type_ = told.value, told.type
+    if not bytewise and known.type.is_integer:
+        if type_ is ParameterType.REAL32 and value == value // 1:
+            value, type_ = int(value), known.type
+        if same_value(float(known.value), float(value)):
+            value = known.value
+    index = known.index if told.index is None else told.index
+    return Parameter(known.name, value, type_, known.default, index)
+
 
 PAUSES = 4
 """The stream has stopped when nothing comes for so many of its longest pauses."""
+
 LONGEST_TICK_S = 1.1
 """ArduPilot sends some of the list ten times a second, or as rarely as once (MAV1_PARAMS)."""
+
 NEAR_END = 20
 """So few are asked for by index without waiting for that: it costs little if they were still to come."""
+
 BEGUN = 2
 """With so many values the stream has begun: it is not asked for afresh any more."""
+
 SHORTEST_START_S = 0.3
 """A list may take that long to begin; asking again would make it begin anew."""
+
 ROUNDS = 3
 """How often indices are asked for again that have shifted since."""
+
 REFUSALS = 2
 
 

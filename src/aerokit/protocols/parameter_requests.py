@@ -1,26 +1,34 @@
 """What reading and writing parameters by name have in common: many at once, one result each.
 
 https://mavlink.io/en/services/parameter.html
+
+https://mavlink.io/en/services/parameter.html#read_single
+
+https://mavlink.io/en/services/parameter.html#write
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
-from aerokit.mavlink.messages import ParamError, ParamValue
-from aerokit.parameters import Parameter
-from aerokit.protocols.early_answers import EarlyAnswers
+from aerokit.mavlink.enums import MavParamError
+from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamValue
+from aerokit.parameters import Parameter, ParameterType
+from aerokit.parameters.encoding import parameter_of, set_message
+from aerokit.parameters.parameter import same_value
+from aerokit.protocols.exchange import PATIENCE_S, EarlyAnswers, OnProgress, Transfer
 from aerokit.protocols.request_window import RequestWindow
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress, Transfer
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.round_trip import RoundTrip
+    from aerokit.protocols.exchange import RoundTrip
 
-__all__ = ["Answer", "ParameterRequests", "rejection"]
+__all__ = ["Answer", "ParameterReads", "ParameterRequests", "ParameterWrites", "rejection"]
 
 Answer = Parameter | ParameterRejected | ParameterTimeout
 """What came of one request: what the vehicle says the parameter is, or why there is nothing to say."""
@@ -156,3 +164,240 @@ def rejection(name: str, code: int) -> ParameterRejected:
     """The exception that stands for a PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR)."""
     reason = ERRORS.get(code, f"MAV_PARAM_ERROR {code}")
     return ParameterRejected(f"{name} was refused: {reason}", name=name, code=code)
+
+
+READS_AT_ONCE = 20
+
+BY_NAME = -1
+
+PROBE, PROBE_INDEX = "", 0
+"""The request for a parameter that every vehicle has."""
+
+DOUBT = 1e-4
+"""How probable it may be that a parameter exists although the vehicle, which answers otherwise, says nothing of it."""
+
+
+class ParameterReads(ParameterRequests):
+    """Read some parameters by name; ends with one answer for each.
+
+    ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So names that ``are_doubtful`` are asked for
+    together with the parameter of index 0, and when that one comes time and again, the vehicle has none of the name
+    that does not: the answer is a ParameterRejected without a code.
+
+    Of a name and its ``rivals`` the vehicle has one at most: the others are rejected when that one has come.
+    An answer that tells a ``distrusted`` value may have been under way for long: it is believed the second time.
+    """
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        names: Iterable[str],
+        *,
+        bytewise: bool,
+        are_doubtful: bool = False,
+        distrusted: Mapping[str, float] = MappingProxyType({}),
+        rivals: Mapping[str, Iterable[str]] = MappingProxyType({}),
+        own_system: int = 0,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        super().__init__(
+            target_system,
+            target_component,
+            names,
+            bytewise=bytewise,
+            window=READS_AT_ONCE,
+            doubles_last=not are_doubtful,
+            own_system=own_system,
+            round_trip=round_trip,
+            patience_s=patience_s,
+            on_progress=on_progress,
+        )
+        self._are_doubtful = self._is_probe_wanted = are_doubtful
+        self._distrusted = dict(distrusted)
+        self._refused: set[str] = set()
+        self._rivals = {name: tuple(others) for name, others in rivals.items()}
+        self._probes_sent = self._probes_answered = 0
+
+    def _request(self, name: str) -> list[Message]:
+        target = self.target_system, self.target_component
+        if name == PROBE:
+            self._probes_sent += 1
+            return [ParamRequestRead(*target, "", PROBE_INDEX)]
+        return [ParamRequestRead(*target, name, BY_NAME)]
+
+    def _before_sending(self, now: float) -> None:
+        overdue = [name for name in self._window.overdue(now) if name != PROBE]
+        if self._are_doubtful and overdue:
+            self._give_up_unknown(overdue, now)
+            self._is_probe_wanted = True
+
+    def _after_sending(self, now: float) -> None:
+        if self._is_probe_wanted and PROBE not in self._window:
+            self._window.send(PROBE, now)
+            self._outbox += self._request(PROBE)
+        self._is_probe_wanted = False
+
+    def _take(self, message: ParamValue, now: float) -> None:
+        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
+            self._probes_answered = min(
+                self._probes_answered + 1, self._probes_sent
+            )  # repeated ones count once
+            passed_over = self._window.answered(PROBE, now, overtaken=1)
+            self._give_up_unknown(passed_over, now)
+            self._is_probe_wanted |= bool(passed_over)
+        name = message.param_id
+        if name and name in self._window:
+            self._window.answered(name, now)
+            told = parameter_of(message, self._bytewise)
+            old = self._distrusted.pop(name, None)
+            if old is not None and same_value(old, told.value):
+                self._window.ask(name)
+            else:
+                self._settle(name, told, now)
+                self._reject_rivals(name, now)
+
+    def _reject_rivals(self, name: str, now: float) -> None:
+        for other in self._rivals.get(name, ()):
+            if other in self._names and other not in self._answers:
+                text = f"the vehicle has no parameter {other}, it has {name}"
+                self._settle(other, ParameterRejected(text, name=other), now)
+
+    def _take_error(self, message: ParamError, now: float) -> None:
+        """PX4 says that there is no such parameter also when it has no room to send it: once more, then."""
+        name = message.param_id
+        is_first = name in self._names and name in self._window and name not in self._refused
+        if is_first and message.error == MavParamError.DOES_NOT_EXIST:
+            self._refused.add(name)
+            self._window.answered(name, now)
+            self._window.ask(name)
+        else:
+            super()._take_error(message, now)
+
+    def _give_up_unknown(self, names: list[str], now: float) -> None:
+        """Silence is an answer once it can hardly be loss."""
+        for name in names:
+            if self._probability_of_silence(self._window.attempts(name)) < DOUBT:
+                text = f"the vehicle has no parameter {name}: it answers others, and not this one"
+                self._settle(name, ParameterRejected(text, name=name), now)
+
+    def _probability_of_silence(self, attempts: int) -> float:
+        """How probable it is to lose all answers to so many requests, after what became of the probes (Laplace)."""
+        lost = self._probes_sent - self._probes_answered
+        chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
+        return math.prod(chances) if self._probes_answered else 1.0
+
+    def _timeout_text(self, name: str) -> str:
+        return f"{name} was not answered, asked for {self._window.attempts(name)} times"
+
+
+WRITES_AT_ONCE = 10
+"""ArduPilot saves through a queue of 30, which it must not overflow while it is armed."""
+
+VERDICT, VERDICT_OF_NO_CHANGE = 2, 8
+"""So many answers with another value than asked for are a verdict; more when it is the value from before, which may
+also stand in a message that was under way, while PARAM_SET was lost."""
+
+
+class ParameterWrites(ParameterRequests):
+    """Set some parameters; ends with what the vehicle says each of them is then.
+
+    The answer that tells value and type as asked for ends a write. When none comes the vehicle is asked what it has: a
+    PARAM_SET is never sent into a silence. Only an answer with the value from ``before`` (the one known so far) has it
+    set again; any other value is the vehicle's own (it rounds or clamps) or another station's, and is the answer
+    when it comes twice. So nothing is sent for ever, and nobody's later setting is undone.
+
+    ``recent`` are names that were written a moment ago: echoes of that write
+    may still come, so that the first answer as asked is read back.
+    """
+
+    def __init__(
+        self,
+        target_system: int,
+        target_component: int,
+        wanted: Iterable[Parameter],
+        *,
+        bytewise: bool,
+        before: Mapping[str, float] = MappingProxyType({}),
+        recent: Iterable[str] = (),
+        own_system: int = 0,
+        round_trip: RoundTrip | None = None,
+        patience_s: float = PATIENCE_S,
+        on_progress: OnProgress | None = None,
+    ) -> None:
+        self._wanted = {each.name: each for each in wanted}
+        super().__init__(
+            target_system,
+            target_component,
+            self._wanted,
+            bytewise=bytewise,
+            window=WRITES_AT_ONCE,
+            own_system=own_system,
+            round_trip=round_trip,
+            patience_s=patience_s,
+            on_progress=on_progress,
+        )
+        self._before = dict(before)
+        self._recent = set(recent)
+        self._to_set = set(self._wanted)
+        """Those that may be set with the next request."""
+        self._others: dict[str, list[Parameter]] = {}
+
+    def _request(self, name: str) -> list[Message]:
+        wanted, others = self._wanted[name], self._others.get(name)
+        read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
+        if name not in self._to_set:
+            return [read]
+        self._to_set.remove(name)
+        write = set_message(
+            self.target_system, self.target_component, name, wanted.value, wanted.type, self._bytewise
+        )
+        return [write, read] if others else [write]
+
+    def _take(self, message: ParamValue, now: float) -> None:
+        name = message.param_id
+        if not self._window.attempts(name):
+            return  # it has not been sent yet
+        wanted = self._wanted[name]
+        told = self._typed(parameter_of(message, self._bytewise), wanted.type)
+        others = self._others.setdefault(name, [])
+        is_as_asked = same_value(told.value, wanted.value)
+        if is_as_asked and name in self._recent:
+            self._recent.remove(name)
+            others.append(told)
+            self._window.answered(name, now)
+            self._window.ask(name)
+            return
+        if is_as_asked and (told.type == wanted.type or (others and _is_same(others[-1], told))):
+            self._window.answered(name, now)
+            self._settle(name, told, now)
+            return
+        if self._is_too_early(name, now):
+            return
+        if others and not _is_same(others[-1], told):
+            others.clear()
+        others.append(told)
+        self._window.answered(name, now)
+        is_no_change = same_value(told.value, self._before.get(name, told.value))
+        if is_no_change and not is_as_asked:
+            self._to_set.add(name)
+        if len(others) >= (VERDICT_OF_NO_CHANGE if is_no_change else VERDICT):
+            self._settle(name, told, now)
+        else:
+            self._window.ask(name)
+
+    def _typed(self, told: Parameter, type_: ParameterType) -> Parameter:
+        """ArduPilot calls an integer that holds its default a float, in answers to PARAM_SET alone."""
+        is_whole = told.type is ParameterType.REAL32 and told.value == told.value // 1
+        if self._bytewise or not type_.is_integer or not is_whole:
+            return told
+        return Parameter(told.name, int(told.value), type_, None, told.index)
+
+    def _timeout_text(self, name: str) -> str:
+        return f"PARAM_SET of {name} was not confirmed, sent {self._window.attempts(name)} times"
+
+
+def _is_same(one: Parameter, other: Parameter) -> bool:
+    return same_value(one.value, other.value) and one.type == other.type

@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from aerokit.protocols.round_trip import RoundTrip
+    from aerokit.protocols.exchange import RoundTrip
 
 __all__ = ["RequestWindow"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.ftp_message import FtpMessage
+from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim.file_tree import EEXIST, ENOENT
 from aerokit.sim.vehicle import sender_of
 

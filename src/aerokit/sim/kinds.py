@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import InvalidArgument
-from aerokit.wording import did_you_mean, shown
 
 if TYPE_CHECKING:
     from aerokit.sim.vehicle import SimulatedVehicle

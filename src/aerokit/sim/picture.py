@@ -10,9 +10,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.files import write_whole
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.sim.track import metres_from
-from aerokit.whole_file import write_whole
 
 if TYPE_CHECKING:
     from os import PathLike

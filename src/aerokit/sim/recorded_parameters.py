@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamError
 from aerokit.parameters.encoding import UNKNOWN_INDEX
-from aerokit.parameters.px4_hash import HASH_NAME
+from aerokit.parameters.pack import HASH_NAME
 from aerokit.sim.vehicle import sender_of
 
 if TYPE_CHECKING:

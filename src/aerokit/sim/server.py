@@ -11,10 +11,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import BusyError, InvalidArgument, LinkLost
-from aerokit.links import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 from aerokit.sim.channel import datagrams
 from aerokit.sim.hearing import SharedHearing
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
+from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
 if TYPE_CHECKING:
     from typing_extensions import Self

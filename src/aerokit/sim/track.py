@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast, overload
 
-from aerokit import geo
+from aerokit._internal import geo
 from aerokit.autopilots import autopilot_for
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.messages import Heartbeat

@@ -24,40 +24,38 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.lazy import lazy_names
+from aerokit._internal.imports import lazy_exports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.sync.fleet_twins import Fleet, Selection, fleet
-    from aerokit.sync.twins import (
-        Connection,
-        Guided,
-        SetpointStream,
-        StateCell,
-        Subscription,
-        Vehicle,
-        connect,
-        open_connection,
-    )
-
-__all__ = [
-    "Connection",
-    "Fleet",
-    "Guided",
-    "Selection",
-    "SetpointStream",
-    "StateCell",
-    "Subscription",
-    "Vehicle",
-    "connect",
-    "fleet",
-    "open_connection",
-]
-
-_OF_FLEETS = ("Fleet", "Selection", "fleet")
-_HOMES = {name: f"aerokit.sync.{'fleet_twins' if name in _OF_FLEETS else 'twins'}" for name in __all__}
+    from aerokit.sync.fleet_twins import Fleet as Fleet
+    from aerokit.sync.fleet_twins import Selection as Selection
+    from aerokit.sync.fleet_twins import fleet as fleet
+    from aerokit.sync.twins import Connection as Connection
+    from aerokit.sync.twins import Guided as Guided
+    from aerokit.sync.twins import SetpointStream as SetpointStream
+    from aerokit.sync.twins import StateCell as StateCell
+    from aerokit.sync.twins import Subscription as Subscription
+    from aerokit.sync.twins import Vehicle as Vehicle
+    from aerokit.sync.twins import connect as connect
+    from aerokit.sync.twins import open_connection as open_connection
 
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "aerokit.sync.fleet_twins": ("Fleet", "Selection", "fleet"),
+        "aerokit.sync.twins": (
+            "Connection",
+            "Guided",
+            "SetpointStream",
+            "StateCell",
+            "Subscription",
+            "Vehicle",
+            "connect",
+            "open_connection",
+        ),
+    },
+)

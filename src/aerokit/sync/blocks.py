@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
+from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import ConnectionClosed
-from aerokit.read_only import ReadOnly
-from aerokit.sync.blocking_block import BlockingBlock
 from aerokit.sync.loop_thread import Held, LoopThread
 from aerokit.vehicle.connect import tell_how_it_is_left
 
@@ -19,25 +18,26 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-    from aerokit.fleets.following import Following
-    from aerokit.runtime.cells import Changes, StateCell  # noqa: F401 - named in the base classes below
-    from aerokit.runtime.connection import Connection
-    from aerokit.runtime.events import VehicleFound
-    from aerokit.runtime.subscription import Subscription  # noqa: F401
+    from aerokit.connection.bus import Subscription  # noqa: F401 - named in the base classes below
+    from aerokit.connection.cells import Changes, StateCell  # noqa: F401
+    from aerokit.connection.connection import Connection
+    from aerokit.events import VehicleFound
+    from aerokit.fleets.formations import Following
     from aerokit.sync.twins import Gimbal
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.part import CameraBlock
     from aerokit.vehicle.camera.shooting import PhotoInterval
+    from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.gimbal.control import GimbalControl
-    from aerokit.vehicle.gimbal.gimbals import Gimbals  # noqa: F401
+    from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
     from aerokit.vehicle.gimbal.rates import GimbalRates
-    from aerokit.vehicle.orders.guided import SetpointStream
-    from aerokit.vehicle.parameters.results import ParameterWrite
     from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
+    from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = [
     "BlockTwin",
+    "BlockingBlock",
     "CellTwin",
     "ChangesTwin",
     "ConnectionTwin",
@@ -52,14 +52,61 @@ __all__ = [
     "opened",
 ]
 
+
+class BlockingBlock:
+    """A base of what :mod:`aerokit.sync` opens. Nobody else would close it then, so it is closed first."""
+
+    _opened_by: str
+    """The function that makes one."""
+
+    def close(self) -> None:
+        """End it; idempotent."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    if not TYPE_CHECKING:  # type checkers know that they are not there
+
+        def __await__(self) -> NoReturn:
+            self._misused("await")
+
+        async def __aenter__(self) -> NoReturn:
+            self._misused("async with")
+
+        async def __aexit__(self, *_: object) -> None:
+            """Never: it cannot be entered so. Python looks for it first."""
+
+    def _misused(self, word: str) -> NoReturn:
+        self.close()
+        name = self._opened_by
+        raise TypeError(
+            f"aerokit.sync.{name}(…) blocks, and is not for `{word}`: write `with aerokit.sync.{name}(…) as …:`, or"
+            f" `async with aerokit.{name}(…) as …:` in an async function; what was opened is closed again"
+        )
+
+
 A = TypeVar("A")
+
 T = TypeVar("T")
+
 EnteredT = TypeVar("EnteredT")
+
 LeftT = TypeVar(
     "LeftT",
     bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
 )
+
 BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
+
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 

@@ -7,8 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aerokit.errors import InvalidArgument
-from aerokit.sync.blocking_block import BlockingBlock
-from aerokit.sync.blocks import ConnectionTwin, TwinOf, VehicleTwin
+from aerokit.sync.blocks import BlockingBlock, ConnectionTwin, TwinOf, VehicleTwin
 from aerokit.sync.loop_thread import Held, LoopThread
 from aerokit.sync.twins import Vehicle
 from aerokit.vehicle.connect import tell_how_it_is_left
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from aerokit.fleets.fleet import Fleet as AsyncFleet
+    from aerokit.fleets.fleet import Selection as AsyncSelection
     from aerokit.fleets.members import Member
-    from aerokit.fleets.selection import Selection as AsyncSelection
     from aerokit.sync.fleet_twins import Selection
 
 __all__ = ["FleetTwin", "SelectionTwin", "opened_fleet"]

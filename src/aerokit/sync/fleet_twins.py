@@ -10,34 +10,32 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.arguments import checked
+from aerokit._internal.arguments import checked
 from aerokit.fleets.opening import fleet as fleet_async
 from aerokit.sync.blocks import BlockTwin
 from aerokit.sync.fleet_blocks import FleetTwin, SelectionTwin, opened_fleet
 from aerokit.sync.twins import Connection, Subscription, Vehicle
-from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
     from typing import Any
-    from aerokit.fleets.apart import Deconfliction
+    from aerokit.connection.bus import Overflow
+    from aerokit.events import Event
     from aerokit.fleets.events import FleetEvent, StateTold
-    from aerokit.fleets.following import Following as AsyncFollowing
+    from aerokit.fleets.fleet import Selection as AsyncSelection
     from aerokit.fleets.formation import Formation
+    from aerokit.fleets.formations import Following as AsyncFollowing
     from aerokit.fleets.members import Member
     from aerokit.fleets.opening import WhenTooClose
-    from aerokit.fleets.policy import Failure, PolicyName, PolicyOrder
-    from aerokit.fleets.results import FleetResult
-    from aerokit.fleets.selection import Selection as AsyncSelection
-    from aerokit.fleets.show import Show
-    from aerokit.fleets.show_report import ShowReport
+    from aerokit.fleets.policy import Failure, FleetResult, PolicyName, PolicyOrder
+    from aerokit.fleets.separation import Deconfliction
+    from aerokit.fleets.shows.show import Show, ShowReport
     from aerokit.fleets.travel import WayApart
-    from aerokit.links.link import Link
     from aerokit.mavlink.message import Message
     from aerokit.missions.mission import Mission
     from aerokit.position import Position
-    from aerokit.runtime.events import Event
-    from aerokit.runtime.subscription import Overflow
+    from aerokit.transport.link import Link
 
 __all__ = [
     "Fleet",

@@ -23,33 +23,117 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit.sync.originals import TWINS, Member, Twin, decorators_of, function_node, imports_of, members_of
-from aerokit.sync.source_text import (
-    WIDTH,
-    arguments_of,
-    call,
-    docstring,
-    forwarded,
-    function,
-    optional,
-    outer,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["FILE", "FILES", "generate"]
+__all__ = [
+    "FILE",
+    "FILES",
+    "WIDTH",
+    "arguments_of",
+    "call",
+    "docstring",
+    "forwarded",
+    "function",
+    "generate",
+    "optional",
+    "outer",
+]
+
+WIDTH = 100
+"""Of a line."""
+
+
+def outer(annotation: ast.expr | None) -> str:
+    """The name in an annotation, without what is in brackets behind it."""
+    while isinstance(annotation, ast.Subscript):
+        annotation = annotation.value
+    return annotation.id if isinstance(annotation, ast.Name) else ""
+
+
+def optional(annotation: ast.expr | None) -> ast.expr | None:
+    """What is in front of ``| None``, if that is how the annotation ends."""
+    if isinstance(annotation, ast.BinOp) and isinstance(annotation.op, ast.BitOr):
+        last = annotation.right
+        return annotation.left if isinstance(last, ast.Constant) and last.value is None else None
+    return None
+
+
+def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    """The arguments as they are handed on, without ``self``."""
+    positional = [each.arg for each in (*node.args.posonlyargs, *node.args.args)]
+    positional = [each for each in positional if each != "self"]
+    star = [f"*{node.args.vararg.arg}"] if node.args.vararg else []
+    rest = [f"**{node.args.kwarg.arg}"] if node.args.kwarg else []
+    return positional + star + [f"{each.arg}={each.arg}" for each in node.args.kwonlyargs] + rest
+
+
+def call(function: str, arguments: Sequence[str]) -> str:
+    """A call, in lines that are not too long."""
+    line = f"{function}({', '.join(arguments)})"
+    if len(line) < WIDTH:
+        return line
+    return f"{function}(\n" + "".join(f"            {each},\n" for each in arguments) + "        )"
+
+
+def function(
+    node: ast.FunctionDef | ast.AsyncFunctionDef, returns: ast.expr | None, text: str | None, body: str
+) -> str:
+    """A method whose body is one statement."""
+    gives = "" if returns is None else f" -> {ast.unparse(returns)}"
+    line = f"    def {node.name}({ast.unparse(node.args)}){gives}:\n"
+    if len(line) > WIDTH:
+        line = f"    def {node.name}(\n"
+        line += "".join(f"        {each},\n" for each in arguments_of(node.args)) + f"    ){gives}:\n"
+    return f"{line}{docstring(text)}        {body}\n"
+
+
+def arguments_of(arguments: ast.arguments) -> list[str]:
+    """Each as it is written, with its default."""
+    positional = [*arguments.posonlyargs, *arguments.args]
+    lacking: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
+    found = [_argument(*each) for each in zip(positional, [*lacking, *arguments.defaults])]  # noqa: B905
+    if arguments.vararg is not None:
+        found.append("*" + _argument(arguments.vararg, None))
+    elif arguments.kwonlyargs:
+        found.append("*")
+    found += [_argument(*each) for each in zip(arguments.kwonlyargs, arguments.kw_defaults)]  # noqa: B905
+    return found + (["**" + _argument(arguments.kwarg, None)] if arguments.kwarg else [])
+
+
+def _argument(each: ast.arg, default: ast.expr | None) -> str:
+    kind = "" if each.annotation is None else f": {ast.unparse(each.annotation)}"
+    value = "" if default is None else f"{' = ' if kind else '='}{ast.unparse(default)}"
+    return f"{each.arg}{kind}{value}"
+
+
+def docstring(text: str | None, indent: str = "        ") -> str:
+    """As it stands in the source; nothing for none."""
+    if not text:
+        return ""
+    lines = text.splitlines()
+    if len(lines) == 1:
+        return f'{indent}"""{lines[0]}"""\n'
+    body = "".join(f"{indent}{line}\n" if line else "\n" for line in lines[1:])
+    return f'{indent}"""{lines[0]}\n{body}{indent}"""\n'
+
 
 FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fleet_twins")}
 """What is written: page → file."""
+
 FILE = FILES["twins"]
 """The first of them."""
+
 OF_ONE = ("TwinOf", "BlockTwin", "SelectionTwin")
 """Bases that are told whose twin it is."""
+
 FUNCTIONS: dict[str, tuple[str, ...]] = {
-    "twins": ("aerokit.runtime.opening.open_connection", "aerokit.vehicle.connect.connect"),
+    "twins": ("aerokit.connection.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
 }
 """Blocks that are opened by a function, by pages."""
+
 BLOCKS = {"SelectionTwin": "fleet_blocks", "FleetTwin": "fleet_blocks"}
 """Where bases are that are not in ``blocks.py``."""
 
@@ -70,8 +154,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 
 # --------------------------------------------------------------------------------------- writing
-
-
 @dataclass
 class Page:
     """What is written, and what it has to import."""
@@ -164,8 +246,6 @@ TYPE_VARIABLES = {
 
 
 # --------------------------------------------------------------------------------------- the page
-
-
 def generate(name: str = "twins") -> str:
     """The text of ``sync/twins.py``, or of another page."""
     page, twins = Page(name), [each for each in TWINS if each.page == name]
@@ -178,12 +258,12 @@ def generate(name: str = "twins") -> str:
         if name == "twins"
         else ("aerokit.sync.fleet_blocks", "opened_fleet")
     )
-    page.at_run_time |= {opener, ("aerokit.arguments", "checked")}
+    page.at_run_time |= {opener, ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
         (each.module, f"{each.name} as Async{each.name}") for each in twins if each.base in OF_ONE
     }
     variables = TYPE_VARIABLES if name == "twins" else {}
-    page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.runtime.events", "Event")}
+    page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
     for path in FUNCTIONS[name]:
         module, _, name = path.rpartition(".")
         page.at_run_time.add((module, f"{name} as {name}_async"))

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import anyio
 
+from aerokit.connection.own_heartbeat import ProofOfLife
+from aerokit.connection.tasks import Cancellation
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkOpenError
-from aerokit.runtime.cancellation import Cancellation
-from aerokit.runtime.own_heartbeat import ProofOfLife
 from aerokit.sync.reply import Reply
 
 if TYPE_CHECKING:

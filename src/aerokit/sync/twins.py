@@ -11,12 +11,12 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
-from aerokit.arguments import checked
+from aerokit._internal.arguments import checked
+from aerokit.connection.opening import open_connection as open_connection_async
+from aerokit.connection.own_heartbeat import OwnHeartbeat
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
-from aerokit.protocols.transfer import PATIENCE_S
-from aerokit.runtime.opening import open_connection as open_connection_async
-from aerokit.runtime.own_heartbeat import OwnHeartbeat
+from aerokit.protocols.exchange import PATIENCE_S
 from aerokit.sync.blocks import (
     BlockTwin,
     CellTwin,
@@ -32,16 +32,15 @@ from aerokit.sync.blocks import (
     VehicleTwin,
     opened,
 )
-from aerokit.vehicle.camera.storing import FORMATTING_S
-from aerokit.vehicle.connect import connect as connect_async
-from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
-from aerokit.vehicle.orders.progress import LONGEST_SILENCE_S
-from aerokit.vehicle.orders.setpoints import (
+from aerokit.vehicle.camera.controls import FORMATTING_S
+from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, MAX_DISTANCE_M
+from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
     BodyVelocitySetpoint,
     VelocitySetpoint,
 )
-from aerokit.vehicle.orders.whereabouts import MAX_DISTANCE_M
+from aerokit.vehicle.connect import connect as connect_async
+from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -50,11 +49,12 @@ if TYPE_CHECKING:
     from typing import Any
     from aerokit.autopilots import Autopilot, Mode
     from aerokit.autopilots.modes import Mode
-    from aerokit.autopilots.version import AutopilotVersion
+    from aerokit.autopilots.telemetry import AutopilotVersion
+    from aerokit.connection.bus import Overflow
+    from aerokit.connection.cells import Source
     from aerokit.errors import ParameterRejected, ParameterTimeout
+    from aerokit.events import Event, LinkReport, LinkState, LinkStatus
     from aerokit.hub.values import Endpoint
-    from aerokit.links.allowed import Peers
-    from aerokit.links.link import Link
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import CommandAck
@@ -70,14 +70,12 @@ if TYPE_CHECKING:
         SettingValue,
     )
     from aerokit.position import Position
-    from aerokit.protocols.transfer import OnProgress
-    from aerokit.runtime.cells import Source
-    from aerokit.runtime.events import Event, LinkReport
-    from aerokit.runtime.link_state import LinkState, LinkStatus
-    from aerokit.runtime.subscription import Overflow
-    from aerokit.vehicle.camera.camera import Camera as AsyncCamera
+    from aerokit.protocols.exchange import OnProgress
+    from aerokit.transport.link import Link
+    from aerokit.transport.sockets import Peers
+    from aerokit.vehicle.camera.cameras import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
-    from aerokit.vehicle.camera.lens import AutoFocus
+    from aerokit.vehicle.camera.controls import AutoFocus
     from aerokit.vehicle.camera.part import CameraBlock as AsyncCameraBlock
     from aerokit.vehicle.camera.values import (
         CameraInformation,
@@ -90,34 +88,40 @@ if TYPE_CHECKING:
         VideoStream,
     )
     from aerokit.vehicle.camera.videos import SourceName
-    from aerokit.vehicle.components.component import Component as AsyncComponent, MetadataKind
-    from aerokit.vehicle.components.settings import Settings as AsyncSettings
-    from aerokit.vehicle.components.status import ComponentInformation, ComponentStatus
-    from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
-    from aerokit.vehicle.files.log_entry import LogEntry
-    from aerokit.vehicle.files.logs import LogMethod, Logs as AsyncLogs
-    from aerokit.vehicle.gimbal.control import GimbalControl as AsyncGimbalControl
-    from aerokit.vehicle.gimbal.gimbal import Gimbal as AsyncGimbal
-    from aerokit.vehicle.gimbal.rates import GimbalRates as AsyncGimbalRates
-    from aerokit.vehicle.gimbal.values import Frame, GimbalControllers, GimbalInformation
-    from aerokit.vehicle.orders.guided import Guided as AsyncGuided
-    from aerokit.vehicle.orders.order import Subject
-    from aerokit.vehicle.orders.posting import PostedOrder as AsyncPostedOrder
-    from aerokit.vehicle.orders.setpoints import (
+    from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
+    from aerokit.vehicle.commanding.order import Subject
+    from aerokit.vehicle.commanding.posting import PostedOrder as AsyncPostedOrder
+    from aerokit.vehicle.commanding.setpoints import (
         AttitudeSetpoint,
         LocalPositionSetpoint,
         PositionSetpoint,
+    )
+    from aerokit.vehicle.components.component import (
+        Component as AsyncComponent,
+        ComponentInformation,
+        ComponentStatus,
+        MetadataKind,
+    )
+    from aerokit.vehicle.components.settings import Settings as AsyncSettings
+    from aerokit.vehicle.files.files import FileEntry, Files as AsyncFiles
+    from aerokit.vehicle.files.log_paths import LogEntry
+    from aerokit.vehicle.files.logs import LogMethod, Logs as AsyncLogs
+    from aerokit.vehicle.gimbal.control import GimbalControl as AsyncGimbalControl
+    from aerokit.vehicle.gimbal.device import Frame, GimbalControllers, GimbalInformation
+    from aerokit.vehicle.gimbal.gimbal import Gimbal as AsyncGimbal
+    from aerokit.vehicle.gimbal.rates import GimbalRates as AsyncGimbalRates
+    from aerokit.vehicle.missions.mission import MissionControl as AsyncMissionControl
+    from aerokit.vehicle.missions.plans import (
+        FenceControl as AsyncFenceControl,
+        PlanMethod,
+        RallyControl as AsyncRallyControl,
     )
     from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, UploadMethod
     from aerokit.vehicle.parameters.parameters import (
         ParameterSource,
         Parameters as AsyncParameters,
     )
-    from aerokit.vehicle.parameters.results import ParameterWrite
-    from aerokit.vehicle.plans.fence import FenceControl as AsyncFenceControl
-    from aerokit.vehicle.plans.held import PlanMethod
-    from aerokit.vehicle.plans.mission import MissionControl as AsyncMissionControl
-    from aerokit.vehicle.plans.rally import RallyControl as AsyncRallyControl
+    from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.state.condition import (
         EstimatorHealth,
         MissionProgress,
@@ -127,6 +131,7 @@ if TYPE_CHECKING:
     )
     from aerokit.vehicle.state.equipment import (
         Battery,
+        GimbalAttitude,
         GpsReceiver,
         Power,
         RangeFinder,
@@ -134,7 +139,6 @@ if TYPE_CHECKING:
         ServoOutputs,
         Vibration,
     )
-    from aerokit.vehicle.state.gimbal import GimbalAttitude
     from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 __all__ = [
@@ -312,7 +316,7 @@ class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
     Frames come in through ``bytes_received``, are checked by one framer for each remote peer, and go to ``bus``. Who
-    may speak in whose name is said in :class:`aerokit.runtime.routes.Routes`; ``may_move`` is its own.
+    may speak in whose name is said in :class:`aerokit.connection.routes.Routes`; ``may_move`` is its own.
     ``send`` numbers a message and writes it to where its target was last heard. Everything runs on the loop's thread.
     """
 

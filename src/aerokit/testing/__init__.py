@@ -8,54 +8,41 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit.lazy import lazy_names
+from aerokit._internal.imports import lazy_exports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.sim.journal import Journal
-    from aerokit.sim.track import Track, TrackPoint
+    from aerokit.sim.journal import Journal as Journal
+    from aerokit.sim.track import Track as Track
+    from aerokit.sim.track import TrackPoint as TrackPoint
+    from aerokit.testing.clock import VIRTUAL_BACKEND as VIRTUAL_BACKEND
+    from aerokit.testing.clock import DeadlockError as DeadlockError
+    from aerokit.testing.clock import VirtualClockLoop as VirtualClockLoop
+    from aerokit.testing.clock import run_virtual as run_virtual
+    from aerokit.testing.fault_model import FaultModel as FaultModel
+    from aerokit.testing.faults import FaultInjector as FaultInjector
+    from aerokit.testing.faulty_link import FaultyLink as FaultyLink
+    from aerokit.testing.flights import Fleet as Fleet
+    from aerokit.testing.flights import Flight as Flight
+    from aerokit.testing.flights import open_fleet as open_fleet
+    from aerokit.testing.flights import open_flight as open_flight
+    from aerokit.testing.served import ServedFlight as ServedFlight
+    from aerokit.testing.served import serve_flight as serve_flight
 
-    from .clock import VIRTUAL_BACKEND, DeadlockError, VirtualClockLoop, run_virtual
-    from .fault_verbs import FaultInjector
-    from .flights import Fleet, Flight, open_fleet, open_flight
-    from .served import ServedFlight, serve_flight
-
-__all__ = [
-    "VIRTUAL_BACKEND",
-    "DeadlockError",
-    "FaultInjector",
-    "Fleet",
-    "Flight",
-    "Journal",
-    "ServedFlight",
-    "Track",
-    "TrackPoint",
-    "VirtualClockLoop",
-    "open_fleet",
-    "open_flight",
-    "run_virtual",
-    "serve_flight",
-]
-
-# Imported when first asked for: pytest imports this package with its plugin in every project.
-_HOMES = {
-    "Journal": "aerokit.sim.journal",
-    "Track": "aerokit.sim.track",
-    "TrackPoint": "aerokit.sim.track",
-    "VIRTUAL_BACKEND": "aerokit.testing.clock",
-    "DeadlockError": "aerokit.testing.clock",
-    "FaultInjector": "aerokit.testing.fault_verbs",
-    "Fleet": "aerokit.testing.flights",
-    "Flight": "aerokit.testing.flights",
-    "ServedFlight": "aerokit.testing.served",
-    "VirtualClockLoop": "aerokit.testing.clock",
-    "open_fleet": "aerokit.testing.flights",
-    "open_flight": "aerokit.testing.flights",
-    "run_virtual": "aerokit.testing.clock",
-    "serve_flight": "aerokit.testing.served",
-}
 
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, __all__)
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "aerokit.sim.journal": ("Journal",),
+        "aerokit.sim.track": ("Track", "TrackPoint"),
+        "aerokit.testing.clock": ("DeadlockError", "VIRTUAL_BACKEND", "VirtualClockLoop", "run_virtual"),
+        "aerokit.testing.fault_model": ("FaultModel",),
+        "aerokit.testing.faults": ("FaultInjector",),
+        "aerokit.testing.faulty_link": ("FaultyLink",),
+        "aerokit.testing.flights": ("Fleet", "Flight", "open_fleet", "open_flight"),
+        "aerokit.testing.served": ("ServedFlight", "serve_flight"),
+    },
+)

@@ -24,7 +24,7 @@ The rules:
 
 * ``time()`` starts at 0.0 and moves only when no callback is ready and no socket has anything to say.
 * Real sockets are polled before every jump, but a jump does not wait for them: let tests on virtual time talk
-  over `aerokit.links.memory_link_pair`.
+  over `aerokit.transport.memory_link_pair`.
 * While a call of ``run_in_executor`` (``asyncio.to_thread``, name resolution) is under way the clock stands
   still. Other threads may wake the loop by ``call_soon_threadsafe``, but do not stop the clock.
 * When nothing can ever happen again, `DeadlockError` names the waiting tasks instead of hanging. If real

@@ -100,7 +100,7 @@ def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: 
 
 
 def _report(path: Path, flight: Flight | ServedFlight, count: int) -> str:
-    from aerokit.report import write_report
+    from aerokit.logs.report import write_report
 
     system_id = flight.simulated.system_id
     target = path.with_suffix(f".{system_id}.html" if count > 1 else ".html")

@@ -20,23 +20,22 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import aerokit
 from aerokit.errors import InvalidArgument
-from aerokit.links import memory_link_pair
 from aerokit.sim.kinds import simulated
 from aerokit.sim.picture import save_picture
 from aerokit.sim.server import SimulatorServer
 from aerokit.sim.track import least_distance_m
 from aerokit.testing.clock import run_virtual
-from aerokit.testing.fault_verbs import FaultInjector
-from aerokit.testing.recording import FlightRecording
-from aerokit.testing.stage import Stagehand
+from aerokit.testing.faults import FaultInjector
+from aerokit.testing.stage import FlightRecording, Stagehand
+from aerokit.transport import memory_link_pair
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from aerokit.links import Link
     from aerokit.sim.journal import Journal
     from aerokit.sim.track import Track
     from aerokit.sim.vehicle import SimulatedVehicle
+    from aerokit.transport import Link
 
 __all__ = ["Fleet", "Flight", "open_fleet", "open_flight", "repeated"]
 

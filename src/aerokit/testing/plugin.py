@@ -130,7 +130,7 @@ def dronekit() -> Iterator[ModuleType]:
     import sys
 
     import aerokit.dronekit as package
-    from aerokit.dronekit.alias import install, uninstall
+    from aerokit.dronekit.runner import install, uninstall
 
     was_there = sys.modules.get("dronekit") is package
     install()

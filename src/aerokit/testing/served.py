@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 from aerokit.sim.kinds import simulated
 from aerokit.sim.patience import wait_longer
 from aerokit.sim.server import SimulatorServer, open_simulator
-from aerokit.testing.fault_verbs import FaultInjector
+from aerokit.testing.faults import FaultInjector
 from aerokit.testing.interruption import Interruption
-from aerokit.testing.recording import FlightRecording
-from aerokit.testing.stage import Stagehand
+from aerokit.testing.stage import FlightRecording, Stagehand
 
 if TYPE_CHECKING:
     from anyio.from_thread import BlockingPortal

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.tlog import TlogWriter
 from aerokit.sim.journal import Journal
 from aerokit.sim.track import record_track, true_point
 from aerokit.sim.vehicle import SimulatedVehicle
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
+    from aerokit.sim.server import SimulatorServer
     from aerokit.sim.track import Track
 
-__all__ = ["Stagehand"]
+__all__ = ["FlightRecording", "Stagehand"]
 
 _LOOK_S = 0.1
 """How often conditions are looked at, in simulated seconds."""
@@ -77,3 +81,30 @@ class Stagehand(SimulatedVehicle):
         """See `Track.follow`."""
         for track in self.tracks:
             track.follow(catch_up)
+
+
+_BEGAN_AT = 1_790_000_000.0
+"""UTC of the simulated second 0: the same in every run."""
+
+
+class FlightRecording:
+    """Kept in memory, some kilobytes a simulated second, because most tests succeed."""
+
+    def __init__(self) -> None:
+        self._file = BytesIO()
+        self._writer = TlogWriter(self._file)
+        self._framers = Framer(), Framer()
+        for framer in self._framers:
+            framer.keep_unknown = True
+
+    def follow(self, server: SimulatorServer) -> None:
+        """Record what this server sends and hears from now on."""
+        server.on_datagram = self._take
+
+    def to_bytes(self) -> bytes:
+        """The file."""
+        return self._file.getvalue()
+
+    def _take(self, time_s: float, data: bytes, is_sent: bool) -> None:
+        for frame in self._framers[is_sent].receive(data, time_s):
+            self._writer.write(frame.raw, _BEGAN_AT + time_s)

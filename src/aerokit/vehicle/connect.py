@@ -5,47 +5,49 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.arguments import checked
-from aerokit.async_block import async_block
-from aerokit.errors import BusyError, ConnectFailed, InvalidArgument
-from aerokit.links.link import Link
+from aerokit._internal.arguments import checked
+from aerokit._internal.async_block import async_block
+from aerokit.connection.bus import raisable
+from aerokit.connection.components import is_autopilot
+from aerokit.connection.connection import Connection
+from aerokit.connection.opening import no_vehicle_reason, open_connection
+from aerokit.connection.own_heartbeat import OwnHeartbeat
+from aerokit.connection.routes import MOST_ROUTES
+from aerokit.connection.tasks import Background
+from aerokit.errors import AerokitError, BusyError, ConnectFailed, InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.runtime.components import is_autopilot
-from aerokit.runtime.connection import Connection
-from aerokit.runtime.diagnosis import no_vehicle_reason
-from aerokit.runtime.endings import raisable
-from aerokit.runtime.opening import open_connection
-from aerokit.runtime.own_heartbeat import OwnHeartbeat
-from aerokit.runtime.routes import MOST_ROUTES
-from aerokit.vehicle.orders.bridge import Bridge
-from aerokit.vehicle.talk.rates import check_rate
-from aerokit.vehicle.talk.talk import Talk
+from aerokit.transport.link import Link
+from aerokit.vehicle.commanding.context import Bridge
+from aerokit.vehicle.session.rates import check_rate
+from aerokit.vehicle.session.session import Talk
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 
     from aerokit.hub.hub import Hub
     from aerokit.hub.values import Endpoint
-    from aerokit.links.allowed import Peers
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import Signing
+    from aerokit.transport.sockets import Peers
 
-__all__ = ["connect", "tell_how_it_is_left"]
+__all__ = ["connect", "tell_how_it_is_left", "vehicles_on"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 FRESH_HEARTBEAT_S = 2.0
 """A heartbeat heard longer ago says nothing about now: the next one is waited for."""
+
 HEARTBEATS_ALONE = 3
 """So many heartbeats of another component and none of component 1 make it the vehicle's autopilot."""
 
@@ -320,3 +322,55 @@ class _Search:
 
     def _is_wanted(self, frame: Frame, heartbeat: Heartbeat) -> bool:
         return frame.system_id != 0 and self._system_id in (None, frame.system_id) and is_autopilot(heartbeat)
+
+
+@async_block
+async def vehicles_on(
+    connection: Connection,
+    *,
+    rates: Mapping[type[Message], float] | None = None,
+    on_found: Callable[[Vehicle], object] | None = None,
+) -> AsyncIterator[Mapping[int, Vehicle]]:
+    """Connect to each vehicle that is heard on a connection, as soon as it is heard, for the time of the block.
+
+    A vehicle that falls silent stays: its cells have ages, and its ``link_state`` says so. One that this program has
+    a vehicle object of already is left out.
+
+    Args:
+        connection: of :func:`aerokit.open_connection`.
+        rates: message class → Hz, asked of each, as by :func:`aerokit.connect`; ``{}`` asks for nothing.
+        on_found: called with each new vehicle, in the loop.
+
+    Returns:
+        System id → vehicle, in the order in which they were heard; it grows while the block lasts.
+
+    Raises:
+        ConnectionClosed, LinkLost: the connection has ended.
+    """
+    connection.raise_if_ended()
+    vehicles: dict[int, Vehicle] = {}
+
+    async def keep(system_id: int) -> None:
+        try:
+            async with connect(connection, system_id=system_id, rates=rates) as vehicle:
+                vehicles[system_id] = vehicle
+                if on_found is not None:
+                    on_found(vehicle)
+                await asyncio.Event().wait()
+        except AerokitError as error:  # silent again at once, known already, or the connection has ended
+            logger.info("system %d is not followed: %s", system_id, error)
+
+    async def look_out() -> None:
+        try:
+            async for found in connection.vehicles():
+                if found.system_id not in vehicles:
+                    tasks.start(partial(keep, found.system_id))
+        except AerokitError as error:
+            logger.info("no more vehicles are looked for: %s", error)
+
+    tasks = Background(connection.fail)
+    tasks.start(look_out)
+    try:
+        yield vehicles
+    finally:
+        await tasks.aclose()

@@ -3,45 +3,41 @@
 from __future__ import annotations
 
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit._internal.values import plain
 from aerokit.mavlink.messages import ParamValue
-from aerokit.read_only import ReadOnly
-from aerokit.vehicle.orders.arming import ArmingActions
-from aerokit.vehicle.orders.flight import FlightActions
-from aerokit.vehicle.orders.looking import LookActions
-from aerokit.vehicle.orders.modes import ModeActions
-from aerokit.vehicle.orders.talking import TalkActions
-from aerokit.vehicle.orders.travel import TravelActions
-from aerokit.vehicle.plans.context import PlanContext
-from aerokit.vehicle.state.told import MESSAGE_IDS
+from aerokit.vehicle.commanding.arming import ArmingActions
+from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
+from aerokit.vehicle.commanding.messaging import TalkActions
+from aerokit.vehicle.commanding.travel import LookActions, TravelActions
+from aerokit.vehicle.missions.context import PlanContext
+from aerokit.vehicle.state.field import MESSAGE_IDS
 
 if TYPE_CHECKING:
+    from aerokit.connection.cells import StateCell
     from aerokit.mavlink.signing import Signing
-    from aerokit.runtime.cells import StateCell
-    from aerokit.vehicle.camera.camera import Camera
-    from aerokit.vehicle.camera.cameras import Cameras
-    from aerokit.vehicle.components.component import Component
+    from aerokit.vehicle.camera.cameras import Camera, Cameras
+    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.guided import Guided
+    from aerokit.vehicle.components.component import Component, ComponentStatus
     from aerokit.vehicle.components.components import Components
-    from aerokit.vehicle.components.status import ComponentStatus
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.files.logs import Logs
-    from aerokit.vehicle.gimbal.gimbal import Gimbal
-    from aerokit.vehicle.gimbal.gimbals import Gimbals
-    from aerokit.vehicle.orders.bridge import Bridge
-    from aerokit.vehicle.orders.guided import Guided
+    from aerokit.vehicle.gimbal.gimbal import Gimbal, Gimbals
+    from aerokit.vehicle.missions.mission import MissionControl
+    from aerokit.vehicle.missions.plans import FenceControl, RallyControl
     from aerokit.vehicle.parameters.parameters import Parameters
-    from aerokit.vehicle.plans.fence import FenceControl
-    from aerokit.vehicle.plans.mission import MissionControl
-    from aerokit.vehicle.plans.rally import RallyControl
 
-__all__ = ["Vehicle"]
+__all__ = ["Vehicle", "overview"]
 
 TELL_OF_GIMBALS = tuple(
     MESSAGE_IDS[name]
     for name in ("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "MountStatus", "MountOrientation")
 )
+
 TELL_OF_PICTURES = tuple(
     MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger")
 )
@@ -127,7 +123,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
     @cached_property
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
-        from aerokit.vehicle.orders.guided import Guided
+        from aerokit.vehicle.commanding.guided import Guided
 
         return Guided(self._bridge)
 
@@ -139,7 +135,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
     @cached_property
     def gimbals(self) -> Gimbals:
         """All gimbals that it carries."""
-        from aerokit.vehicle.gimbal.gimbals import Gimbals
+        from aerokit.vehicle.gimbal.gimbal import Gimbals
 
         return Gimbals(self._bridge)
 
@@ -167,21 +163,21 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
     @cached_property
     def mission(self) -> MissionControl:
         """The mission it holds: upload, download, start, pause, wait until it is finished."""
-        from aerokit.vehicle.plans.mission import MissionControl
+        from aerokit.vehicle.missions.mission import MissionControl
 
         return MissionControl(self._plans)
 
     @cached_property
     def fence(self) -> FenceControl:
         """The fence it holds."""
-        from aerokit.vehicle.plans.fence import FenceControl
+        from aerokit.vehicle.missions.plans import FenceControl
 
         return FenceControl(self._plans)
 
     @cached_property
     def rally(self) -> RallyControl:
         """The rally points it holds."""
-        from aerokit.vehicle.plans.rally import RallyControl
+        from aerokit.vehicle.missions.plans import RallyControl
 
         return RallyControl(self._plans)
 
@@ -206,6 +202,36 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
             OperationTimeout: it went on as before; the text has what it said.
             BusyError: another vehicle on this connection is just being given a key. Nothing was sent.
         """
-        from aerokit.vehicle.talk.signing import set_up_signing
+        from aerokit.vehicle.session.session import set_up_signing
 
         await set_up_signing(self._talk, signing, timeout)
+
+
+def overview(vehicle: Vehicle) -> dict[str, Any]:
+    """What is known of a vehicle, for showing and for other programs; nothing is asked of it.
+
+    Returns:
+        ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` (``state`` as of
+        :class:`aerokit.LinkState`, ``heartbeat_age_s``, and how many frames of the vehicle came and were lost on the
+        way, by their numbers) and ``states``: for each state of docs/states.md that the vehicle has told, ``value``
+        (as :func:`aerokit._internal.values.plain` gives it) and ``age_s``, seconds since it was told.
+    """
+    received, lost = vehicle.connection.counts(vehicle.system_id)
+    telemetry, link = vehicle.telemetry, vehicle.link_state.latest
+    return {
+        "system_id": vehicle.system_id,
+        "autopilot": vehicle.autopilot.name,
+        "firmware": vehicle.autopilot.firmware,
+        "vehicle_type": vehicle.autopilot.vehicle_type,
+        "link": {
+            "state": None if link is None else link.value,
+            "heartbeat_age_s": plain(vehicle.heartbeat_age),
+            "frames_received": received,
+            "frames_lost": lost,
+        },
+        "states": {
+            name: {"value": plain(cell.value), "age_s": plain(cell.age)}
+            for name, cell in telemetry.cells.items()
+            if cell.is_known
+        },
+    }

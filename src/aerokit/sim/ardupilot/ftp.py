@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
-from aerokit.protocols.ftp_message import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.file_tree import EISDIR, ENOENT, FileFault
 from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
-from aerokit.protocols.ftp_message import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.file_tree import EEXIST, FileFault
 from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
 

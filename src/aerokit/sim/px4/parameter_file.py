@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
-from aerokit.protocols.ftp_message import DATA_SIZE
+from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.file_tree import EINVAL, FileFault, OpenFile
 from aerokit.sim.parameter_pack_file import ParameterPackMount
 

@@ -8,7 +8,7 @@ from aerokit.mavlink.enums import MavParamError, MavParamType
 from aerokit.mavlink.messages import ParamValue
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import value_message, value_of
-from aerokit.parameters.px4_hash import HASH_NAME, px4_hash
+from aerokit.parameters.pack import HASH_NAME, px4_hash
 from aerokit.sim.parameter_server import ParameterServer
 from aerokit.sim.vehicle import sender_of
 

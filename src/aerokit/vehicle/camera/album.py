@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.errors import CommandRejected
+from aerokit.events import ImageCaptured
 from aerokit.mavlink import messages as m
-from aerokit.runtime.events import ImageCaptured
 from aerokit.vehicle.camera.capture import (
     SECONDS_IN_1990,
     WRAPS,
@@ -24,9 +24,9 @@ from aerokit.vehicle.camera.capture import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
-    from aerokit.runtime.cells import StateCell
-    from aerokit.vehicle.camera.line import CameraLine
+    from aerokit.vehicle.camera.link import CameraLine
 
 __all__ = ["LONGEST", "Album", "Arrivals"]
 

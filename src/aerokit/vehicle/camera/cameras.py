@@ -4,20 +4,66 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import anyio
+
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavType
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.vehicle.camera.camera import Camera
-from aerokit.vehicle.camera.line import BEHIND, HEARD_WITHIN_S, CameraLine
+from aerokit.vehicle.camera.controls import LensCalls, StorageCalls, TrackingCalls
+from aerokit.vehicle.camera.link import BEHIND, HEARD_WITHIN_S, CameraLine
+from aerokit.vehicle.camera.photos import PhotoCalls
+from aerokit.vehicle.camera.values import CameraInformation
+from aerokit.vehicle.camera.videos import VideoCalls
 
 if TYPE_CHECKING:
+    from aerokit.vehicle.commanding.context import Bridge
     from aerokit.vehicle.components.components import Components
-    from aerokit.vehicle.orders.bridge import Bridge
 
-__all__ = ["Cameras"]
+__all__ = ["Camera", "Cameras"]
+
+
+@checks_arguments
+class Camera(ReadOnly, PhotoCalls, VideoCalls, LensCalls, TrackingCalls, StorageCalls):
+    """One camera: pictures, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
+
+    ``vehicle.camera`` is the first one that is heard, ``vehicle.camera_at(number)`` any: one with a component id of its
+    own (100 to 105), or behind the autopilot (1 to 6), which are ArduPilot's own drivers and PX4's trigger. What a
+    camera says that it cannot do is refused before anything is sent. Cells are asked for while somebody looks at them.
+    """
+
+    def __init__(self, line: CameraLine) -> None:
+        super().__init__(line)
+        self.information: StateCell[CameraInformation] = line.information
+        """What it is (CAMERA_INFORMATION): asked for once, by the first call."""
+
+    @property
+    def number(self) -> int | None:
+        """1 to 6 behind the autopilot, otherwise its component id; None before the first camera was heard."""
+        return self._line.number
+
+    async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
+        """Wait until the camera is heard and says what it is; other calls do so by themselves.
+
+        Raises:
+            CommandRejected: it does not say what it is.
+            OperationTimeout: none was heard, or it does not say what it is: PX4's trigger never does.
+        """
+        found: CameraInformation | None = None
+        with anyio.move_on_after(timeout):
+            found = await self._line.find()
+        if found is None:
+            raise self._line.timed_out(f"says nothing of itself; waited for {timeout:g} s at most")
+        return found
+
+    def __repr__(self) -> str:
+        return f"<Camera {self._line.describe().removeprefix('camera ')}>"
+
 
 OWN_IDS = range(100, 106)
+
 MOST_EARLY = 99
 
 

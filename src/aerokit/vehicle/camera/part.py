@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
     from types import TracebackType
 
-    from aerokit.vehicle.camera.line import CameraLine
-    from aerokit.vehicle.orders.subjects import Given
+    from aerokit.vehicle.camera.link import CameraLine
+    from aerokit.vehicle.commanding.subjects import Given
 
 __all__ = ["Begun", "CameraBlock", "CameraPart"]
 

@@ -7,18 +7,17 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.wording import shown
 from aerokit.errors import FileFormatError, InvalidArgument, NotSupported
 from aerokit.vehicle.camera.album import LONGEST, Album
 from aerokit.vehicle.camera.capture import Capture
 from aerokit.vehicle.camera.part import CameraPart
 from aerokit.vehicle.camera.shooting import PhotoInterval, Shutter
-from aerokit.vehicle.checks import check_range
-from aerokit.wording import shown
 
 if TYPE_CHECKING:
-    from aerokit.runtime.cells import StateCell
-    from aerokit.vehicle.camera.line import CameraLine
+    from aerokit.connection.cells import StateCell
+    from aerokit.vehicle.camera.link import CameraLine
 
 __all__ = ["PhotoCalls"]
 

@@ -14,10 +14,9 @@ from aerokit.errors import (
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.camera.album import Album, Arrivals
-from aerokit.vehicle.camera.decoding import status_of
-from aerokit.vehicle.camera.ordering import SENT
+from aerokit.vehicle.camera.orders import SENT
 from aerokit.vehicle.camera.part import Begun
-from aerokit.vehicle.camera.values import CameraStatus
+from aerokit.vehicle.camera.values import CameraStatus, status_of
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -25,8 +24,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.vehicle.camera.capture import Capture
-    from aerokit.vehicle.camera.line import CameraLine
-    from aerokit.vehicle.orders.subjects import Given
+    from aerokit.vehicle.camera.link import CameraLine
+    from aerokit.vehicle.commanding.subjects import Given
 
 __all__ = ["PhotoInterval", "Shutter"]
 

@@ -6,18 +6,24 @@ from typing import TYPE_CHECKING, Literal
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraSource, MavCmd
-from aerokit.vehicle.camera.decoding import status_of, stream_of, thermal_range_of, with_status
 from aerokit.vehicle.camera.part import CameraBlock, CameraPart
-from aerokit.vehicle.camera.values import CameraStatus, ThermalRange, VideoStream
-from aerokit.vehicle.checks import check_range
+from aerokit.vehicle.camera.values import (
+    CameraStatus,
+    ThermalRange,
+    VideoStream,
+    status_of,
+    stream_of,
+    thermal_range_of,
+    with_status,
+)
 
 if TYPE_CHECKING:
-    from aerokit.runtime.cells import StateCell
-    from aerokit.vehicle.camera.line import CameraLine
-    from aerokit.vehicle.orders.subjects import Given
+    from aerokit.connection.cells import StateCell
+    from aerokit.vehicle.camera.link import CameraLine
+    from aerokit.vehicle.commanding.subjects import Given
 
 __all__ = ["SourceName", "VideoCalls"]
 

@@ -2,41 +2,114 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import anyio
 
-from aerokit.arguments import checks_arguments
-from aerokit.errors import CommandRejected, CommandTimeout, OperationTimeout
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.async_block import ReadOnly
+from aerokit._internal.files import unpacked
+from aerokit._internal.values import Snapshot
+from aerokit.connection.bus import Overflow, Subscription
+from aerokit.connection.components import is_autopilot
+from aerokit.errors import CommandRejected, CommandTimeout, FileFormatError, NotSupported, OperationTimeout
+from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavComponent, MavType
 from aerokit.mavlink.message import Message
-from aerokit.read_only import ReadOnly
-from aerokit.runtime.link_state import SILENT_AFTER_S
-from aerokit.runtime.subscription import Overflow, Subscription
-from aerokit.vehicle.components.status import ComponentInformation, information_of, kind_of
+from aerokit.vehicle.components.session import WEB
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from aerokit.mavlink.messages import CommandAck
-    from aerokit.runtime.cells import StateCell
-    from aerokit.runtime.events import Event
+    from aerokit.connection.cells import StateCell
+    from aerokit.events import Event
+    from aerokit.mavlink.messages import CommandAck, ComponentInformationBasic, Heartbeat
+    from aerokit.vehicle.commanding.orders import Orders
+    from aerokit.vehicle.components.session import ComponentTalk
     from aerokit.vehicle.components.settings import Settings
-    from aerokit.vehicle.components.talk import ComponentTalk
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.orders.orders import Orders
     from aerokit.vehicle.parameters.parameters import Parameters
-    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.session.session import Talk
 
-__all__ = ["Component"]
+__all__ = [
+    "KINDS",
+    "Component",
+    "ComponentInformation",
+    "ComponentStatus",
+    "information_of",
+    "kind_of",
+    "read_metadata",
+]
+
+
+class ComponentStatus(Snapshot):
+    """One component of the vehicle's system, as far as it was heard.
+
+    ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
+    MAV_TYPE in small letters. ``device_id`` is 0, or 1 to 6 for a camera or gimbal without a component id of its own,
+    behind the component that speaks for it. ``heard_at`` is when it was last heard, on the loop's clock.
+    """
+
+    component_id: int
+    device_id: int
+    kind: str
+    heard_at: float
+
+
+class ComponentInformation(Snapshot):
+    """What a component says of itself (COMPONENT_INFORMATION_BASIC); texts are empty where it tells nothing.
+
+    ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits; ``manufactured_at`` is in seconds since 1970, None if not told.
+    """
+
+    vendor: str
+    model: str
+    software_version: str
+    hardware_version: str
+    serial_number: str
+    capabilities: int
+    manufactured_at: int | None
+
+
+def kind_of(heartbeat: Heartbeat | None, component_id: int) -> str:
+    """The kind of a component: of one whose type says nothing, by its id."""
+    if heartbeat is not None and is_autopilot(heartbeat):
+        return "autopilot"
+    if heartbeat is not None and heartbeat.type != MavType.GENERIC:
+        return _name(MavType, heartbeat.type)
+    return _name(MavComponent, component_id) if heartbeat is not None else "unknown"
+
+
+def information_of(message: ComponentInformationBasic) -> ComponentInformation:
+    """The same in words."""
+    return ComponentInformation(
+        message.vendor_name,
+        message.model_name,
+        message.software_version,
+        message.hardware_version,
+        message.serial_number,
+        message.capabilities,
+        message.time_manufacture_s or None,
+    )
+
+
+def _name(enum: type[MavType | MavComponent], number: int) -> str:
+    try:
+        return enum(number).name.lower()
+    except ValueError:
+        return "unknown"
+
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
+
 MessageT = TypeVar("MessageT", bound=Message)
 
 MetadataKind = Literal["general", "parameter", "commands", "peripherals", "events", "actuators"]
+
 ASK_S, ASKED = 1.0, 3
 
 
@@ -107,8 +180,6 @@ class Component(ReadOnly):
             FileFormatError: the file is damaged.
             FileError, FileTimeout: it cannot be read.
         """
-        from aerokit.vehicle.components.metadata import read_metadata
-
         return await read_metadata(self, kind, timeout)
 
     async def fetch(self, uri: str, *, patience_s: float = 10.0) -> bytes:
@@ -124,7 +195,7 @@ class Component(ReadOnly):
             FileFormatError: the file has more than 16 MB.
             FileError, FileTimeout, OperationRejected: it was not given.
         """
-        from aerokit.vehicle.components.remote_file import fetch
+        from aerokit.vehicle.components.session import fetch
 
         return await fetch(uri, self._files_of, self.component_id, patience_s)
 
@@ -249,3 +320,50 @@ class Component(ReadOnly):
             return await self.request(m.CameraInformation)
 
         return Settings(self._talk, information, self._files_of)
+
+
+KINDS = {each.name.lower(): int(each) for each in CompMetadataType}
+"""Kinds of files: ``"general"``, ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``, ``"actuators"``."""
+
+
+async def read_metadata(component: Component, kind: str, timeout: float) -> dict[str, Any]:
+    """Fetch the file of this kind by MAVFTP; see :meth:`Component.metadata`."""
+    general = await _read(component, await _general_uri(component, timeout))
+    if kind == "general":
+        return general
+    for each in _listed(general):
+        if each.get("type") == KINDS[kind] and isinstance(each.get("uri"), str):
+            return await _read(component, each["uri"])
+    raise NotSupported(f"component {component.component_id} has no metadata of its {kind}")
+
+
+async def _general_uri(component: Component, timeout: float) -> str:
+    """Where its first file is, by COMPONENT_METADATA, or COMPONENT_INFORMATION of older firmware."""
+    try:
+        return (await component.request(m.ComponentMetadata, timeout=timeout)).uri
+    except CommandRejected:
+        pass
+    except OperationTimeout as error:
+        raise NotSupported(f"component {component.component_id} tells of no metadata: {error}") from None
+    try:
+        return (await component.request(m.ComponentInformation, timeout=timeout)).general_metadata_uri
+    except (CommandRejected, OperationTimeout) as error:
+        raise NotSupported(f"component {component.component_id} tells of no metadata: {error}") from None
+
+
+def _listed(general: dict[str, Any]) -> list[dict[str, Any]]:
+    listed = general.get("metadataTypes")
+    return [each for each in listed if isinstance(each, dict)] if isinstance(listed, list) else []
+
+
+async def _read(component: Component, uri: str) -> dict[str, Any]:
+    if uri.lower().startswith(WEB):
+        raise NotSupported(f"{uri} is not on the vehicle: fetch it by another program")
+    data = unpacked(await component.fetch(uri), uri)
+    try:
+        content = json.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{uri}: no JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{uri}: its outermost value is no object")
+    return content

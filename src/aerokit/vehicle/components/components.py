@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.vehicle.components.component import Component
-from aerokit.vehicle.components.status import ComponentStatus, kind_of
-from aerokit.vehicle.components.talk import ComponentTalk
+from aerokit.vehicle.components.component import Component, ComponentStatus, kind_of
+from aerokit.vehicle.components.session import ComponentTalk
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.parameters.parameters import Parameters
 
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.mavlink.frame import Frame
-    from aerokit.vehicle.orders.bridge import Bridge
+    from aerokit.vehicle.commanding.context import Bridge
 
 __all__ = ["Components"]
 

@@ -10,26 +10,26 @@ import os
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import NotSupported, ParameterRejected
+from aerokit.events import SettingChanged
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import ParamAck
 from aerokit.parameters import Setting, SettingValue, check_name
 from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.parameters.setting import checked_setting, settings_equal
+from aerokit.protocols.exchange import PATIENCE_S
 from aerokit.protocols.extended_parameters import SettingList, SettingReads, SettingWrite, setting_of
-from aerokit.protocols.transfer import PATIENCE_S
-from aerokit.runtime.events import SettingChanged
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
 
     from aerokit.parameters import CameraDefinition, SettingDefinition
+    from aerokit.protocols.exchange import OnProgress
     from aerokit.protocols.extended_parameters import SettingAnswer
-    from aerokit.protocols.transfer import OnProgress
-    from aerokit.vehicle.components.talk import ComponentTalk
+    from aerokit.vehicle.components.session import ComponentTalk
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.session.session import Talk
 
 __all__ = ["Settings"]
 
@@ -141,7 +141,7 @@ class Settings:
             OperationRejected: the web server does not give it.
         """
         from aerokit.parameters import parse_definition
-        from aerokit.vehicle.components.remote_file import fetch
+        from aerokit.vehicle.components.session import fetch
 
         with self._transfers.limit(timeout):
             if uri is None:

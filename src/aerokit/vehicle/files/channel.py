@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
     from aerokit.protocols.ftp import FtpMessage
-    from aerokit.vehicle.talk.transfers import Transfers
+    from aerokit.vehicle.session.transfers import Transfers
 
 __all__ = ["FileChannel", "OpenFile"]
 

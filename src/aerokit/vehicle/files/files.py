@@ -6,23 +6,23 @@ import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.files import PartFile
+from aerokit._internal.values import Snapshot
 from aerokit.errors import FileError, InvalidArgument, RemoteProtocolError, VerificationFailed
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.blocks import Reassembly
+from aerokit.protocols.exchange import PATIENCE_S, OnProgress
 from aerokit.protocols.ftp import DATA_SIZE, path_bytes
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload, is_virtual
-from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress
-from aerokit.snapshot import Snapshot
 from aerokit.vehicle.files.channel import FileChannel
-from aerokit.vehicle.files.part_file import PartFile
 
 if TYPE_CHECKING:
     import os
 
     from aerokit.protocols.ftp import FtpMessage
     from aerokit.vehicle.files.channel import OpenFile
-    from aerokit.vehicle.talk.transfers import Transfers
+    from aerokit.vehicle.session.transfers import Transfers
 
 __all__ = ["FileEntry", "Files"]
 

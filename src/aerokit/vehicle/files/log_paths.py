@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from datetime import datetime
 from typing import TYPE_CHECKING, NamedTuple
 
+from aerokit._internal.values import Snapshot
 from aerokit.errors import FileError
 
 if TYPE_CHECKING:
+    from aerokit.protocols.exchange import OnProgress, Progress
     from aerokit.vehicle.files.files import FileEntry, Files
-    from aerokit.vehicle.files.log_entry import LogEntry
 
-__all__ = ["ListedLog", "listed_logs", "log_path"]
+__all__ = ["GrowthWatch", "ListedLog", "LogEntry", "listed_logs", "log_path"]
 
 ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
+
 PX4_LIST = "logdata.txt"
+
 PX4_LINE = re.compile(r"(\d+) (\d+) (\S+)")
 
 
@@ -97,3 +102,42 @@ def _numbered_path(
     may_be_larger = has_grown or number == max(entries)
     is_it = entry.size >= log.size if may_be_larger else entry.size == log.size
     return f"{directory}/{entry.name}" if is_it else None
+
+
+class LogEntry(Snapshot):
+    """One flight log: its id for :meth:`Logs.download`, its size in bytes, and when it was last written.
+
+    The time is None when the vehicle did not know it; the size of a log that is being written is that of the moment.
+    """
+
+    id: int
+    size: int
+    time_utc: datetime | None
+
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+
+class GrowthWatch:
+    """Passes progress on, and tells in the log when there is more of a log than its entry says."""
+
+    def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
+        self._entry, self._on_progress = entry, on_progress
+        self._size = entry.size
+
+    def __call__(self, progress: Progress) -> None:
+        """As an OnProgress."""
+        self._size = progress.total or self._size
+        if self._on_progress is not None:
+            self._on_progress(progress)
+
+    def tell(self) -> None:
+        """The end has come."""
+        if self._size > self._entry.size:
+            logger.info(
+                "log %d was still being written when it was listed with %d bytes: it had %d when it was asked for, and"
+                " they were read",
+                self._entry.id,
+                self._entry.size,
+                self._size,
+            )

@@ -9,25 +9,22 @@ from typing import TYPE_CHECKING, Literal
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.files import PartFile
 from aerokit.errors import AerokitError, FileError, FileTimeout, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
-from aerokit.protocols.log_list import LogList
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd
-from aerokit.protocols.reassembly import Reassembly
-from aerokit.protocols.transfer import PATIENCE_S, OnProgress
-from aerokit.vehicle.files.log_entry import LogEntry
-from aerokit.vehicle.files.log_growth import GrowthWatch
-from aerokit.vehicle.files.log_paths import listed_logs, log_path
-from aerokit.vehicle.files.part_file import PartFile
+from aerokit.protocols.blocks import Reassembly
+from aerokit.protocols.exchange import PATIENCE_S, OnProgress
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd, LogList
+from aerokit.vehicle.files.log_paths import GrowthWatch, LogEntry, listed_logs, log_path
 
 if TYPE_CHECKING:
     import os
     from collections.abc import AsyncIterator, Callable
 
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.talk.transfers import Transfers
+    from aerokit.vehicle.session.transfers import Transfers
 
 __all__ = ["LogEntry", "LogMethod", "Logs"]
 

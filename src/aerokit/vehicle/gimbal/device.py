@@ -2,37 +2,153 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from aerokit.mavlink.enums import GimbalDeviceErrorFlags
+from aerokit._internal.values import Snapshot
+from aerokit.connection.cells import Source, StateCell
+from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.vehicle.gimbal.values import GimbalControllers, controllers_of
-from aerokit.vehicle.orders.newest import Newest
-from aerokit.vehicle.talk.rates import SUBSCRIPTION_HZ
+from aerokit.vehicle.commanding.newest import Newest
+from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from aerokit.connection.bus import Detach
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.messages import (
         GimbalDeviceInformation,
         GimbalManagerInformation,
         GimbalManagerStatus,
     )
-    from aerokit.runtime.bus import Detach
+    from aerokit.vehicle.commanding.context import Bridge
     from aerokit.vehicle.gimbal.control import GimbalControl
-    from aerokit.vehicle.orders.bridge import Bridge
-    from aerokit.vehicle.state.gimbal import GimbalAttitude
-    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.state.equipment import GimbalAttitude
 
-__all__ = ["ATTITUDE_COMES_IN", "LAST_NUMBER", "Device"]
+__all__ = [
+    "ATTITUDE_COMES_IN",
+    "LAST_NUMBER",
+    "Claim",
+    "Claims",
+    "Device",
+    "Frame",
+    "GimbalControllers",
+    "GimbalInformation",
+    "controllers_of",
+    "information_of",
+]
+
+Frame = Literal["earth", "vehicle"]
+"""What a yaw counts from, and keeps to: north, or the vehicle's nose."""
+
+Can = GimbalManagerCapFlags
+
+
+class GimbalControllers(Snapshot):
+    """Who is in control of a gimbal: (system id, component id), (0, 0): nobody (GIMBAL_MANAGER_STATUS)."""
+
+    primary: tuple[int, int]
+    secondary: tuple[int, int]
+
+
+class GimbalInformation(Snapshot):
+    """What a gimbal is and can do (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
+
+    ``gimbal_device_id``: the component id of the device, or 1 to 6 behind its manager's component, which is
+    ``manager_component_id``. ``roll_deg``, ``pitch_deg``, ``yaw_deg``: lowest and highest angle, None: not told. The
+    texts are empty, and ``uid`` is 0, of a device that does not tell them.
+    """
+
+    gimbal_device_id: int
+    manager_component_id: int
+    capabilities: int
+    roll_deg: tuple[float, float] | None = None
+    pitch_deg: tuple[float, float] | None = None
+    yaw_deg: tuple[float, float] | None = None
+    vendor: str = ""
+    model: str = ""
+    custom_name: str = ""
+    firmware_version: str = ""
+    hardware_version: str = ""
+    uid: int = 0
+
+    def can(self, capability: int) -> bool:
+        """Whether it has this: a member of ``enums.GimbalManagerCapFlags``."""
+        return bool(self.capabilities & capability)
+
+    @property
+    def retracts(self) -> bool:
+        """Whether it can be retracted."""
+        return self.can(Can.HAS_RETRACT)
+
+    @property
+    def has_neutral(self) -> bool:
+        """Whether it has a neutral position."""
+        return self.can(Can.HAS_NEUTRAL)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Those that it turns about: of ``"roll"``, ``"pitch"``, ``"yaw"``."""
+        bits = (("roll", Can.HAS_ROLL_AXIS), ("pitch", Can.HAS_PITCH_AXIS), ("yaw", Can.HAS_YAW_AXIS))
+        return tuple(name for name, bit in bits if self.can(bit))
+
+    @property
+    def looks_at_places(self) -> bool:
+        """Whether its manager says that it can point at a place on the globe."""
+        return self.can(Can.CAN_POINT_LOCATION_GLOBAL)
+
+
+def controllers_of(message: GimbalManagerStatus) -> GimbalControllers:
+    """Of GIMBAL_MANAGER_STATUS."""
+    return GimbalControllers(
+        (message.primary_control_sysid, message.primary_control_compid),
+        (message.secondary_control_sysid, message.secondary_control_compid),
+    )
+
+
+def information_of(
+    device_id: int,
+    manager_id: int,
+    manager: GimbalManagerInformation | None,
+    device: GimbalDeviceInformation | None,
+) -> GimbalInformation:
+    """Of what was told; the manager's word goes before the device's."""
+    told = manager or device
+    assert told is not None
+    capabilities = manager.cap_flags if manager is not None else told.cap_flags
+    limits = (
+        _limits(told.roll_min, told.roll_max),
+        _limits(told.pitch_min, told.pitch_max),
+        _limits(told.yaw_min, told.yaw_max),
+    )
+    if device is None:
+        return GimbalInformation(device_id, manager_id, capabilities, *limits)
+    names = (device.vendor_name, device.model_name, device.custom_name)
+    versions = (_version(device.firmware_version), _version(device.hardware_version))
+    return GimbalInformation(device_id, manager_id, capabilities, *limits, *names, *versions, device.uid)
+
+
+def _limits(low: float, high: float) -> tuple[float, float] | None:
+    """Zeros are what devices say that do not know."""
+    if not (math.isfinite(low) and math.isfinite(high)) or low >= high:
+        return None
+    return round(math.degrees(low), 2) + 0.0, round(math.degrees(high), 2) + 0.0
+
+
+def _version(number: int) -> str:
+    """Major, minor and patch, each a byte from the lowest on."""
+    return "" if not number else f"{number & 0xFF}.{number >> 8 & 0xFF}.{number >> 16 & 0xFF}"
+
 
 LAST_NUMBER = 6
 """Gimbals without a component id of their own are numbered from 1 to this."""
+
 OVERTAKEN_MS = 5_000
 """Behind by more, its manager has rebooted."""
+
 ATTITUDE_COMES_IN = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
 
 
@@ -176,3 +292,42 @@ class Device:
         return Source(
             self._system_id, self.component_id if frame is None else frame.component_id, message.NAME
         )
+
+
+class Claim:
+    """Of one block, from its entering on, to one manager; a ``parameter`` of 0 means all gimbals of the manager."""
+
+    def __init__(self, manager_id: int, parameter: int, *, is_primary: bool) -> None:
+        self.manager_id: int = manager_id
+        self.parameter: int = parameter
+        self.is_primary: bool = is_primary
+        self.owes_release = False
+        """Whether an earlier block, whose last word was not answered, leaves it to this one to give control back."""
+
+    def shares(self, other: Claim) -> bool:
+        """Whether to give back what the one has takes it away from the other."""
+        is_same = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
+        return is_same and (self.parameter == other.parameter or 0 in (self.parameter, other.parameter))
+
+
+class Claims:
+    """Those that are open."""
+
+    def __init__(self) -> None:
+        self._open: list[Claim] = []
+
+    def add(self, claim: Claim) -> None:
+        """Its block is being entered."""
+        self._open.append(claim)
+
+    def end(self, claim: Claim) -> None:
+        """Its block was left, or not entered."""
+        if claim in self._open:
+            self._open.remove(claim)
+
+    def may_give_back(self, claim: Claim) -> bool:
+        """Whether no other block wants or has the same; one that does has to give it back now."""
+        others = [each for each in self._open if each is not claim and each.shares(claim)]
+        for each in others:
+            each.owes_release = True
+        return not others

@@ -7,36 +7,43 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from aerokit._internal.wording import shown
 from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.messages import GimbalManagerInformation, MountConfigure, MountControl
-from aerokit.wording import shown
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.gimbal.claims import Claims
-    from aerokit.vehicle.gimbal.device import Device
-    from aerokit.vehicle.gimbal.hearing import Hearing
-    from aerokit.vehicle.orders.bridge import Bridge
-    from aerokit.vehicle.orders.newest import Turn
-    from aerokit.vehicle.talk.talk import Talk
+    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.newest import Turn
+    from aerokit.vehicle.gimbal.device import Claims, Device, GimbalControllers
+    from aerokit.vehicle.gimbal.discovery import Hearing
+    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.state.equipment import GimbalAttitude
 
-__all__ = ["CONFIGURE", "LEVEL", "LOCKED", "NAN", "PITCHYAW", "GimbalOrders"]
+__all__ = ["CONFIGURE", "LEVEL", "LOCKED", "NAN", "PITCHYAW", "GimbalOrders", "GimbalPart"]
 
 NAN = math.nan
 
 PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE
+
 MOUNT = MavCmd.DO_MOUNT_CONTROL
+
 LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
 """Roll and pitch from the horizon, yaw from the vehicle's nose."""
+
 LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
 """Yaw from north."""
+
 RELEASE, UNCHANGED = -3, -1
+
 FOUND_S = 1.0
 """How long what was promised may take to come."""
+
 BY_THE_STANDARD = GimbalRules()
 
 
@@ -306,3 +313,25 @@ class GimbalOrders:
         autopilot = self.talk.autopilot
         who = autopilot.firmware if self.manager_id == self.talk.component_id else shown(self.manager_id)
         raise NotSupported(f"{self.name}: {who} {what}; nothing was sent")
+
+
+class GimbalPart:
+    """A part of :class:`Gimbal`: its state, and some of its orders."""
+
+    def __init__(self, bridge: Bridge, hearing: Hearing, device: Device | None) -> None:
+        self._orders = GimbalOrders(bridge, hearing, device)
+        self._bridge, self._talk = bridge, bridge.talk
+        shown = self._orders.shown
+        self.attitude: StateCell[GimbalAttitude] = shown.attitude
+        """Where it points (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION,
+        MOUNT_STATUS). The autopilot is asked for it while somebody waits, follows or observes; reading asks nothing."""
+        self.controllers: StateCell[GimbalControllers] = shown.controllers
+        """Who is in control of it, as its manager tells by itself (GIMBAL_MANAGER_STATUS)."""
+
+    @property
+    def device_id(self) -> int:
+        """Its gimbal device id: 1 to 6 behind its manager, or its component id; 0 while none is heard of."""
+        return self._orders.device.device_id
+
+    def _now(self) -> float:
+        return self._talk.connection.now()

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import AerokitError, BusyError, CommandRejected, NotSupported, SetpointStreamStopped
+from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.messages import GimbalManagerSetAttitude, GimbalManagerSetPitchyaw
-from aerokit.runtime.link_state import SILENT_AFTER_S
-from aerokit.vehicle.checks import check_range
-from aerokit.vehicle.gimbal.ending import LastWord
+from aerokit.vehicle.commanding.newest import OVERRULED
+from aerokit.vehicle.gimbal.control import LastWord
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, PITCHYAW, GimbalOrders
-from aerokit.vehicle.orders.newest import OVERRULED
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.orders.newest import Turn
+    from aerokit.vehicle.commanding.newest import Turn
 
 __all__ = ["FASTEST_DEG_S", "GimbalRates"]
 

@@ -18,19 +18,19 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavProtocolCapability
 from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
+from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
-from aerokit.parameters.px4_hash import HASH_NAME
-from aerokit.protocols.round_trip import RoundTrip
+from aerokit.protocols.exchange import RoundTrip
 from aerokit.vehicle.parameters.store import ParameterStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from aerokit.protocols.exchange import OnProgress
     from aerokit.protocols.parameter_requests import Answer
-    from aerokit.protocols.transfer import OnProgress
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.parameters.cache import ParameterCache
-    from aerokit.vehicle.talk.transfers import Transfers
+    from aerokit.vehicle.parameters.store import ParameterCache
+    from aerokit.vehicle.session.transfers import Transfers
 
 __all__ = ["CacheChoice", "DownloadMethod", "ParameterAccess", "UploadMethod"]
 
@@ -103,7 +103,7 @@ class ParameterAccess:
                 return self.store.table
             keeper = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
-                from aerokit.vehicle.parameters.cache import ParameterCache
+                from aerokit.vehicle.parameters.store import ParameterCache
 
                 keeper = _Keeper(self, ParameterCache(None if cache is True else cache), patience_s)
                 if await keeper.begin(refresh):
@@ -215,7 +215,7 @@ class ParameterAccess:
         if not names:
             return {}
         from aerokit.parameters.renames import other_names
-        from aerokit.protocols.parameter_read import ParameterReads
+        from aerokit.protocols.parameter_requests import ParameterReads
 
         transfers, store = self._transfers, self.store
         exchange = ParameterReads(
@@ -262,7 +262,7 @@ class ParameterAccess:
         wanted = tuple(wanted)
         if not wanted:
             return {}
-        from aerokit.protocols.parameter_write import ParameterWrites
+        from aerokit.protocols.parameter_requests import ParameterWrites
 
         transfers = self._transfers
         async with self._writing:
@@ -376,7 +376,7 @@ class _Keeper:
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 
     async def _key(self) -> str:
-        from aerokit.vehicle.parameters.cache import vehicle_key
+        from aerokit.vehicle.parameters.store import vehicle_key
 
         transfers = self._access._transfers
         await transfers.capabilities()

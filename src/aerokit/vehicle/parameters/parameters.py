@@ -9,23 +9,28 @@ import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, ParameterTable, check_name
-from aerokit.protocols.transfer import PATIENCE_S
-from aerokit.read_only import ReadOnly
+from aerokit.protocols.exchange import PATIENCE_S
 from aerokit.vehicle.parameters.access import CacheChoice, DownloadMethod, ParameterAccess, UploadMethod
-from aerokit.vehicle.parameters.names import Found, ParameterNames
-from aerokit.vehicle.parameters.results import Outcome, ParameterWrite
 from aerokit.vehicle.parameters.transaction import Holds, Temporarily, Transaction
-from aerokit.vehicle.parameters.writing import ParameterWriting, check_values
+from aerokit.vehicle.parameters.writing import (
+    Found,
+    Outcome,
+    ParameterNames,
+    ParameterWrite,
+    ParameterWriting,
+    check_values,
+)
 
 if TYPE_CHECKING:
     from aerokit.parameters import Metadata, ParameterDifference
+    from aerokit.protocols.exchange import OnProgress
     from aerokit.protocols.parameter_requests import Answer
-    from aerokit.protocols.transfer import OnProgress
     from aerokit.vehicle.files.files import Files
-    from aerokit.vehicle.talk.transfers import Talking
+    from aerokit.vehicle.session.transfers import Talking
 
 __all__ = ["Outcome", "ParameterWrite", "Parameters", "Transaction"]
 

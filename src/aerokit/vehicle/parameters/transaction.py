@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.arguments import checks_arguments
+from aerokit._internal.arguments import checks_arguments
+from aerokit.connection.tasks import to_its_end
 from aerokit.errors import AerokitError, InvalidArgument, RollbackFailed, VerificationFailed
 from aerokit.parameters import Parameter
 from aerokit.parameters.parameter import same_value
-from aerokit.runtime.background import to_its_end
-from aerokit.vehicle.parameters.names import Found
+from aerokit.vehicle.parameters.writing import Found
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
     from aerokit.parameters import ParameterDifference
     from aerokit.vehicle.parameters.access import ParameterAccess
-    from aerokit.vehicle.parameters.results import ParameterWrite
-    from aerokit.vehicle.parameters.writing import ParameterWriting
+    from aerokit.vehicle.parameters.writing import ParameterWrite, ParameterWriting
 
 __all__ = ["Holds", "Temporarily", "Transaction"]
 

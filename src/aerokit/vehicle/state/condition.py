@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aerokit._internal.values import Snapshot
 from aerokit.autopilots import is_armed
 from aerokit.autopilots.modes import Mode
-from aerokit.autopilots.version import AutopilotVersion
+from aerokit.autopilots.telemetry import AutopilotVersion
 from aerokit.mavlink.enums import (
     MavLandedState,
     MavProtocolCapability,
@@ -15,8 +16,7 @@ from aerokit.mavlink.enums import (
     MavVtolState,
     MissionState,
 )
-from aerokit.snapshot import Snapshot
-from aerokit.vehicle.state.reading import U16, Context, finite, member, unless
+from aerokit.vehicle.state.field import U16, Context, finite, member, unless
 
 if TYPE_CHECKING:
     from aerokit.mavlink import messages

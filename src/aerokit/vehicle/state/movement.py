@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from aerokit import geo
+from aerokit._internal import geo
+from aerokit._internal.values import Snapshot
 from aerokit.position import Position
-from aerokit.snapshot import Snapshot
-from aerokit.vehicle.state.reading import U16, Context, finite
+from aerokit.vehicle.state.field import U16, Context, finite
 
 if TYPE_CHECKING:
     from typing_extensions import Self

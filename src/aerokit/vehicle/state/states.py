@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.modes import Mode
-from aerokit.autopilots.version import AutopilotVersion
+from aerokit.autopilots.telemetry import AutopilotVersion
 from aerokit.position import Position
 from aerokit.vehicle.state import condition, equipment, movement
 from aerokit.vehicle.state.condition import (
@@ -29,13 +29,13 @@ from aerokit.vehicle.state.equipment import (
     ServoOutputs,
     Vibration,
 )
+from aerokit.vehicle.state.field import By, Told
 from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
-from aerokit.vehicle.state.told import By, Told
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from aerokit.runtime.cells import StateCell
+    from aerokit.connection.cells import StateCell
 
 __all__ = ["DEFAULT_RATES_HZ", "LAZY", "SOURCES", "STATES", "States"]
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit.vehicle.state import states
-from aerokit.vehicle.state.told import message_type
+from aerokit.vehicle.state.field import message_type
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.state.told import Told
+    from aerokit.vehicle.state.field import Told
 
 __all__ = ["documentation", "rendered"]
 

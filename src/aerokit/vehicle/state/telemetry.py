@@ -7,14 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots import Autopilot, autopilot_for
+from aerokit.connection.cells import Source, StateCell
+from aerokit.connection.components import is_autopilot
 from aerokit.mavlink.message import offset_of
-from aerokit.runtime.cells import Source, StateCell
-from aerokit.runtime.components import is_autopilot
-from aerokit.vehicle.state.reading import Context
+from aerokit.vehicle.state.field import MESSAGE_IDS, By, Context, StreamedMessage, message_type
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
 from aerokit.vehicle.state.status_text import StatusTextAssembler
-from aerokit.vehicle.state.streamed import StreamedMessage
-from aerokit.vehicle.state.told import MESSAGE_IDS, By, message_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -1,0 +1,1 @@
+"""Helpers that several packages use and that are not part of the public API."""

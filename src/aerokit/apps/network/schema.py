@@ -1,0 +1,169 @@
+"""The JSON schema of published states, made of their types: ``python -m aerokit.apps.network.schema``."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+import types
+import typing
+from datetime import date, datetime
+from enum import Enum, Flag
+from typing import Any
+
+from aerokit._internal.values import Snapshot
+from aerokit.apps.network.publishing import VERSION
+from aerokit.events import LinkState
+from aerokit.mavlink import enums
+from aerokit.vehicle.state.states import States
+from aerokit.vehicle.state.table import documentation
+
+__all__ = ["document", "rendered"]
+
+_ABOUT = (
+    "What aerokit publishes of a vehicle (docs/network.md). Units are in the names of fields. null: not known. A reader"
+    " must take fields and states that it does not know, for they are added without another version."
+)
+_PLAIN: dict[Any, dict[str, Any]] = {
+    bool: {"type": "boolean"},
+    int: {"type": "integer"},
+    float: {"type": ["number", "null"]},
+    str: {"type": "string"},
+    bytes: {"type": "string", "description": "hexadecimal digits", "pattern": "^([0-9a-f]{2})*$"},
+    datetime: {"type": "string", "format": "date-time"},
+    date: {"type": "string", "format": "date"},
+    type(None): {"type": "null"},
+}
+ENUMS: dict[str, type[Enum]] = {
+    "system_status": enums.MavState,
+    "vtol_state": enums.MavVtolState,
+    "landed_state": enums.MavLandedState,
+    "capabilities": enums.MavProtocolCapability,
+    "GpsReceiver.fix_type": enums.GpsFixType,
+    "Battery.charge_state": enums.MavBatteryChargeState,
+    "MissionProgress.state": enums.MissionState,
+    "Power.flags": enums.MavPowerStatus,
+}
+"""Integers that are published by their names in the standard (`aerokit._internal.values`), where the number has one."""
+
+
+def document() -> dict[str, Any]:
+    """The schema (draft 2020-12): one of the messages below ``oneOf``, told apart by ``state``."""
+    values: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
+    texts = documentation()
+    hints = typing.get_type_hints(States)
+    states = {
+        name: _message(
+            name, texts[name][1], _named(name) or _schema_of(typing.get_args(hints[name])[0], values)
+        )
+        for name in texts
+    }
+    states["link"] = _message("link", "Whether frames of it come at all, and how many.", _LINK)
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "aerokit state",
+        "description": _ABOUT,
+        "oneOf": list(states.values()),
+        "$defs": dict(sorted(values.items())),
+    }
+
+
+_COUNT = {"type": "integer", "minimum": 0}
+_LINK: dict[str, Any] = {
+    "type": "object",
+    "properties": {
+        "state": {"type": ["string", "null"], "enum": [*(each.value for each in LinkState), None]},
+        "heartbeat_age_s": {"type": ["number", "null"]},
+        "frames_received": _COUNT,
+        "frames_lost": _COUNT,
+    },
+    "required": ["state", "heartbeat_age_s", "frames_received", "frames_lost"],
+}
+
+
+_MESSAGE: dict[str, Any] = {
+    "description": "what all of them have",
+    "type": "object",
+    "properties": {
+        "version": {"const": VERSION},
+        "system_id": {"type": "integer", "minimum": 1, "maximum": 255},
+        "state": {"type": "string"},
+        "age_s": {"type": "number", "minimum": 0, "description": "seconds since the vehicle told it"},
+        "unix_s": {"type": "number", "description": "by the clock of who publishes it"},
+    },
+    "required": ["version", "system_id", "state", "value", "age_s", "unix_s"],
+}
+
+
+def _message(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "title": name,
+        "description": " ".join(text.replace("`", "").split()),
+        "$ref": "#/$defs/Message",
+        "properties": {"state": {"const": name}, "value": value},
+    }
+
+
+def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Of what :func:`aerokit._internal.values.plain` makes of a value of this type."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return {"anyOf": [_schema_of(each, values) for each in arguments]}
+    if origin in (tuple, list):
+        if len(arguments) == 2 and arguments[1] is ...:
+            return {"type": "array", "items": _schema_of(arguments[0], values)}
+        members = [_schema_of(each, values) for each in arguments]
+        return {"type": "array", "prefixItems": members, "minItems": len(members), "maxItems": len(members)}
+    if isinstance(kind, type) and issubclass(kind, Snapshot):
+        if kind.__name__ not in values:
+            values[kind.__name__] = {}  # of one that has itself inside
+            values[kind.__name__] = _object(kind, values)
+        return {"$ref": f"#/$defs/{kind.__name__}"}
+    return dict(_PLAIN[kind])
+
+
+def _named(name: str) -> dict[str, Any] | None:
+    """Of an integer that has names: its name, or a list of those of its bits; the number where it has none."""
+    enum = ENUMS.get(name)
+    if enum is None:
+        return None
+    names = {"enum": [each.name for each in enum]}
+    several = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
+    return {"description": f"of {enum.__name__}", "anyOf": [names, *several, {"type": "integer"}]}
+
+
+def _object(kind: type[Snapshot], values: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    annotations: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        if issubclass(base, Snapshot) and base is not Snapshot:
+            annotations.update(inspect.get_annotations(base, eval_str=True))
+    names = list(kind.__match_args__)
+    return {
+        "type": "object",
+        "description": " ".join((inspect.getdoc(kind) or "").replace("`", "").split()),
+        "properties": {
+            name: _named(f"{kind.__name__}.{name}") or _schema_of(annotations[name], values) for name in names
+        },
+        "required": names,
+    }
+
+
+def rendered() -> str:
+    """The file docs/state.schema.json: a line for each state and each type."""
+    whole = document()
+    lines = [
+        f" {json.dumps(key)}: {_json(value)},"
+        for key, value in whole.items()
+        if key not in ("oneOf", "$defs")
+    ]
+    states = ",\n".join(f"  {_json(each)}" for each in whole["oneOf"])
+    kinds = ",\n".join(f"  {_json(name)}: {_json(each)}" for name, each in whole["$defs"].items())
+    return "\n".join(["{", *lines, f' "oneOf": [\n{states}\n ],', f' "$defs": {{\n{kinds}\n }}', "}", ""])
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(rendered())

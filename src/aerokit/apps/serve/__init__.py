@@ -1,0 +1,16 @@
+"""A web page and an HTTP and WebSocket API for vehicles: what ``aerokit serve`` runs, and other programs can mount.
+
+```python
+import aerokit.apps.serve                                   # pip install 'aerokit-mavlink[serve]'
+
+async with aerokit.open_connection("udpin:0.0.0.0:14550") as connection:
+    async with aerokit.apps.serve.make_app(connection) as app:     # an ASGI application, with app.token
+        ...                                                   # mount it, or run it by uvicorn
+```
+
+docs/serve.md has the API and what is done for safety.
+"""
+
+from aerokit.apps.serve.app import ServeApp, make_app
+
+__all__ = ["ServeApp", "make_app"]

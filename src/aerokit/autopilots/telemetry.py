@@ -1,0 +1,187 @@
+"""What the bits of SYS_STATUS, EKF_STATUS_REPORT and ESTIMATOR_STATUS say, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from aerokit._internal.values import Snapshot
+from aerokit.mavlink.enums import EstimatorStatusFlags, MavDataStream, MavSysStatusSensor
+from aerokit.mavlink.messages import INDEX
+
+__all__ = [
+    "ARDUPILOT_GROUPS",
+    "ATTITUDE_AND_HEIGHT",
+    "ESTIMATES",
+    "POS_HORIZ_ABS",
+    "PREARM_CHECK",
+    "SENSORS",
+    "STREAMED",
+    "AutopilotVersion",
+    "names_of",
+    "version_text",
+]
+
+_E, _S = EstimatorStatusFlags, MavSysStatusSensor
+
+PREARM_CHECK = _S.MAV_SYS_STATUS_PREARM_CHECK.value
+"""MAV_SYS_STATUS_PREARM_CHECK: the summary of all checks, not a sensor."""
+
+POS_HORIZ_ABS = _E.POS_HORIZ_ABS.value
+
+ATTITUDE_AND_HEIGHT = _E.ATTITUDE.value | _E.POS_VERT_ABS.value
+"""What arming in a mode that needs a position takes at least, besides the position itself."""
+
+SENSORS: Mapping[int, str] = {
+    _S.SENSOR_3D_GYRO.value: "gyroscope",
+    _S.SENSOR_3D_ACCEL.value: "accelerometer",
+    _S.SENSOR_3D_MAG.value: "compass",
+    _S.ABSOLUTE_PRESSURE.value: "barometer",
+    _S.DIFFERENTIAL_PRESSURE.value: "airspeed sensor",
+    _S.GPS.value: "GPS",
+    _S.OPTICAL_FLOW.value: "optical flow",
+    _S.VISION_POSITION.value: "vision position",
+    _S.LASER_POSITION.value: "range finder",
+    _S.EXTERNAL_GROUND_TRUTH.value: "external ground truth",
+    _S.ANGULAR_RATE_CONTROL.value: "rate control",
+    _S.ATTITUDE_STABILIZATION.value: "attitude stabilisation",
+    _S.YAW_POSITION.value: "yaw control",
+    _S.Z_ALTITUDE_CONTROL.value: "altitude control",
+    _S.XY_POSITION_CONTROL.value: "horizontal position control",
+    _S.MOTOR_OUTPUTS.value: "motor outputs",
+    _S.RC_RECEIVER.value: "RC receiver",
+    _S.SENSOR_3D_GYRO2.value: "second gyroscope",
+    _S.SENSOR_3D_ACCEL2.value: "second accelerometer",
+    _S.SENSOR_3D_MAG2.value: "second compass",
+    _S.MAV_SYS_STATUS_GEOFENCE.value: "geofence",
+    _S.MAV_SYS_STATUS_AHRS.value: "attitude and heading estimate",
+    _S.MAV_SYS_STATUS_TERRAIN.value: "terrain data",
+    _S.MAV_SYS_STATUS_REVERSE_MOTOR.value: "reversed motors",
+    _S.MAV_SYS_STATUS_LOGGING.value: "logging",
+    _S.BATTERY.value: "battery",
+    _S.PROXIMITY.value: "proximity sensor",
+    _S.SATCOM.value: "satellite link",
+    _S.MAV_SYS_STATUS_PREARM_CHECK.value: "pre-arm checks",
+    _S.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE.value: "obstacle avoidance",
+    _S.PROPULSION.value: "propulsion",
+}
+"""MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR) in words."""
+
+ESTIMATES: Mapping[int, str] = {
+    _E.ATTITUDE.value: "attitude",
+    _E.VELOCITY_HORIZ.value: "horizontal velocity",
+    _E.VELOCITY_VERT.value: "vertical velocity",
+    _E.POS_HORIZ_REL.value: "relative horizontal position",
+    _E.POS_HORIZ_ABS.value: "absolute horizontal position",
+    _E.POS_VERT_ABS.value: "absolute altitude",
+    _E.POS_VERT_AGL.value: "altitude above ground",
+    _E.CONST_POS_MODE.value: "constant position mode",
+    _E.PRED_POS_HORIZ_REL.value: "predicted relative horizontal position",
+    _E.PRED_POS_HORIZ_ABS.value: "predicted absolute horizontal position",
+}
+"""The bits that EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS have in common, in words."""
+
+
+def names_of(bits: int, names: Mapping[int, str]) -> tuple[str, ...]:
+    """The names of the bits that are set; a bit without a name is left out."""
+    return tuple(name for bit, name in names.items() if bits & bit)
+
+
+_GROUPS: Mapping[int, tuple[str, ...]] = {
+    MavDataStream.RAW_SENSORS: (
+        "RawImu",
+        "ScaledImu2",
+        "ScaledImu3",
+        "ScaledPressure",
+        "ScaledPressure2",
+        "ScaledPressure3",
+        "Airspeed",
+    ),
+    MavDataStream.EXTENDED_STATUS: (
+        "SysStatus",
+        "PowerStatus",
+        "McuStatus",
+        "Meminfo",
+        "MissionCurrent",
+        "GpsRawInt",
+        "GpsRtk",
+        "Gps2Raw",
+        "Gps2Rtk",
+        "NavControllerOutput",
+        "FenceStatus",
+        "PositionTargetGlobalInt",
+    ),
+    MavDataStream.POSITION: ("GlobalPositionInt", "LocalPositionNed"),
+    MavDataStream.RAW_CONTROLLER: ("RcChannelsScaled",),
+    MavDataStream.RC_CHANNELS: ("ServoOutputRaw", "RcChannels", "RcChannelsRaw"),
+    MavDataStream.EXTRA1: ("Attitude", "Simstate", "Ahrs2", "Rpm", "AoaSsa", "PidTuning", "EscTelemetry1To4"),
+    MavDataStream.EXTRA2: ("VfrHud",),
+    MavDataStream.EXTRA3: (
+        "Ahrs",
+        "Wind",
+        "Rangefinder",
+        "DistanceSensor",
+        "SystemTime",
+        "TerrainReport",
+        "BatteryStatus",
+        "OpticalFlow",
+        "MagCalReport",
+        "MagCalProgress",
+        "EkfStatusReport",
+        "Vibration",
+    ),
+}
+
+_IDS: Mapping[str, int] = {row[0]: message_id for message_id, row in INDEX.items()}
+
+ARDUPILOT_GROUPS: Mapping[int, int] = {
+    _IDS[name]: group for group, names in _GROUPS.items() for name in names
+}
+"""Message id → MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp."""
+
+_ALSO_STREAMED = (
+    *("ActuatorControlTarget", "ActuatorOutputStatus", "Ahrs2", "Ahrs3", "Altitude", "AttitudeQuaternion"),
+    *(
+        "AttitudeTarget",
+        "Battery2",
+        "EfiStatus",
+    ),
+    *("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "GlobalPositionIntCov", "GpsStatus", "Gps2Raw"),
+    *("HighLatency2", "HighresImu", "HilActuatorControls", "HygrometerSensor", "LocalPositionNedCov"),
+    *("LocalPositionNedSystemGlobalOffset", "ManualControl", "NavControllerOutput", "ObstacleDistance"),
+    *("Odometry", "OpticalFlowRad", "OrbitExecutionStatus", "PositionTargetGlobalInt"),
+    *("PositionTargetLocalNed", "RawRpm", "ScaledImu", "UtmGlobalPosition", "WaterDepth", "WheelDistance"),
+)
+
+STREAMED = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
+"""Class names of the messages that come in streams, of any autopilot; the others are sent when there is need."""
+
+_KINDS = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
+"""FIRMWARE_VERSION_TYPE: each kind begins at its number."""
+
+
+class AutopilotVersion(Snapshot):
+    """Firmware and hardware of an autopilot.
+
+    ``firmware`` is ``"4.7.0-dev"``, ``number`` its (major, minor, patch) for comparisons, ``git_hash`` the
+    beginning of the firmware's commit or an empty text. ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits;
+    ``uid`` identifies the hardware, 0 when it is not told.
+    """
+
+    firmware: str
+    number: tuple[int, int, int]
+    git_hash: str
+    capabilities: int
+    vendor_id: int
+    product_id: int
+    board_version: int
+    uid: int
+
+    def __str__(self) -> str:
+        return f"{self.firmware} ({self.git_hash})" if self.git_hash else self.firmware
+
+
+def version_text(flight_sw_version: int) -> tuple[str, tuple[int, int, int]]:
+    """Turn ``flight_sw_version`` into a text and its (major, minor, patch): ``("4.6.1-rc", (4, 6, 1))``."""
+    major, minor, patch, kind = flight_sw_version.to_bytes(4, "big")
+    suffix = next(text for begin, text in _KINDS if kind >= begin)
+    return f"{major}.{minor}.{patch}{suffix}", (major, minor, patch)

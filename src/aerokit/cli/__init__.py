@@ -1,5 +1,0 @@
-"""The command line: ``aerokit demo`` and ``aerokit sim``."""
-
-from aerokit.cli.main import main
-
-__all__ = ["main"]

@@ -1,0 +1,1 @@
+"""Several links to the same vehicles: duplicates, the choice of a link, and routes."""

@@ -1,0 +1,143 @@
+"""What numbers in a log of ArduPilot mean: reasons of a mode, errors of a subsystem.
+
+From ``ModeReason.h`` and ``AP_Logger.h`` of ArduPilot 4.7.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+__all__ = ["ERRORS", "MODE_REASONS", "readable", "said_by_error"]
+
+MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
+    1: ("radio control", None, False),
+    2: ("ground station", None, False),
+    3: ("radio failsafe", "radio", True),
+    4: ("battery failsafe", "battery", True),
+    5: ("ground station failsafe", "ground station", True),
+    6: ("estimator failsafe", "estimator", True),
+    7: ("GPS glitch", "gps", True),
+    8: ("end of the mission", None, True),
+    9: ("pilot's throttle ended the landing", None, False),
+    10: ("fence breach", "fence", True),
+    11: ("terrain failsafe", "terrain", True),
+    12: ("BRAKE timed out", None, True),
+    13: ("flip complete", None, True),
+    14: ("avoidance", "avoidance", True),
+    15: ("end of the avoidance", None, True),
+    16: ("throw complete", None, True),
+    17: ("termination", "termination", True),
+    18: ("toy mode", None, False),
+    19: ("crash failsafe", "crash", True),
+    20: ("soaring: motor runs", None, True),
+    21: ("soaring: thermal found", None, True),
+    22: ("soaring: thermal lost", None, True),
+    23: ("transition failed", "transition", True),
+    24: ("take-off failed", "take-off", True),
+    25: ("failsafe", "general", True),
+    26: ("initialised", None, True),
+    27: ("surface reached", None, True),
+    28: ("bad depth", "depth", True),
+    29: ("leak failsafe", "leak", True),
+    30: ("servo test", None, None),
+    31: ("start-up", None, True),
+    32: ("script", None, None),
+    33: ("mode not available", None, True),
+    34: ("autorotation", None, True),
+    35: ("end of the autorotation", None, True),
+    36: ("soaring: too high", None, True),
+    37: ("soaring: too low", None, True),
+    38: ("soaring: drifted too far", None, True),
+    39: ("return complete, landing", None, True),
+    40: ("return complete, landing", None, True),
+    41: ("mission command", None, True),
+    42: ("telemetry of the radio control", None, False),
+    43: ("back to the mode before the fence breach", None, True),
+    44: ("QRTL in the place of RTL", None, True),
+    45: ("end of AUTO RTL", None, True),
+    46: ("height for landing reached", None, True),
+    47: ("loiter height in a VTOL mode", None, True),
+    48: ("end of the radio failsafe", None, True),
+    49: ("QLAND in the place of RTL", None, True),
+    50: ("dead-reckoning failsafe", "estimator", True),
+    51: ("failsafe of the TAKEOFF mode", "take-off", True),
+    52: ("order by DDS", None, False),
+    53: ("auxiliary switch", None, False),
+    54: ("automatic landing", None, True),
+    55: ("fence was enabled again", None, True),
+}
+"""Number → in words, kind of failsafe if it is one, whether the autopilot did it by itself."""
+
+ERRORS: Mapping[int, tuple[str, str]] = {
+    1: ("general", "main loop"),
+    2: ("radio", "receiver of the radio control"),
+    3: ("compass", "compass"),
+    5: ("radio", "radio failsafe"),
+    6: ("battery", "battery failsafe"),
+    8: ("ground station", "ground station failsafe"),
+    9: ("fence", "fence"),
+    10: ("mode", "change of the mode"),
+    11: ("gps", "GPS"),
+    12: ("crash", "crash check"),
+    13: ("mode", "flip"),
+    15: ("general", "parachute"),
+    16: ("estimator", "check of the estimator"),
+    17: ("estimator", "estimator failsafe"),
+    18: ("general", "barometer"),
+    19: ("general", "processor"),
+    20: ("avoidance", "avoidance of aircraft"),
+    21: ("terrain", "terrain data"),
+    22: ("general", "navigation"),
+    23: ("terrain", "terrain failsafe"),
+    24: ("estimator", "another estimator took over"),
+    25: ("thrust", "thrust loss"),
+    26: ("general", "sensors"),
+    27: ("leak", "leak"),
+    28: ("general", "pilot's input"),
+    29: ("vibration", "vibration failsafe"),
+    30: ("general", "internal error"),
+    31: ("estimator", "dead reckoning"),
+}
+"""Subsystem → kind of failsafe, in words."""
+
+_CODES: Mapping[tuple[int, int], str] = {
+    (2, 2): "its frames come late",
+    (11, 2): "glitch",
+    (12, 1): "crash into the ground",
+    (12, 2): "lost control",
+    (16, 2): "variances are too great",
+    (18, 2): "glitch",
+}
+
+_FENCES = {
+    1: "above the greatest height",
+    2: "outside the circle",
+    4: "outside a polygon",
+    8: "below the least height",
+}
+"""AC_FENCE_TYPE bits, which the error code of the fence is made of."""
+
+
+def said_by_error(subsystem: int, code: int, text: str) -> str:
+    """An ERR message in words."""
+    if subsystem == 10:
+        return f"mode {code} was refused"
+    if subsystem == 24:
+        return f"{text}: number {code}"
+    if subsystem == 9:
+        return f"{text}: {' and '.join(words for bit, words in _FENCES.items() if code & bit)}"
+    told = _CODES.get((subsystem, code))
+    return f"{text}: {told}" if told else text
+
+
+_CONTROL = re.compile(
+    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # colours and the like (ECMA-48, CSI)
+    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"  # titles of windows (OSC)
+    r"|[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # any other control character but tab and new line
+)
+
+
+def readable(text: str) -> str:
+    """``text`` without what only a terminal obeys, and without white space around it: PX4 ends texts with a tab."""
+    return _CONTROL.sub("", text).strip()

@@ -1,0 +1,339 @@
+"""A ``.bin`` of ArduPilot → `Flight`: pymavlink finds the rows; only the columns that are wanted are read."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+from aerokit.autopilots.ardupilot import ardupilot_for
+from aerokit.errors import FileFormatError
+from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, readable, said_by_error
+from aerokit.logs.flights.columns import Plane
+from aerokit.logs.flights.flight import Said, Sign, Waypoint
+from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
+from aerokit.mavlink.enums import MavType
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from aerokit.logs.flights.flight import Flight
+
+__all__ = ["read_bin_flight"]
+
+NAN = math.nan
+_CHUNK = 1 << 14
+_NO_PERCENT = 255
+"""A battery that does not know how much is left (AP_BattMonitor_Logging.cpp writes its -1 as a byte)."""
+_FIRMWARES = {
+    "ArduCopter": MavType.QUADROTOR,
+    "ArduPlane": MavType.FIXED_WING,
+    "ArduRover": MavType.GROUND_ROVER,
+    "Rover": MavType.GROUND_ROVER,
+    "ArduSub": MavType.SUBMARINE,
+    "AntennaTracker": MavType.ANTENNA_TRACKER,
+    "Blimp": MavType.AIRSHIP,
+}
+_ARMED, _DISARMED = 10, 11  # events, of logs that have no ARM
+_HOME = 1
+_NOWHERE_DEG = 0.01
+"""So near to 0° N 0° E: an estimator that does not know its place yet."""
+_SHARE_OF_SEARCH = 0.3  # of all the work
+
+
+def read_bin_flight(flight: Flight, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
+    """Fill a flight from its file.
+
+    Raises:
+        FileFormatError: it is no log of ArduPilot, or one from before 2015.
+    """
+    size = flight.path.stat().st_size
+    reader = opened_bin(flight.path, lambda percent: on_bytes(round(size * _SHARE_OF_SEARCH * percent / 100)))
+    try:
+        _Reader(flight, _Tables(reader)).read(
+            lambda share: on_bytes(round(size * (_SHARE_OF_SEARCH + (1 - _SHARE_OF_SEARCH) * share)))
+        )
+    finally:
+        close_bin(reader)
+
+
+class _Tables:
+    """The tables of a log, by name."""
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+        self.began_us = self._first_time()
+
+    @property
+    def unix_at_0(self) -> float:
+        """UTC when the clock of the log was 0; 0 where no receiver told the time."""
+        return float(getattr(self._reader.clock, "timebase", 0.0) or 0.0)
+
+    def has(self, table: str, *columns: str) -> bool:
+        """Whether there is such a table with these columns, and rows in it."""
+        number = self._reader.name_to_id.get(table)
+        if number is None or not len(self._reader.offsets[number]):
+            return False
+        return {"TimeUS", *columns} <= set(self._reader.formats[number].columns)
+
+    def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
+        """Seconds since the log began, then the values of the columns; nothing if the table or one of them is missing.
+
+        Texts are ``str``, numbers in the unit of the table.
+        """
+        for chunk in self._chunks(table, columns):
+            yield from zip(*chunk, strict=True)
+
+    def columns(self, table: str, *columns: str) -> list[list[Any]]:
+        """The same by columns."""
+        found: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
+        for chunk in self._chunks(table, columns):
+            for whole, part in zip(found, chunk, strict=True):
+                whole.extend(part)
+        return found
+
+    def _chunks(self, table: str, columns: Sequence[str]) -> Iterator[list[list[Any]]]:
+        if not self.has(table, *columns):
+            return
+        reader = self._reader
+        made = reader.formats[reader.name_to_id[table]]
+        wanted = ("TimeUS", *columns)
+        places = [made.columns.index(name) for name in wanted]
+        unpack = struct.Struct(_pattern(made, places)).unpack_from
+        order = [sorted(places).index(place) for place in places]
+        scales = [made.msg_mults[place] for place in places]
+        data, offsets = reader.data_map, reader.offsets[made.type]
+        last, began = len(data) - made.len, self.began_us
+        for begin in range(0, len(offsets), _CHUNK):
+            rows = [unpack(data, at + 3) for at in offsets[begin : begin + _CHUNK] if at <= last]
+            if not rows:
+                continue
+            parts = list(zip(*rows, strict=True))
+            chunk = [_scaled(parts[i], scale) for i, scale in zip(order, scales, strict=True)]
+            chunk[0] = [(time - began) / 1e6 for time in chunk[0]]
+            yield chunk
+
+    def _first_time(self) -> int:
+        """Of the rows at the beginning of each table the earliest: tables begin at different times."""
+        self.began_us = 0
+        reader, found = self._reader, []
+        for number in reader.name_to_id.values():
+            offsets = reader.offsets[number]
+            if not len(offsets) or "TimeUS" not in reader.formats[number].columns:
+                continue
+            made = reader.formats[number]
+            place = made.columns.index("TimeUS")
+            if made.format[place] == "Q" and offsets[0] + made.len <= len(reader.data_map):
+                pattern = _pattern(made, [place])
+                found.append((offsets[0], struct.unpack_from(pattern, reader.data_map, offsets[0] + 3)[0]))
+        if not found:
+            raise FileFormatError(
+                f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
+            )
+        return int(min(found)[1])  # of the first row of the file: a damaged one may claim any time
+
+
+def _pattern(made: Any, places: Sequence[int]) -> str:
+    """The rows' layout for struct, the columns that nobody wants as padding."""
+    codes, at = [], 1  # behind "<"
+    text = made.msg_struct
+    while at < len(text):
+        end = at
+        while text[end].isdigit():
+            end += 1
+        codes.append(text[at : end + 1])
+        at = end + 1
+    padded = [
+        code if place in places else f"{struct.calcsize('<' + code)}x" for place, code in enumerate(codes)
+    ]
+    return "<" + "".join(padded)
+
+
+def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
+    if values and isinstance(values[0], bytes):
+        return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
+    if scale is None:
+        return list(values)
+    if 0 < scale < 1:
+        divisor = round(1 / scale)
+        return [value / divisor for value in values]
+    return [value * scale for value in values]
+
+
+def _wrapped(angles: Sequence[float]) -> list[float]:
+    """From -180 to 180 degrees."""
+    return [(angle + 180) % 360 - 180 for angle in angles]
+
+
+class _Reader:
+    def __init__(self, flight: Flight, tables: _Tables) -> None:
+        self._flight, self._tables = flight, tables
+
+    def read(self, on_share: Callable[[float], object]) -> None:
+        flight, tables = self._flight, self._tables
+        flight.autopilot = "ArduPilot"
+        flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6
+        steps = (
+            *(self._texts, self._modes, self._armed, self._parameters, self._mission, self._home),
+            *(self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries),
+            *(self._gps, self._vibration, self._estimator, self._radio, self._errors),
+        )
+        for number, step in enumerate(steps):
+            step()
+            on_share((number + 1) / len(steps))
+        columns = (flight.track, flight.attitude, flight.vibration, *flight.batteries.values())
+        ends = [each.times[-1] for each in columns if len(each)]
+        ends += [flight.texts[-1].time_s] if flight.texts else []
+        flight.ends_at = flight.begins_at + max(ends, default=0.0)
+        if not tables.unix_at_0:
+            flight.notes.append(
+                "no satellite receiver told the time: times count from the start of the controller"
+            )
+
+    def _texts(self) -> None:
+        flight = self._flight
+        rows = self._tables.rows("MSG", "Message")
+        flight.texts = [Said(time, None, readable(text)) for time, text in rows]
+        names = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
+        told = next(names, "")
+        flight.vehicle = " ".join(told.split(" ")[:2]) or "ArduPilot"
+
+    def _modes(self) -> None:
+        kind = _FIRMWARES.get(self._flight.vehicle.split(" ")[0], MavType.GENERIC)
+        table = ardupilot_for(kind).modes
+        has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
+        for row in self._tables.rows("MODE", "ModeNum", *(("Rsn",) if has_reason else ())):
+            reason, failsafe, by_itself = MODE_REASONS.get(row[2] if has_reason else None, ("", None, None))
+            name = table.name_of(row[1])
+            if self._flight.note_mode(row[0], name, reason, by_itself) and failsafe:
+                self._flight.signs.append(
+                    Sign(row[0], failsafe, f"mode {name}, for this reason: {reason} (MODE)", True)
+                )
+
+    def _armed(self) -> None:
+        if self._tables.has("ARM", "ArmState"):
+            for time, armed in self._tables.rows("ARM", "ArmState"):
+                self._flight.note_armed(time, bool(armed))
+            return
+        for time, event in self._tables.rows("EV", "Id"):
+            if event in (_ARMED, _DISARMED):
+                self._flight.note_armed(time, event == _ARMED)
+
+    def _parameters(self) -> None:
+        for time, name, value in self._tables.rows("PARM", "Name", "Value"):
+            self._flight.note_parameter(time, name, value)
+
+    def _mission(self) -> None:
+        items: dict[int, Waypoint] = {}
+        for row in self._tables.rows("CMD", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
+            _, number, command, latitude, longitude, altitude, frame = row
+            if not latitude and not longitude:
+                latitude = longitude = NAN
+            items[number] = Waypoint(number, command, latitude, longitude, altitude, frame)
+        self._flight.mission = [items[number] for number in sorted(items)]
+
+    def _home(self) -> None:
+        for row in self._tables.rows("ORGN", "Type", "Lat", "Lng", "Alt"):
+            time, kind, latitude, longitude, altitude = row
+            if kind == _HOME:
+                self._flight.note_home(time, latitude, longitude, altitude)
+
+    def _track(self) -> None:
+        track = self._flight.track
+        for time, latitude, longitude, amsl, relative in self._tables.rows(
+            "POS", "Lat", "Lng", "Alt", "RelHomeAlt"
+        ):
+            if abs(latitude) > _NOWHERE_DEG or abs(longitude) > _NOWHERE_DEG:
+                track.add(time, latitude, longitude, amsl, relative)
+        if len(track):
+            return
+        for time, status, latitude, longitude, amsl in self._tables.rows(
+            "GPS", "Status", "Lat", "Lng", "Alt"
+        ):
+            if status >= 3:
+                track.add(time, latitude, longitude, amsl, NAN)
+
+    def _velocity(self) -> None:
+        name = next((each for each in ("XKF1", "NKF1") if self._tables.has(each, "VN", "VE", "VD")), "XKF1")
+        several = self._tables.has(name, "C")
+        for row in self._tables.rows(name, "VN", "VE", "VD", *(("C",) if several else ())):
+            if not several or row[4] == 0:
+                self._flight.velocity.add(*row[:4])
+
+    def _attitude(self) -> None:
+        times, roll, pitch, yaw = self._tables.columns("ATT", "Roll", "Pitch", "Yaw")
+        self._flight.attitude.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
+        times, roll, pitch, yaw = self._tables.columns("ATT", "DesRoll", "DesPitch", "DesYaw")
+        self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
+
+    def _targets(self) -> None:
+        origin = self._origin()
+        north = list(self._tables.rows("PSCN", "TPN", "TVN"))
+        east = list(self._tables.rows("PSCE", "TPE", "TVE"))
+        if origin is not None:
+            plane = Plane(*origin)
+            for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north, east):  # noqa: B905 - cut off at the end
+                self._flight.position_target.add(time, *plane.degrees(north_m, east_m), NAN, NAN)
+                self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
+        self._put_heights(self._tables.rows("CTUN", "DAlt"))
+
+    def _put_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
+        """Put the heights that were wanted beside the places that were wanted, which come at the same rate."""
+        target = self._flight.position_target
+        has_places = len(target) > 0
+        relative = target["altitude_relative_m"]
+        for time, height in heights:
+            if has_places:
+                relative[max(target.index_at(time), 0)] = height
+            else:
+                target.add(time, NAN, NAN, NAN, height)
+
+    def _origin(self) -> tuple[float, float] | None:
+        places = self._tables.rows("ORGN", "Type", "Lat", "Lng")
+        return next(((lat, lon) for _, kind, lat, lon in places if kind != _HOME and (lat or lon)), None)
+
+    def _air(self) -> None:
+        for time, speed in self._tables.rows("ARSP", "Airspeed"):
+            self._flight.air.add(time, speed, NAN)
+
+    def _batteries(self) -> None:
+        instance = "Inst" if self._tables.has("BAT", "Inst") else "Instance"
+        percent = ("RemPct",) if self._tables.has("BAT", "RemPct") else ()
+        for row in self._tables.rows("BAT", instance, "Volt", "Curr", "CurrTot", *percent):
+            is_known = percent and row[5] != _NO_PERCENT
+            self._flight.battery(row[1]).add(row[0], *row[2:5], row[5] if is_known else NAN)
+
+    def _gps(self) -> None:
+        accuracy = defaultdict(
+            lambda: NAN, {(at, i): m for at, i, m in self._tables.rows("GPA", "I", "HAcc")}
+        )
+        for time, number, status, satellites, hdop in self._tables.rows(
+            "GPS", "I", "Status", "NSats", "HDop"
+        ):
+            self._flight.receiver(number).add(time, status, satellites, hdop, accuracy[time, number])
+
+    def _vibration(self) -> None:
+        columns = ("VibeX", "VibeY", "VibeZ", "Clip", "IMU")
+        for time, x, y, z, clips, number in self._tables.rows("VIBE", *columns):
+            if number == 0:
+                self._flight.vibration.add(time, x, y, z, clips)
+
+    def _estimator(self) -> None:
+        several = self._tables.has("XKF4", "C", "PI")
+        extra = ("C", "PI") if several else ()
+        name = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
+        for row in self._tables.rows(name, "SV", "SP", "SH", "SM", "SVT", *extra):
+            if not several or row[6] == max(row[7], 0):
+                self._flight.estimator.add(*row[:6])
+
+    def _radio(self) -> None:
+        for row in self._tables.rows("RAD", "RSSI", "RemRSSI", "Noise", "RemNoise"):
+            self._flight.radio.add(*row)
+
+    def _errors(self) -> None:
+        for time, system, code in self._tables.rows("ERR", "Subsys", "ECode"):
+            kind, text = ERRORS.get(system, ("general", f"subsystem {system}"))
+            if code:
+                said = said_by_error(system, code, text)
+                self._flight.signs.append(Sign(time, kind, f"{said} (ERR {system}/{code})"))

@@ -1,0 +1,489 @@
+"""A ``.tlog`` → `Flight`: only the frames that a flight is made of are checked and decoded."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from aerokit.autopilots import Autopilot, autopilot_for, is_armed
+from aerokit.connection.components import is_autopilot
+from aerokit.errors import FileFormatError
+from aerokit.logs.flights.codes import readable
+from aerokit.logs.flights.columns import Columns
+from aerokit.logs.flights.flight import Said, Sign, Waypoint
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavCmd, MavState, MavType
+from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
+from aerokit.mavlink.tlog import read_tlog
+from aerokit.parameters.encoding import value_of
+from aerokit.vehicle.state.equipment import current
+from aerokit.vehicle.state.movement import Attitude
+from aerokit.vehicle.state.status_text import StatusTextAssembler
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.logs.flights.flight import Flight
+    from aerokit.mavlink.message import Message
+
+__all__ = ["read_tlog_flight"]
+
+NAN = math.nan
+_U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
+_NOWHERE_E7 = 100_000
+"""So near to 0° N 0° E: an estimator that does not know its place yet."""
+_HEARTBEAT, _MOST_MISSING = b"\0\0\0", 200
+_AGO_S = 5.0
+"""A mode that follows an order so soon was ordered."""
+_NO_POSITION, _NO_VELOCITY = 0x7, 0x38
+"""Bits of a type mask: these are to be ignored."""
+_ORDERS_OF_MODE = frozenset(
+    (
+        MavCmd.DO_SET_MODE,
+        MavCmd.NAV_RETURN_TO_LAUNCH,
+        MavCmd.NAV_LAND,
+        MavCmd.NAV_TAKEOFF,
+        MavCmd.MISSION_START,
+        MavCmd.DO_REPOSITION,
+        MavCmd.NAV_LOITER_UNLIM,
+    )
+)
+_ALARM = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
+
+
+def read_tlog_flight(flight: Flight, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
+    """Fill a flight from its file; ``system_id`` says whose flight, None: of the first autopilot in it.
+
+    Raises:
+        FileFormatError: there is no autopilot in it.
+    """
+    heartbeat, frame = _first_autopilot(flight, system_id)
+    flight.system_id = frame.system_id
+    _Reader(flight, frame.component_id, heartbeat).read(on_bytes)
+
+
+def _first_autopilot(flight: Flight, system_id: int | None) -> tuple[m.Heartbeat, Frame]:
+    records = 0
+    for _, raw in read_tlog(flight.path):
+        records += 1
+        if (raw[7:10] == b"\0\0\0" if raw[0] == MAGIC_V2 else raw[5] == 0) and _is_right(raw):
+            frame = Frame.parse(raw)
+            message = m.Heartbeat.decode_body(frame.body, frame)
+            if is_autopilot(message) and system_id in (None, frame.system_id):
+                return message, frame
+    what = "no MAVLink messages" if not records else "no heartbeat of an autopilot"
+    whose = "" if system_id is None else f" with system id {system_id}"
+    raise FileFormatError(f"{flight.path} holds {what}{whose}: there is no flight in it")
+
+
+def _is_right(raw: bytes) -> bool:
+    try:
+        frame = Frame.parse(raw)
+        return x25(frame.body + STANDARD.extras[frame.message_id]) == frame.checksum
+    except (KeyError, IndexError, ValueError):
+        return False
+
+
+class _Reader:
+    def __init__(self, flight: Flight, component_id: int, heartbeat: m.Heartbeat) -> None:
+        self._flight = flight
+        self._source = bytes((flight.system_id, component_id))
+        self._autopilot: Autopilot = autopilot_for(heartbeat)
+        flight.autopilot, flight.vehicle = self._autopilot.name, self._autopilot.firmware
+        self._texts = StatusTextAssembler()
+        self._others: set[int] = set()
+        self._capabilities: int | None = None
+        self._ordered_at, self._hears_orders = -math.inf, False
+        self._status = 0
+        self._has_battery_status = False
+        self._place = self._local = (NAN, NAN, NAN)
+        self._relative = NAN
+        self._told_of_breach = False
+        self._where_to = Columns(*flight.position_target.names)
+        self._link = _LinkCounter(flight)
+        self._items: dict[int, Waypoint] = {}
+        of_anybody: dict[type[Message], Callable[[float, Any], None]] = {
+            m.CommandLong: self._order,
+            m.CommandInt: self._order,
+            m.SetMode: self._set_mode,
+            m.MissionItemInt: self._mission_item,
+            m.MissionItem: self._mission_item,
+            m.MissionCount: self._mission_count,
+        }
+        self._of_anybody = {_key(kind): handler for kind, handler in of_anybody.items()}
+        self._of_vehicle = {
+            **self._of_anybody,
+            **{_key(kind): handler for kind, handler in self._handlers().items()},
+        }
+
+    def read(self, on_bytes: Callable[[int], object]) -> None:
+        # This runs for every message of a log, of which there are millions: most leave it undecoded.
+        flight, source, link = self._flight, self._source, self._link
+        of_vehicle, of_anybody = self._of_vehicle, self._of_anybody
+        damaged = count = came = 0
+        expected, next_second = -1, 0.0
+        begins_at = ends_at = 0.0
+        with flight.path.open("rb") as file:
+            for unix_s, raw in read_tlog(file):
+                if not count:
+                    begins_at = unix_s
+                count += 1
+                if not count & 0xFFFF:
+                    on_bytes(file.tell())
+                if unix_s > ends_at:
+                    ends_at = unix_s
+                if raw[0] == MAGIC_V2:
+                    kind, sender, sequence = raw[7:10], raw[5:7], raw[4]
+                else:
+                    kind, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
+                if sender == source:
+                    came += 1
+                    if sequence != expected or unix_s >= next_second:
+                        next_second = begins_at + link.count(unix_s - begins_at, sequence, expected, came)
+                        came = 0
+                    expected = (sequence + 1) & 0xFF
+                    if kind not in of_vehicle:
+                        continue
+                    handle = of_vehicle[kind]
+                elif kind in of_anybody:
+                    handle = of_anybody[kind]
+                else:
+                    if kind == _HEARTBEAT:
+                        self._other(unix_s - begins_at, sender[0], raw)
+                    continue
+                message = _decoded(raw, unix_s)
+                if message is None:
+                    damaged += 1
+                else:
+                    handle(unix_s - begins_at, message)
+            on_bytes(file.tell())
+        flight.begins_at, flight.ends_at = begins_at, ends_at
+        link.end(came)
+        self._end(damaged)
+
+    def _end(self, damaged: int) -> None:
+        flight = self._flight
+        self._take_texts(flight.duration_s, self._texts.expire(math.inf))
+        self._take_destinations()
+        flight.mission = [self._items[number] for number in sorted(self._items)]
+        if damaged:
+            flight.notes.append(f"{damaged} messages are damaged and were left out")
+        if self._others:
+            who = ", ".join(map(str, sorted(self._others)))
+            flight.notes.append(
+                f"this is system {flight.system_id}; the log has other vehicles, too: system {who}"
+            )
+        if not self._hears_orders:
+            flight.notes.append("the log has no orders to the vehicle: who changed the mode is not known")
+
+    def _take_destinations(self) -> None:
+        """Where it was to go in the end (POSITION_TARGET_GLOBAL_INT), if nothing tells where it was to be meanwhile."""
+        target, where_to = self._flight.position_target, self._where_to
+        if target.has("latitude_deg"):
+            return
+        has_heights = target.has()
+        rows = [
+            (time, *values)
+            for time, *values in zip(target.times, *map(target.__getitem__, target), strict=True)
+        ]
+        for time, latitude, longitude, amsl, relative in zip(
+            where_to.times, *map(where_to.__getitem__, where_to), strict=True
+        ):
+            heights = (NAN, NAN) if has_heights else (amsl, relative)
+            rows.append((time, latitude, longitude, *heights))
+        self._flight.position_target = made = Columns(*target.names)
+        for row in sorted(rows, key=lambda row: row[0]):
+            made.add(*row)
+
+    def _handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
+        flight = self._flight
+        return {
+            m.Heartbeat: self._heartbeat,
+            m.GlobalPositionInt: self._global_position,
+            m.LocalPositionNed: self._local_position,
+            m.Attitude: lambda t, x: flight.attitude.add(
+                t, math.degrees(x.roll), math.degrees(x.pitch), math.degrees(x.yaw)
+            ),
+            m.VfrHud: lambda t, x: flight.air.add(t, x.airspeed, x.throttle),
+            m.Statustext: lambda t, x: self._take_texts(t, self._texts.receive(x, t)),
+            m.SysStatus: self._sys_status,
+            m.BatteryStatus: self._battery_status,
+            m.GpsRawInt: lambda t, x: self._gps(t, x, 0),
+            m.Gps2Raw: lambda t, x: self._gps(t, x, 1),
+            m.Vibration: lambda t, x: flight.vibration.add(
+                t, x.vibration_x, x.vibration_y, x.vibration_z, x.clipping_0 + x.clipping_1 + x.clipping_2
+            ),
+            m.EkfStatusReport: lambda t, x: flight.estimator.add(
+                t,
+                x.velocity_variance,
+                x.pos_horiz_variance,
+                x.pos_vert_variance,
+                x.compass_variance,
+                max(x.terrain_alt_variance, x.airspeed_variance),
+            ),
+            m.EstimatorStatus: lambda t, x: flight.estimator.add(
+                t,
+                x.vel_ratio,
+                x.pos_horiz_ratio,
+                x.pos_vert_ratio,
+                x.mag_ratio,
+                max(x.hagl_ratio, x.tas_ratio),
+            ),
+            m.NavControllerOutput: self._navigation,
+            m.AttitudeTarget: self._attitude_target,
+            m.PositionTargetGlobalInt: self._global_target,
+            m.PositionTargetLocalNed: self._local_target_told,
+            m.RadioStatus: self._radio,
+            m.Radio: self._radio,
+            m.ParamValue: self._parameter,
+            m.AutopilotVersion: self._version,
+            m.HomePosition: self._home,
+            m.FenceStatus: self._fence,
+        }
+
+    # ---------------------------------------------------------------------------- state and orders
+
+    def _heartbeat(self, time_s: float, message: m.Heartbeat) -> None:
+        flight = self._flight
+        ordered = time_s - self._ordered_at < _AGO_S
+        flight.note_mode(
+            time_s,
+            self._autopilot.mode_of(message).name,
+            "ordered" if ordered else "",
+            False if ordered else None,
+        )
+        armed = is_armed(message.base_mode)
+        flight.note_armed(time_s, armed)
+        status = message.system_status
+        if armed and status in _ALARM and status != self._status:
+            name = _ALARM[MavState(status)]
+            flight.signs.append(Sign(time_s, "general", f"the vehicle calls its state {name} (HEARTBEAT)"))
+        self._status = status
+
+    def _other(self, time_s: float, system_id: int, raw: bytes) -> None:
+        kind = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # a damaged one may be shorter
+        if kind == bytes((MavType.GCS,)):
+            self._flight.station.append(time_s)
+            return
+        if system_id != self._flight.system_id and system_id not in self._others and _is_right(raw):
+            frame = Frame.parse(raw)
+            if is_autopilot(m.Heartbeat.decode_body(frame.body, frame)):
+                self._others.add(system_id)
+
+    def _order(self, time_s: float, message: m.CommandLong | m.CommandInt) -> None:
+        if message.target_system in (0, self._flight.system_id):
+            self._hears_orders = True
+            if message.command in _ORDERS_OF_MODE:
+                self._mode_was_ordered(time_s)
+
+    def _set_mode(self, time_s: float, message: m.SetMode) -> None:
+        if message.target_system in (0, self._flight.system_id):
+            self._mode_was_ordered(time_s)
+
+    def _mode_was_ordered(self, time_s: float) -> None:
+        self._ordered_at, self._hears_orders = time_s, True
+
+    def _take_texts(self, time_s: float, texts: list[Any]) -> None:
+        self._flight.texts += [Said(time_s, text.severity, readable(text.text)) for text in texts]
+
+    def _parameter(self, time_s: float, message: m.ParamValue) -> None:
+        bytewise = self._autopilot.encodes_parameters_bytewise(self._capabilities)
+        if message.param_id and not message.param_id.startswith("_HASH"):
+            self._flight.note_parameter(time_s, message.param_id, float(value_of(message, bytewise)))
+
+    def _version(self, time_s: float, message: m.AutopilotVersion) -> None:
+        self._capabilities = message.capabilities
+        number = message.flight_sw_version
+        if number:
+            parts = ".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8))
+            self._flight.vehicle = f"{self._autopilot.firmware} {parts}"
+
+    def _home(self, time_s: float, message: m.HomePosition) -> None:
+        self._flight.note_home(
+            time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3
+        )
+
+    def _mission_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
+        if not self._is_our_mission(message):
+            return
+        scale = _E7 if isinstance(message, m.MissionItemInt) else 1.0
+        has_place = bool(message.x or message.y)
+        self._items[message.seq] = Waypoint(
+            message.seq,
+            message.command,
+            message.x / scale if has_place else NAN,
+            message.y / scale if has_place else NAN,
+            message.z,
+            message.frame,
+        )
+
+    def _mission_count(self, time_s: float, message: m.MissionCount) -> None:
+        """What follows has so many items: those behind are of a mission before."""
+        if self._is_our_mission(message):
+            self._items = {number: item for number, item in self._items.items() if number < message.count}
+
+    def _is_our_mission(self, message: m.MissionItemInt | m.MissionItem | m.MissionCount) -> bool:
+        """Whether it is told by this vehicle or to it: a log may have those of others, and fences."""
+        frame, ours = message.received_frame, self._flight.system_id
+        sender = None if frame is None else frame.system_id
+        return message.mission_type == 0 and ours in (sender, message.target_system)
+
+    def _fence(self, time_s: float, message: m.FenceStatus) -> None:
+        if message.breach_status and not self._told_of_breach:
+            self._flight.signs.append(Sign(time_s, "fence", "outside the fence (FENCE_STATUS)"))
+        self._told_of_breach = bool(message.breach_status)
+
+    # ------------------------------------------------------------------------------------ movement
+
+    def _global_position(self, time_s: float, message: m.GlobalPositionInt) -> None:
+        if abs(message.lat) < _NOWHERE_E7 and abs(message.lon) < _NOWHERE_E7:
+            return
+        if abs(message.lat) > 90 * _E7 or abs(message.lon) > 180 * _E7:
+            return
+        self._place = message.lat / _E7, message.lon / _E7, message.alt / 1e3
+        self._relative = message.relative_alt / 1e3
+        self._flight.track.add(time_s, *self._place, self._relative)
+        self._flight.velocity.add(time_s, message.vx / 100, message.vy / 100, message.vz / 100)
+
+    def _local_position(self, time_s: float, message: m.LocalPositionNed) -> None:
+        self._local = message.x, message.y, message.z
+
+    def _navigation(self, time_s: float, message: m.NavControllerOutput) -> None:
+        if self._autopilot.name == "ArduPilot":
+            bearing = message.nav_bearing  # of fixed wings where they are to go; copters are told no yaw here
+            self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
+            if -180 <= bearing <= 360 and self._relative == self._relative:
+                self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative + message.alt_error)
+
+    def _attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:
+        if not message.type_mask & 0x80 and all(math.isfinite(part) for part in message.q):
+            w, x, y, z = message.q
+            wanted = Attitude.from_quaternion(w, x, y, z, (None, None, None))
+            self._flight.attitude_target.add(time_s, wanted.roll_deg, wanted.pitch_deg, wanted.yaw_deg)
+
+    def _global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:
+        if message.type_mask & _NO_POSITION != _NO_POSITION and (message.lat_int or message.lon_int):
+            is_amsl = message.coordinate_frame in (0, 5)
+            self._where_to.add(
+                time_s,
+                message.lat_int / _E7,
+                message.lon_int / _E7,
+                message.alt if is_amsl else NAN,
+                NAN if is_amsl else message.alt,
+            )
+        self._velocity_target(time_s, message)
+
+    def _local_target_told(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
+        target, here = (message.x, message.y, message.z), self._local
+        if message.type_mask & _NO_POSITION != _NO_POSITION:
+            north, east, down = (there - mine for there, mine in zip(target, here, strict=True))
+            latitude, longitude, amsl = self._place
+            east_per_degree = _METRES_PER_DEGREE * math.cos(math.radians(latitude))
+            self._flight.position_target.add(
+                time_s,
+                latitude + north / _METRES_PER_DEGREE,
+                longitude + east / east_per_degree,
+                amsl - down,
+                self._relative - down,
+            )
+        self._velocity_target(time_s, message)
+
+    def _velocity_target(
+        self, time_s: float, message: m.PositionTargetLocalNed | m.PositionTargetGlobalInt
+    ) -> None:
+        if message.type_mask & _NO_VELOCITY != _NO_VELOCITY:
+            self._flight.velocity_target.add(time_s, message.vx, message.vy, message.vz)
+
+    # ----------------------------------------------------------------------------------- equipment
+
+    def _sys_status(self, time_s: float, message: m.SysStatus) -> None:
+        if self._has_battery_status or message.voltage_battery in (0, _U16):
+            return
+        ampere = current(message.current_battery, self._autopilot)
+        left = NAN if message.battery_remaining < 0 else message.battery_remaining
+        self._flight.battery(0).add(
+            time_s, message.voltage_battery / 1e3, NAN if ampere is None else ampere, NAN, left
+        )
+
+    def _battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
+        cells = [mv for mv in message.voltages if mv != _U16]
+        cells += [mv for mv in message.voltages_ext if mv not in (0, _U16)]
+        if message.id == 0 and cells and not self._has_battery_status:
+            self._has_battery_status = True
+        ampere = current(message.current_battery, self._autopilot)
+        self._flight.battery(message.id).add(
+            time_s,
+            sum(cells) / 1e3 if cells else NAN,
+            NAN if ampere is None else ampere,
+            message.current_consumed if message.current_consumed >= 0 else NAN,
+            message.battery_remaining if message.battery_remaining >= 0 else NAN,
+        )
+
+    def _gps(self, time_s: float, message: m.GpsRawInt | m.Gps2Raw, number: int) -> None:
+        self._flight.receiver(number).add(
+            time_s,
+            message.fix_type,
+            NAN if message.satellites_visible == 0xFF else message.satellites_visible,
+            NAN if message.eph == _U16 else message.eph / 100,
+            message.h_acc / 1e3 if message.h_acc else NAN,
+        )
+
+    def _radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
+        self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
+
+
+def _key(kind: type[Message]) -> bytes:
+    """A message id as it is in a frame."""
+    return kind.ID.to_bytes(3, "little")
+
+
+def _decoded(raw: bytes, unix_s: float) -> Message | None:
+    """The message of a record; None when its checksum is wrong."""
+    if raw[0] == MAGIC_V2 and not raw[2]:
+        frame = Frame()  # as `Frame.parse`, and quicker
+        frame.body, frame.checksum = raw[1:-2], raw[-2] | raw[-1] << 8
+        frame.system_id, frame.component_id = raw[5], raw[6]
+        frame.message_id, frame.received_at = raw[7] | raw[8] << 8 | raw[9] << 16, unix_s
+    else:
+        frame = Frame.parse(raw, unix_s)
+    if x25(frame.body + STANDARD.extras[frame.message_id]) != frame.checksum:
+        return None
+    return STANDARD.decode(frame)
+
+
+class _LinkCounter:
+    """How many frames of the vehicle came each second, and how many did not, by their sequence numbers."""
+
+    def __init__(self, flight: Flight) -> None:
+        self._columns = flight.link
+        self._second = 0
+        self._came = self._lost = 0
+
+    def count(self, time_s: float, sequence: int, expected: int, came: int) -> float:
+        """Take frames that came, the last of them out of order or in another second; when the next second begins."""
+        missing = (sequence - expected) & 0xFF if expected >= 0 else 0
+        if missing > _MOST_MISSING:  # an older one, or a second way: nothing is missing for that
+            missing = 0
+        if time_s >= self._second + 1:
+            self._came += came - 1
+            came = 1
+            if int(time_s) - self._second > 1:  # whole seconds of silence count as such
+                missing = 0
+            self._tell(int(time_s))
+        self._came += came
+        self._lost += missing
+        return self._second + 1
+
+    def end(self, came: int) -> None:
+        """Take the last ones."""
+        self._came += came
+        self._tell(self._second + 1)
+
+    def _tell(self, second: int) -> None:
+        sent = self._came + self._lost
+        self._columns.add(self._second, 100 * self._lost / sent if sent else NAN, self._came)
+        if second - self._second > 1:  # nothing came for a while
+            self._columns.add(self._second + 1, 100.0, 0)
+            self._columns.add(second - 1, 100.0, 0)
+        self._second, self._came, self._lost = second, 0, 0

@@ -1,0 +1,429 @@
+"""A ``.ulg`` of PX4 → `Flight`: pyulog reads the topics that are wanted."""
+
+from __future__ import annotations
+
+import math
+import sys
+from array import array
+from contextlib import redirect_stdout
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from aerokit.autopilots.px4 import Px4
+from aerokit.errors import FileFormatError
+from aerokit.logs.flights.codes import readable
+from aerokit.logs.flights.columns import Plane
+from aerokit.logs.flights.flight import Said, Sign
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from aerokit.logs.flights.columns import Columns
+    from aerokit.logs.flights.flight import Flight
+
+__all__ = ["read_ulog_flight"]
+
+NAN = math.nan
+_TOPICS = (
+    *("vehicle_status", "failsafe_flags", "vehicle_global_position", "vehicle_local_position"),
+    *("vehicle_attitude", "vehicle_attitude_setpoint", "vehicle_local_position_setpoint", "battery_status"),
+    *("vehicle_gps_position", "sensor_gps", "estimator_status", "vehicle_imu_status", "telemetry_status"),
+    *("home_position", "airspeed_validated", "radio_status"),
+)
+_ARMED = 2
+_NAV_STATES = {
+    0: "MANUAL",
+    1: "ALTCTL",
+    2: "POSCTL",
+    3: "MISSION",
+    4: "LOITER",
+    5: "RTL",
+    6: "POSITION_SLOW",
+    10: "ACRO",
+    12: "DESCEND",
+    13: "TERMINATION",
+    14: "OFFBOARD",
+    15: "STABILIZED",
+    17: "TAKEOFF",
+    18: "LAND",
+    19: "FOLLOWME",
+    20: "PRECLAND",
+    21: "ORBIT",
+    22: "VTOL_TAKEOFF",
+    **{22 + number: f"EXTERNAL{number}" for number in range(1, 9)},
+}
+"""``nav_state`` of vehicle_status → the mode's name as everywhere here (VehicleStatus.msg)."""
+_FLAGS = {
+    "manual_control_signal_lost": ("radio", "the signal of the radio control is lost"),
+    "gcs_connection_lost": ("ground station", "the connection to the ground station is lost"),
+    "offboard_control_signal_lost": ("offboard", "no set-points come"),
+    "geofence_breached": ("fence", "outside the fence"),
+    "battery_unhealthy": ("battery", "the battery is not healthy"),
+    "battery_low_remaining_time": ("battery", "the battery will not last much longer"),
+    "global_position_invalid": ("estimator", "the global position is not valid"),
+    "local_position_invalid": ("estimator", "the local position is not valid"),
+    "attitude_invalid": ("estimator", "the attitude is not valid"),
+    "mission_failure": ("mission", "the mission failed"),
+    "wind_limit_exceeded": ("wind", "the wind is too strong"),
+    "flight_time_limit_exceeded": ("time", "the flight took too long"),
+    "navigator_failure": ("general", "the navigator failed"),
+    "fd_critical_failure": ("crash", "attitude or height beyond their limits"),
+    "fd_motor_failure": ("motor", "a motor failed"),
+    "vtol_fixed_wing_system_failure": ("transition", "failure as a fixed wing"),
+}
+"""A flag of failsafe_flags → kind, in words (FailsafeFlags.msg)."""
+_WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
+_SEARCHING = 0.9  # of all the work is pyulog's
+
+
+def read_ulog_flight(flight: Flight, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
+    """Fill a flight from its file.
+
+    Raises:
+        FileFormatError: it is no log of PX4.
+        ModuleNotFoundError: pyulog is not installed.
+    """
+    core = import_module("pyulog")
+    try:
+        # It prints what is damaged, where our answers may go to.
+        with flight.path.open("rb") as file, redirect_stdout(sys.stderr):
+            log = core.ULog(_Watched(file, flight.path.stat().st_size, on_bytes), list(_TOPICS))
+    except Exception as error:  # whatever it raises on a file that is none
+        raise FileFormatError(f"{flight.path} is no log of PX4: {error}") from error
+    if not log.data_list and not log.logged_messages:
+        raise FileFormatError(f"{flight.path} holds no data of a flight")
+    if log.file_corruption:
+        flight.notes.append("the log is damaged: what could be read is shown")
+    if log.dropouts:
+        lost_s = sum(each.duration for each in log.dropouts) / 1e3
+        flight.notes.append(
+            f"{len(log.dropouts)} gaps where the logger was too slow, {lost_s:.1f} s together"
+        )
+    _Reader(flight, log).read()
+
+
+class _Watched:
+    """A file that tells how far it was read."""
+
+    def __init__(self, file: Any, size: int, on_bytes: Callable[[int], object]) -> None:
+        self._read, self._seek, self._tell, self._on_bytes = file.read, file.seek, file.tell, on_bytes
+        self._calls = 0
+        self.close = file.close
+        self._size = size
+
+    def read(self, count: int = -1) -> bytes:
+        self._calls += 1
+        if not self._calls & 0xFFFF:
+            self._on_bytes(round(_SEARCHING * self._tell()))
+        data: bytes = self._read(count)
+        return data
+
+    def seek(self, *place: int) -> int:
+        return int(self._seek(*place))
+
+    def tell(self) -> int:
+        return int(self._tell())
+
+
+class _Topic:
+    """The columns of one instance of a topic, with times in seconds since the log began."""
+
+    def __init__(self, data: dict[str, Any], began_us: int) -> None:
+        self._data = data
+        self.times: list[float] = ((data["timestamp"].astype("int64") - began_us) / 1e6).tolist()
+
+    def __contains__(self, field: str) -> bool:
+        return field in self._data
+
+    def array(self, *fields: str) -> Any:
+        """The column of the first of these fields that there is, as numpy has it; NaN without any."""
+        for field in fields:
+            if field in self._data:
+                return self._data[field].astype("float64")
+        return self._data["timestamp"] * NAN
+
+    def rows(self, *fields: str) -> Iterator[tuple[Any, ...]]:
+        """Times and values, fields that are missing as NaN."""
+        yield from zip(self.times, *(self.array(field).tolist() for field in fields), strict=True)
+
+    def changes(self, field: str) -> Iterator[tuple[float, float]]:
+        """The first value and each other one."""
+        before = None
+        for time_s, value in self.rows(field):
+            if value != before:
+                yield time_s, value
+                before = value
+
+
+class _Reader:
+    def __init__(self, flight: Flight, log: Any) -> None:
+        self._flight, self._log = flight, log
+        self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
+        firsts = [int(data.data["timestamp"][0]) for data in self._data]
+        self._began_us = min([int(log.start_timestamp), *firsts]) if firsts else int(log.start_timestamp)
+
+    def read(self) -> None:
+        flight, log = self._flight, self._log
+        flight.autopilot = "PX4"
+        flight.vehicle = _version(log)
+        utc = _utc_at_0(log)
+        flight.begins_at = utc + self._began_us / 1e6
+        flight.ends_at = utc + log.last_timestamp / 1e6
+        if not utc:
+            flight.notes.append(
+                "no satellite receiver told the time: times count from the start of the controller"
+            )
+        flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
+        for severity, at, text in (
+            (int(each.log_level) - 48, each.timestamp, each.message) for each in log.logged_messages
+        ):
+            # The level is the kernel's, as a character; MAVLink's severities have the same numbers.
+            flight.texts.append(Said(self._time(at), max(0, min(7, severity)), readable(str(text))))
+        parameters = [(log.start_timestamp, *each) for each in log.initial_parameters.items()]
+        for at, name, value in (*parameters, *log.changed_parameters):
+            if isinstance(value, (int, float)):
+                flight.note_parameter(self._time(at), str(name), float(value))
+        self._status()
+        self._movement()
+        self._targets()
+        self._equipment()
+
+    def _time(self, at_us: int) -> float:
+        return max((int(at_us) - self._began_us) / 1e6, 0.0)
+
+    def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
+        """The instances of the first of these topics that there is, with their numbers."""
+        for name in names:
+            found = [each for each in self._data if each.name == name]
+            if found:
+                return [(each.multi_id, _Topic(each.data, self._began_us)) for each in found]
+        return []
+
+    def _topic(self, *names: str) -> _Topic | None:
+        return next((topic for _, topic in self._topics(*names)), None)
+
+    # -------------------------------------------------------------------------------------- status
+
+    def _status(self) -> None:
+        flight, status = self._flight, self._topic("vehicle_status")
+        if status is not None:
+            self._modes(status)
+            for time_s, state in status.changes("arming_state"):
+                flight.note_armed(time_s, state == _ARMED)
+            for time_s, failsafe in status.changes("failsafe"):
+                if failsafe == 1:
+                    flight.signs.append(
+                        Sign(time_s, "general", "the failsafe acts (vehicle_status.failsafe)", True)
+                    )
+        self._failsafe_flags()
+
+    def _modes(self, status: _Topic) -> None:
+        fields = ("nav_state", "nav_state_user_intention", "failsafe")
+        for time_s, state, wanted, failsafe in status.rows(*fields):
+            name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
+            by_itself = bool(state != wanted) if wanted == wanted else None
+            reason = "failsafe" if failsafe == 1 else "by itself" if by_itself else ""
+            self._flight.note_mode(time_s, name, reason, by_itself)
+
+    def _failsafe_flags(self) -> None:
+        """Only while armed: on the ground many of them are set, and mean nothing."""
+        flight, flags = self._flight, self._topic("failsafe_flags")
+        if flags is None:
+            return
+
+        def is_armed(at: float) -> bool:
+            return any(begin + 1 < at <= end for begin, end in flight.armed)
+
+        for name, (kind, text) in _FLAGS.items():
+            if name in flags:
+                flight.signs += [
+                    Sign(time_s, kind, f"{text} ({name})")
+                    for time_s, value in flags.changes(name)
+                    if value == 1 and is_armed(time_s)
+                ]
+        for time_s, warning in flags.changes("battery_warning"):
+            if warning in _WARNINGS and is_armed(time_s):
+                flight.signs.append(
+                    Sign(time_s, "battery", f"the battery is {_WARNINGS[int(warning)]} (battery_warning)")
+                )
+
+    # ------------------------------------------------------------------------------------ movement
+
+    def _movement(self) -> None:
+        flight = self._flight
+        home = self._topic("home_position")
+        if home is not None:
+            for row in home.rows("lat", "lon", "alt"):
+                flight.note_home(*row)
+        place = self._topic("vehicle_global_position")
+        if place is not None:
+            latitude, longitude, amsl = place.array("lat"), place.array("lon"), place.array("alt")
+            if "lat_lon_valid" in place:
+                latitude[place.array("lat_lon_valid") == 0] = NAN
+                longitude[place.array("lat_lon_valid") == 0] = NAN
+            _extend(
+                flight.track,
+                place.times,
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                altitude_amsl_m=amsl,
+            )
+        else:
+            self._track_of_receiver()
+        local = self._topic("vehicle_local_position")
+        if local is not None:
+            north, east, down = local.array("vx"), local.array("vy"), local.array("vz")
+            _extend(flight.velocity, local.times, north_m_s=north, east_m_s=east, down_m_s=down)
+        self._angles(flight.attitude, self._topic("vehicle_attitude"), "q")
+        air = self._topic("airspeed_validated")
+        if air is not None:
+            speed = air.array("calibrated_airspeed_m_s")
+            _extend(flight.air, air.times, air_speed_m_s=speed)
+
+    def _track_of_receiver(self) -> None:
+        receiver = self._topic("vehicle_gps_position", "sensor_gps")
+        if receiver is not None:
+            old = "lat" in receiver
+            rows = receiver.rows("fix_type", *(("lat", "lon", "alt") if old else _GPS_FIELDS))
+            for time_s, fix, latitude, longitude, amsl in rows:
+                if fix >= 3:
+                    scale, metres = (1e7, 1e3) if old else (1, 1)
+                    self._flight.track.add(time_s, latitude / scale, longitude / scale, amsl / metres, NAN)
+
+    def _angles(self, columns: Columns, topic: _Topic | None, field: str) -> None:
+        if topic is None or f"{field}[0]" not in topic:
+            return
+        numpy = import_module("numpy")
+        w, x, y, z = (topic.array(f"{field}[{number}]") for number in range(4))
+        roll = numpy.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = numpy.arcsin(numpy.clip(2 * (w * y - z * x), -1, 1))
+        yaw = numpy.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        angles = {"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
+        _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
+
+    def _targets(self) -> None:
+        flight = self._flight
+        self._angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
+        wanted, local = self._topic("vehicle_local_position_setpoint"), self._topic("vehicle_local_position")
+        if wanted is None:
+            return
+        _extend(
+            flight.velocity_target,
+            wanted.times,
+            north_m_s=wanted.array("vx"),
+            east_m_s=wanted.array("vy"),
+            down_m_s=wanted.array("vz"),
+        )
+        origin = self._origin(local)
+        if origin is None:
+            return
+        latitude, longitude, amsl = origin
+        plane = Plane(latitude, longitude)
+        _extend(
+            flight.position_target,
+            wanted.times,
+            latitude_deg=latitude + wanted.array("x") / plane.north_m_per_deg,
+            longitude_deg=longitude + wanted.array("y") / plane.east_m_per_deg,
+            altitude_amsl_m=amsl - wanted.array("z"),
+        )
+
+    def _origin(self, local: _Topic | None) -> tuple[float, float, float] | None:
+        """Where the local frame has its origin: the last that was told; it moves on the ground, before the flight."""
+        if local is None:
+            return None
+        rows = [
+            row[1:4] for row in local.rows("ref_lat", "ref_lon", "ref_alt") if row[1] == row[1] and row[1]
+        ]
+        return rows[-1] if rows else None
+
+    # ----------------------------------------------------------------------------------- equipment
+
+    def _equipment(self) -> None:
+        flight = self._flight
+        for number, battery in self._topics("battery_status"):
+            remaining = battery.array("remaining") * 100
+            remaining[remaining < 0] = NAN
+            current = battery.array("current_a")
+            current[current < 0] = NAN  # -1: not known
+            voltage, used = battery.array("voltage_v"), battery.array("discharged_mah")
+            voltage[voltage <= 0] = NAN  # 0: not known
+            used[used < 0] = NAN
+            _extend(
+                flight.battery(number),
+                battery.times,
+                voltage_v=voltage,
+                current_a=current,
+                used_mah=used,
+                remaining_percent=remaining,
+            )
+        for number, gps in self._topics("vehicle_gps_position", "sensor_gps"):
+            _extend(
+                flight.receiver(number),
+                gps.times,
+                fix_type=gps.array("fix_type"),
+                satellites=gps.array("satellites_used"),
+                hdop=gps.array("hdop"),
+                accuracy_m=gps.array("eph"),
+            )
+        status = self._topic("estimator_status")
+        if status is not None:
+            _extend(
+                flight.estimator,
+                status.times,
+                velocity=status.array("vel_test_ratio"),
+                horizontal_position=status.array("pos_test_ratio"),
+                vertical_position=status.array("hgt_test_ratio"),
+                compass=status.array("mag_test_ratio", "hdg_test_ratio"),
+                height_or_airspeed=status.array("tas_test_ratio"),
+            )
+        imu = self._topic("vehicle_imu_status")
+        if imu is not None:
+            clips = sum(imu.array(f"accel_clipping[{axis}]") for axis in range(3))
+            _extend(flight.vibration, imu.times, x_m_s2=imu.array("accel_vibration_metric"), clips=clips)
+        self._links()
+
+    def _links(self) -> None:
+        """Of several links the one that received most."""
+        links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
+        if links:
+            best = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))
+            lost = best.array("rx_message_lost_rate") * 100
+            _extend(self._flight.link, best.times, lost_percent=lost)
+        radio = self._topic("radio_status")
+        if radio is not None:
+            _extend(
+                self._flight.radio,
+                radio.times,
+                rssi=radio.array("rssi"),
+                remote_rssi=radio.array("remote_rssi"),
+                noise=radio.array("noise"),
+                remote_noise=radio.array("remote_noise"),
+            )
+
+
+_GPS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_msl_m")
+
+
+def _extend(columns: Columns, times: Sequence[float], **values: Any) -> None:
+    columns.extend(
+        times, **{name: array("d", value.astype("float64").tobytes()) for name, value in values.items()}
+    )
+
+
+def _version(log: Any) -> str:
+    told = log.msg_info_dict.get("ver_sw_release")
+    if not isinstance(told, int) or not told:
+        return Px4.name
+    return f"{Px4.name} {told >> 24 & 0xFF}.{told >> 16 & 0xFF}.{told >> 8 & 0xFF}"
+
+
+def _utc_at_0(log: Any) -> float:
+    """UTC when PX4's clock was 0; 0 when no receiver told the time."""
+    for data in log.data_list:
+        is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
+        if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():
+            utc, at = data.data["time_utc_usec"], data.data["timestamp"]
+            rows = utc.nonzero()[0]
+            if len(rows):
+                return (int(utc[rows[0]]) - int(at[rows[0]])) / 1e6
+    return 0.0

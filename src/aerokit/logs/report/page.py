@@ -1,0 +1,169 @@
+"""Sections → one HTML file: everything is in it, everything from a log is escaped, and it can load nothing."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib import import_module, resources
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["Chart", "Part", "Section", "Table", "Words", "page"]
+
+
+@dataclass(frozen=True)
+class Words:
+    """Paragraphs, or a list."""
+
+    lines: Sequence[str]
+    is_list: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts below a header."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    folded: str = ""
+    """Not empty: what it is called while it is folded away."""
+    marks: Sequence[str] = ()
+    """For each row "", "warning" or "bad"."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Lines that Plotly draws.
+
+    Names that are drawn come from aerokit, never from a log: Plotly reads some of HTML in texts.
+    """
+
+    name: str
+    """Where it is in the page, once."""
+    traces: Sequence[dict[str, Any]]
+    layout: dict[str, Any] = field(default_factory=dict)
+    height: int = 300
+    label: str = ""
+    """What it shows, for who cannot see it."""
+
+
+Part = Words | Table | Chart
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, what it means, and its parts; ``missing`` says what the log does not have."""
+
+    title: str
+    parts: Sequence[Part] = ()
+    means: str = ""
+    missing: str = ""
+
+
+def page(title: str, summaries: Sequence[tuple[str, Sequence[str]]], sections: Sequence[Section]) -> str:
+    """The text of the file; ``summaries`` has a heading and sentences for each flight.
+
+    Its policy (CSP) lets run the two scripts that are in it, and nothing else, and lets it load nothing: what a
+    hostile log says would be text even if it were not escaped.
+
+    Raises:
+        ModuleNotFoundError: plotly is not installed.
+    """
+    scripts = [import_module("plotly.offline").get_plotlyjs(), _ours("draw.js")]
+    hashes = " ".join(f"'sha256-{_hash(script)}'" for script in scripts)
+    policy = f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
+    charts = [part for section in sections for part in section.parts if isinstance(part, Chart)]
+    lines = [
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{escape(title)}</title>",
+        f"<style>{_ours('page.css')}</style></head><body>",
+        f"<h1>{escape(title)}</h1>",
+        *_summary(summaries),
+        _contents(sections),
+        *(line for number, section in enumerate(sections) for line in _section(number, section)),
+        f'<script type="application/json" id="charts">{_json(charts)}</script>',
+        *(f"<script>{script}</script>" for script in scripts),
+        "</body></html>\n",
+    ]
+    return "\n".join(lines)
+
+
+def _ours(name: str) -> str:
+    return resources.files("aerokit.logs.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(script: str) -> str:
+    """As a browser reads the script: it makes every line end a line feed."""
+    data = script.replace("\r\n", "\n").replace("\r", "\n").encode()
+    return base64.b64encode(hashlib.sha256(data).digest()).decode()
+
+
+def _json(charts: Sequence[Chart]) -> str:
+    """By name; no text in it can end the script that holds it."""
+    told = {
+        chart.name: {"traces": chart.traces, "layout": chart.layout, "height": chart.height}
+        for chart in charts
+    }
+    text = json.dumps(told, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _summary(summaries: Sequence[tuple[str, Sequence[str]]]) -> Iterator[str]:
+    for heading, sentences in summaries:
+        yield f'<p class="soft">{escape(heading)}</p>'
+        yield '<div class="summary">'
+        yield from (f"<p>{escape(sentence)}</p>" for sentence in sentences)
+        yield "</div>"
+
+
+def _contents(sections: Sequence[Section]) -> str:
+    links = (f'<a href="#s{number}">{escape(section.title)}</a>' for number, section in enumerate(sections))
+    return f"<nav>{' '.join(links)}</nav>"
+
+
+def _section(number: int, section: Section) -> Iterator[str]:
+    yield f'<section id="s{number}"><h2>{escape(section.title)}</h2>'
+    if section.missing:
+        yield f'<p class="missing">{escape(section.missing)}</p>'
+    elif section.means:
+        yield f'<p class="soft">{escape(section.means)}</p>'
+    for part in section.parts:
+        yield from _part(part)
+    yield "</section>"
+
+
+def _part(part: Part) -> Iterator[str]:
+    if isinstance(part, Chart):
+        yield (
+            f'<div class="chart" data-chart="{escape(part.name)}" style="min-height:{part.height}px"'
+            f' role="img" aria-label="{escape(part.label)}"><noscript>{escape(part.label)}</noscript></div>'
+        )
+    elif isinstance(part, Words):
+        tag = "li" if part.is_list else "p"
+        yield from (f"<{tag}>{escape(each)}</{tag}>" for each in part.lines)
+    else:
+        yield from _table(part)
+
+
+def _table(table: Table) -> Iterator[str]:
+    if table.folded:
+        is_long = ' data-print="no"' if len(table.rows) > 300 else ""
+        yield f"<details{is_long}><summary>{escape(table.folded)}</summary>"
+    yield '<div class="wide"><table><thead><tr>'
+    yield "".join(f"<th>{escape(name)}</th>" for name in table.header)
+    yield "</tr></thead><tbody>"
+    for number, row in enumerate(table.rows):
+        mark = table.marks[number] if number < len(table.marks) else ""
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
+        yield f'<tr class="{mark}">{cells}</tr>' if mark else f"<tr>{cells}</tr>"
+    yield "</tbody></table></div>"
+    if table.folded:
+        yield "</details>"

@@ -1,0 +1,460 @@
+"""`from_pymavlink`: any message object of a program, pymavlink's above all, as one that a connection can send."""
+
+from __future__ import annotations
+
+import math
+import operator
+import sys
+from collections.abc import Callable, Iterable
+from functools import cache, wraps
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink.dialect import STANDARD, class_from_pymavlink
+from aerokit.mavlink.frame import HEADER_LENGTH, SIGNATURE_LENGTH, SIGNED, x25
+from aerokit.mavlink.message import Message
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Field
+
+__all__ = ["MessageFactory", "from_pymavlink", "to_pymavlink"]
+
+REAL_TYPES = ("float", "double")
+
+
+def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
+    """A copy of a message, checked, for ``vehicle.send``; later changes to ``message`` do not change it.
+
+    Args:
+        message: of any pymavlink dialect, for MAVLink 1 or 2, a subclass of such a class, anything with ``get_type()``
+            and the fields of a standard message as attributes, or a message of aerokit. Numbers for integer fields
+            are rounded; texts may be ``str`` (sent in UTF-8) or bytes; missing extension fields are 0.
+        target_system: written into ``message.target_system``, if it has that field (aerokit's own messages do not
+            change: only the copy gets it). None and 0 leave what is there. ``target_component`` always stays.
+
+    Raises:
+        InvalidArgument: a ValueError; a value does not fit its field, or this is no message.
+    """
+    if isinstance(message, Message):
+        message_class: type[Message] = type(message)
+    else:
+        message_class = _class_of(message)
+        if target_system and hasattr(message, "target_system"):
+            message.target_system = target_system
+    values = _values(message_class, message)
+    if target_system and "target_system" in values:
+        values["target_system"] = target_system
+    try:
+        copy = message_class(**values)
+    except TypeError as error:
+        raise InvalidArgument(f"{message_class.NAME} cannot be sent: {error}") from None
+    copy.encode()
+    return copy
+
+
+def _class_of(message: Any) -> type[Message]:
+    given: Any = type(message)
+    if hasattr(given, "ordered_fieldnames") and hasattr(given, "crc_extra"):
+        return _counterpart(int(given.id), int(given.crc_extra), given)
+    try:
+        return STANDARD.by_name(message.get_type())
+    except AttributeError:
+        raise InvalidArgument(f"{message!r} is no MAVLink message") from None
+
+
+@cache
+def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
+    """The standard's class when it is about the same bytes, else one like it made of pymavlink's."""
+    if message_id < 0 or not given.ordered_fieldnames:
+        raise InvalidArgument(f"{given.__name__} is nothing that can be sent")
+    standard = STANDARD.get(message_id)
+    if standard is not None and crc_extra == standard.CRC_EXTRA:
+        return standard
+    return class_from_pymavlink(given)
+
+
+# ----------------------------------------------------------------------------------------- values
+def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
+    """The arguments of ``message_class``; extension fields that ``message`` does not have are left out."""
+    values = {}
+    for field in message_class.FIELDS:
+        name = field.name.rstrip("_")
+        if field.extension and not _has(message, name):
+            continue
+        try:
+            value = _text_given(message, name) if field.type == "char" else getattr(message, name)
+        except AttributeError:
+            raise InvalidArgument(f"{message_class.NAME}.{name} cannot be sent: it is missing") from None
+        values[field.name] = _converted(message_class, field, value)
+    return values
+
+
+def _has(message: Any, name: str) -> bool:
+    """Whether it is a field of it: every class of pymavlink has an ``id`` of its own."""
+    if name in getattr(message, "__dict__", ()):
+        return True
+    return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")
+
+
+def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
+    if field.is_text:
+        return _text(value)
+    if field.type == "char" and isinstance(value, str):
+        return value.encode()
+    is_real = field.type in REAL_TYPES
+    if not field.array_length:
+        return _real(value) if is_real else _integer(value)
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return bytes(value)
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise _error(
+            message_class, field, value, f"must be a sequence of at most {field.array_length} numbers"
+        )
+    items = [_real(item) if is_real else _integer(item) for item in value]
+    return items if field.type != "uint8_t" else _packed(message_class, field, items)
+
+
+def _packed(message_class: type[Message], field: Field, items: list[Any]) -> bytes:
+    try:
+        return bytes(items)
+    except (TypeError, ValueError):
+        wrong = next((at for at, item in enumerate(items) if not _is_byte(item)), 0)
+        raise _error(message_class, field, items, f"element {wrong} must be in 0..255") from None
+
+
+def _is_byte(value: Any) -> bool:
+    return isinstance(value, int) and 0 <= value <= 255
+
+
+def _integer(value: Any) -> Any:
+    """An int, if it is any number; what is none is left for `Message.encode` to complain of."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        number = _real(value)
+    return round(number) if isinstance(number, float) and math.isfinite(number) else value
+
+
+def _real(value: Any) -> Any:
+    """A number that ``struct`` packs: numpy's and decimals too; what is none stays as it is."""
+    if isinstance(value, (int, float)) or not hasattr(value, "__float__"):
+        return value
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return value
+
+
+def _error(message_class: type[Message], field: Field, value: Any, complaint: str) -> InvalidArgument:
+    return InvalidArgument(f"{message_class.NAME}.{field.name} = {value!r} cannot be sent: {complaint}")
+
+
+# ------------------------------------------------------------------------------------------ texts
+def _text_given(message: Any, name: str) -> Any:
+    """What the program gave: pymavlink keeps the bytes beside a text that has lost what is not ASCII."""
+    text, raw = getattr(message, name), getattr(message, f"_{name}_raw", None)
+    if isinstance(raw, bytes) and text == raw.partition(b"\0")[0].decode("ascii", "replace"):
+        return raw
+    return text
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.rstrip("\0")
+    if not isinstance(value, (bytes, bytearray, memoryview)):
+        return value
+    data = bytes(value).rstrip(b"\0")
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return _RawText(data)
+
+
+class _RawText(str):
+    """Bytes that are no UTF-8, in a message whose texts are str: they are sent as they are."""
+
+    _data: bytes
+
+    def __new__(cls, data: bytes) -> _RawText:
+        self = super().__new__(cls, data.decode(errors="replace"))
+        self._data = data
+        return self
+
+    def encode(self, encoding: str = "utf-8", errors: str = "strict") -> bytes:
+        return self._data
+
+
+DIALECTS = ("ardupilotmega", "development")
+"""Where pymavlink's classes come from when the program's own dialect has none; together they know all of STANDARD."""
+
+CHECKSUM_LENGTH = 2
+
+LATE = ("_header", "_msgbuf", "_payload", "_crc")
+"""What most listeners never ask for."""
+
+Decoder = Callable[["Frame", float], Any]
+
+
+def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: float = 0.0) -> Any:
+    """The frame's message as pymavlink decodes it: fields, header, buffers and ``str()`` are the same; never raises.
+
+    Args:
+        frame: as received: ``message.received_frame``, or what a tap of the connection is given.
+        dialect: pymavlink's module whose classes are preferred, if it is one for MAVLink 2 and has the message.
+            Otherwise they are those of pymavlink's ardupilotmega or development for MAVLink 2, which have the extension
+            fields as well. A message that none of them knows is pymavlink's ``MAVLink_unknown``, type ``UNKNOWN_<id>``.
+        timestamp: becomes the message's ``_timestamp``: seconds since 1970 by pymavlink's convention.
+    """
+    return _decoder(frame.message_id, dialect)(frame, timestamp)
+
+
+@cache
+def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
+    """How to decode a message for a program that prefers this dialect."""
+    row = STANDARD.rows.get(message_id)
+    for module in _dialects(preferred):
+        message_class = module.mavlink_map.get(message_id)
+        if message_class is None:
+            continue
+        if row is None:
+            return _checked(message_class, _decoder_for(message_class))
+        if message_class.crc_extra == row[0]:
+            return _decoder_for(message_class)
+    return _unknown
+
+
+def _dialects(preferred: ModuleType | None) -> Any:
+    if getattr(preferred, "WIRE_PROTOCOL_VERSION", None) == "2.0":
+        yield preferred
+    for name in DIALECTS:
+        yield import_module(f"pymavlink.dialects.v20.{name}")
+
+
+def _decoder_for(message_class: Any) -> Decoder:
+    received = _received_class(message_class)
+    unpack = message_class.unpacker.unpack_from
+    length = HEADER_LENGTH + message_class.unpacker.size
+    layout = _Layout(message_class)
+    names, arrays, texts = layout.names, layout.arrays, layout.texts
+    new = object.__new__
+
+    def decode(frame: Frame, timestamp: float) -> Any:
+        body = frame.body
+        values = unpack(body if len(body) >= length else body.ljust(length, b"\0"), HEADER_LENGTH)
+        message = new(received)
+        fields = message.__dict__
+        fields["_frame"] = frame
+        fields["_timestamp"] = timestamp
+        if arrays:
+            values = [values[at] if width == 1 else list(values[at : at + width]) for at, width in arrays]
+        fields.update(zip(names, values))  # noqa: B905 - of one length
+        for name, raw_name in texts:
+            raw = fields[raw_name] = fields[raw_name].rstrip(b"\0")
+            fields[name] = (raw.partition(b"\0")[0] if b"\0" in raw else raw).decode("ascii", "replace")
+        return message
+
+    return decode
+
+
+class _Layout:
+    """Where pymavlink's attributes are among the unpacked values."""
+
+    def __init__(self, message_class: Any) -> None:
+        zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
+        self.names: list[str] = []
+        """In the wire's order; texts are first stored under the name for their bytes."""
+        self.arrays: list[tuple[int, int]] = []
+        """Place and width of every field; empty when there are no arrays."""
+        self.texts: list[tuple[str, str]] = []
+        """Names of texts, and of their bytes."""
+        at = 0
+        for name, width in zip(message_class.ordered_fieldnames, message_class.lengths):  # noqa: B905
+            if isinstance(zeros[at], bytes):
+                self.texts.append((name, f"_{name}_raw"))
+            self.names.append(f"_{name}_raw" if isinstance(zeros[at], bytes) else name)
+            self.arrays.append((at, width))
+            at += width
+        if at == len(self.names):
+            self.arrays = []
+
+
+# ------------------------------------------------------------------- what most listeners never ask for
+class _Received:
+    """Header and buffers, made of the frame when somebody asks for them: making them costs more than the fields."""
+
+    _frame: Frame
+    _header_class: Any
+    _decoded_class: Any
+    _signed = False  # nobody has checked a signature here
+    _link_id = None
+    _instances = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in LATE:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        value = self.__dict__[name] = getattr(self, f"made{name}")()
+        return value
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Copies, also those of ``pickle``, are plain objects of pymavlink's class."""
+        names = (*LATE, "_type", "_fieldnames", "_instance_field", "_instance_offset")
+        state = {name: getattr(self, name) for name in (*names, "_signed", "_link_id", "_instances")}
+        state.update((name, value) for name, value in self.__dict__.items() if name != "_frame")
+        return _restored, (self._decoded_class, state)
+
+    def made_header(self) -> Any:
+        frame, body = self._frame, self._frame.body
+        source = frame.system_id, frame.component_id
+        return self._header_class(frame.message_id, body[1], body[2], body[0], body[3], *source)
+
+    def made_msgbuf(self) -> bytearray:
+        return bytearray(self._frame.raw)
+
+    def made_payload(self) -> bytearray:
+        """Pymavlink has it begin there in MAVLink 2, too."""
+        return bytearray(self._frame.raw)[6 : -_behind_the_payload(self._frame)]
+
+    def made_crc(self) -> int:
+        return self._frame.checksum
+
+
+def _behind_the_payload(frame: Frame) -> int:
+    return CHECKSUM_LENGTH + (SIGNATURE_LENGTH if frame.incompat_flags & SIGNED else 0)
+
+
+def _received_class(message_class: Any) -> Any:
+    """A subclass that looks like the class itself."""
+    return type(
+        message_class.__name__,
+        (_Received, message_class),
+        {
+            "__module__": message_class.__module__,
+            "__doc__": message_class.__doc__,
+            "_decoded_class": message_class,
+            "_header_class": sys.modules[message_class.__module__].MAVLink_header,
+            "_type": message_class.msgname,
+            "_fieldnames": message_class.fieldnames,
+            "_instance_field": message_class.instance_field,
+            "_instance_offset": message_class.instance_offset,
+        },
+    )
+
+
+def _restored(message_class: Any, state: dict[str, Any]) -> Any:
+    message = object.__new__(message_class)
+    message.__dict__.update(state)
+    return message
+
+
+# -------------------------------------------------------------------------------- unknown messages
+def _checked(message_class: Any, decode: Decoder) -> Decoder:
+    """Nobody has checked a message that the standard does not have; the program's dialect says how."""
+
+    def decode_if_right(frame: Frame, timestamp: float) -> Any:
+        raw = frame.raw
+        is_right = (
+            x25(raw[1 : -_behind_the_payload(frame)] + bytes((message_class.crc_extra,))) == frame.checksum
+        )
+        return (decode if is_right else _unknown)(frame, timestamp)
+
+    return decode_if_right
+
+
+def _unknown(frame: Frame, timestamp: float) -> Any:
+    module: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
+    message = module.MAVLink_unknown(frame.message_id, bytearray(frame.raw))
+    header = message.get_header()
+    header.seq, header.srcSystem, header.srcComponent = frame.sequence, frame.system_id, frame.component_id
+    vars(message)["_timestamp"] = timestamp
+    return message
+
+
+if TYPE_CHECKING:  # its own types are stricter than what is taken here
+
+    class _MAVLink:
+        total_packets_sent: int
+        send_callback: Callable[..., object] | None
+        send_callback_args: tuple[Any, ...] | None
+        send_callback_kwargs: dict[str, Any] | None
+
+        def __init__(self, file: object, source_system: int, source_component: int) -> None: ...
+else:
+    _MAVLink = ardupilotmega.MAVLink
+
+
+class MessageFactory(_MAVLink):
+    """Has ``<message>_encode(…)``, which returns a message of pymavlink, and ``<message>_send(…)`` for every message.
+
+    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; those that only the dialect of the
+    program has (``mavutil.mavlink``) are made by that. Values are checked when the message is sent, not before:
+    texts may be ``str`` or bytes, and numbers for integer fields are rounded, by :func:`from_pymavlink`:
+    ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message, vehicle.system_id)), 255, 0)``.
+    """
+
+    seq: int
+    total_packets_sent: int
+    """How many messages it has sent, 0..255, then from 0 again; the link counts by itself."""
+
+    def __init__(
+        self, connection_send: Callable[[Any], object], source_system: int, source_component: int
+    ) -> None:
+        """Make one whose messages go to ``connection_send(message)``; the ids are for programs to read."""
+        super().__init__(None, source_system, source_component)
+        self._connection_send = connection_send
+
+    def send(self, mavmsg: Any, force_mavlink1: bool = False) -> None:
+        """Send a message; what cannot be sent raises what ``connection_send`` raises, and is not counted.
+
+        ``force_mavlink1`` means nothing: the link speaks the version that the vehicle understands.
+        """
+        self._connection_send(mavmsg)
+        self.seq = (self.seq + 1) % 256
+        self.total_packets_sent += 1
+        if self.send_callback is not None:
+            self.send_callback(mavmsg, *(self.send_callback_args or ()), **(self.send_callback_kwargs or {}))
+
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith(("_encode", "_send")):
+            dialect: Any = mavutil.mavlink
+            function = getattr(dialect.MAVLink, name, None)
+            if function is not None:
+                return function.__get__(self)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+
+def _taking_text(encode: Callable[..., Any]) -> Callable[..., Any]:
+    """Pymavlink takes bytes only."""
+
+    @wraps(encode)
+    def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:
+        given = [_as_bytes(value) for value in args]
+        named = {name: _as_bytes(value) for name, value in kwargs.items()}
+        try:
+            return encode(self, *given, **named)
+        except AttributeError:
+            raise InvalidArgument(f"{encode.__name__}: a text must be str or bytes") from None
+
+    return encode_text
+
+
+def _as_bytes(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode()
+    return bytes(value) if isinstance(value, (bytearray, memoryview)) else value
+
+
+def _take_text_in(factory: Any) -> None:
+    for message_class in ardupilotmega.mavlink_map.values():
+        if "char" in message_class.fieldtypes:
+            name = f"{message_class.msgname.lower()}_encode"
+            setattr(factory, name, _taking_text(getattr(factory, name)))
+
+
+_take_text_in(MessageFactory)

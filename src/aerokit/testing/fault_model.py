@@ -1,0 +1,186 @@
+"""``FaultModel``: what a bad radio does to frames; ``FaultyPath``: does it, one direction, without IO and clock."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+
+from aerokit._internal.values import Snapshot
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
+
+__all__ = ["Air", "FaultModel", "FaultyPath", "split_frames"]
+
+_SHARES = ("loss", "duplication", "reordering", "corruption")
+_SECONDS = ("delay_s", "jitter_s", "overtaken_s")
+
+
+class FaultModel(Snapshot):
+    """One direction of a radio link. Without arguments it changes nothing.
+
+    Shares are probabilities from 0 to 1 for each frame, independent of each other and of what came before.
+    Raises InvalidArgument for a field that makes no sense.
+    """
+
+    loss: float = 0.0
+    """Share of the frames that are gone."""
+    duplication: float = 0.0
+    """Share of the frames that arrive twice, the copy right behind the first one."""
+    reordering: float = 0.0
+    """Share of the frames that are held back, so that later ones overtake them."""
+    corruption: float = 0.0
+    """Share of the frames in which one to eight bits are flipped."""
+    delay_s: float = 0.0
+    """Seconds from one end to the other."""
+    jitter_s: float = 0.0
+    """Up to so many seconds are added at random; frames keep their order all the same, as in any queue."""
+    overtaken_s: float = 0.05
+    """Seconds that a frame is held back by ``reordering``."""
+    bandwidth: float = math.inf
+    """Bytes per second; a serial line or radio of 57,600 baud moves about 5,760. What is too much waits in a queue."""
+    queue_bytes: float = math.inf
+    """What does not fit into the queue any more is dropped; a telemetry radio has room for some 4,000 bytes."""
+    outages: tuple[tuple[float, float], ...] = ()
+    """Times (begin, end), in seconds since the link was opened, in which everything that is sent is lost."""
+    per_frame: bool = True
+    """Every MAVLink frame suffers its own fate, as on a radio; False: whole writes and datagrams do."""
+
+    def _check(self) -> None:
+        for name in _SHARES:
+            _check_number(name, getattr(self, name), 0.0, 1.0)
+        for name in _SECONDS:
+            _check_number(name, getattr(self, name), 0.0, 3600.0)
+        for name in ("bandwidth", "queue_bytes"):
+            if not getattr(self, name) > 0:
+                raise InvalidArgument(f"{name} = {getattr(self, name)!r} is not allowed: above 0")
+        for begin, end in self.outages:
+            if not begin <= end:
+                raise InvalidArgument(f"outages: ({begin!r}, {end!r}) is not allowed: begin before end")
+
+
+class Air:
+    """What is transmitted on: busy until its last frame has left. Two directions that share one are half duplex."""
+
+    def __init__(self) -> None:
+        self.busy_until: float = -math.inf
+
+
+class FaultyPath:
+    """One direction. The same model, seed, frames and times always give the same result.
+
+    Counters: ``frames`` and ``bytes`` that were put in, and the frames that were ``lost`` (outages included),
+    ``overflowed`` (no room in the queue), ``duplicated``, ``reordered`` and ``corrupted``.
+    """
+
+    frames: int
+    lost: int
+    overflowed: int
+    duplicated: int
+    reordered: int
+    corrupted: int
+
+    def __init__(self, model: FaultModel, seed: object = 0, air: Air | None = None) -> None:
+        self.model = model
+        """May be replaced at any time."""
+        self.frames = self.lost = self.overflowed = 0
+        self.bytes: int = 0
+        self.duplicated = self.reordered = self.corrupted = 0
+        self._chance = random.Random(repr(seed)).random
+        self._bits = random.Random(repr((seed, "bits")))
+        self._air = Air() if air is None else air
+        self._started_at: float | None = None
+        self._latest_due = -math.inf
+
+    def start(self, now: float) -> None:
+        """The times of outages count from here; otherwise from the first frame."""
+        self._started_at = now
+
+    def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
+        """What becomes of a write or datagram: (when it arrives, bytes), in the order of sending."""
+        if self._started_at is None:
+            self.start(now)
+        arrivals: list[tuple[float, bytes]] = []
+        for frame in split_frames(data) if self.model.per_frame else [data]:
+            arrivals += self._carry_frame(bytes(frame), now)
+        return arrivals
+
+    def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
+        # Always as many draws, so that the other faults stay where they were when one share is changed.
+        model, draws = self.model, [self._chance() for _ in range(5)]
+        lost, doubled = draws[0] < model.loss, draws[1] < model.duplication
+        held, bad, jitter = (
+            draws[2] < model.reordering,
+            draws[3] < model.corruption,
+            draws[4] * model.jitter_s,
+        )
+        self.frames += 1
+        self.bytes += len(frame)
+        left_at = self._transmit(len(frame), now)
+        if left_at is None:
+            self.overflowed += 1
+            return []
+        if lost or self._is_out(left_at):
+            self.lost += 1
+            return []
+        if bad:
+            frame = self._corrupt(frame)
+        due = left_at + model.delay_s + jitter
+        if held:
+            self.reordered += 1
+            due += model.overtaken_s
+        else:
+            due = self._latest_due = max(due, self._latest_due)
+        self.duplicated += doubled
+        return [(due, frame)] * (1 + doubled)
+
+    def _transmit(self, size: int, now: float) -> float | None:
+        """When the last byte has left; None when there is no room to wait."""
+        model, air = self.model, self._air
+        begin = max(now, air.busy_until)
+        if math.isinf(model.bandwidth):
+            return begin
+        waiting = (begin - now) * model.bandwidth
+        if waiting + size > model.queue_bytes and waiting > 0:
+            return None
+        air.busy_until = begin + size / model.bandwidth
+        return air.busy_until
+
+    def _is_out(self, when: float) -> bool:
+        elapsed = when - (self._started_at or 0.0)
+        return any(begin <= elapsed < end for begin, end in self.model.outages)
+
+    def _corrupt(self, frame: bytes) -> bytes:
+        self.corrupted += 1
+        damaged = bytearray(frame)
+        for _ in range(self._bits.randint(1, 8) if damaged else 0):
+            bit = self._bits.randrange(len(damaged) * 8)
+            damaged[bit // 8] ^= 1 << bit % 8
+        return bytes(damaged)
+
+
+def split_frames(data: bytes) -> Sequence[bytes]:
+    """The MAVLink frames of a write or datagram; what is no frame, or only the beginning of one, is one piece.
+
+    Only lengths are looked at, no checksums.
+    """
+    pieces: list[bytes] = []
+    begin, size = 0, len(data)
+    while begin < size:
+        end = min(_end_of_frame(data, begin) or size, size)
+        pieces.append(data[begin:end])
+        begin = end
+    return pieces or [data]
+
+
+def _end_of_frame(data: bytes, begin: int) -> int | None:
+    if len(data) < begin + 3 or data[begin] not in (MAGIC_V1, MAGIC_V2):
+        return None
+    if data[begin] == MAGIC_V1:
+        return begin + data[begin + 1] + 8
+    return begin + data[begin + 1] + 12 + (SIGNATURE_LENGTH if data[begin + 2] & SIGNED else 0)
+
+
+def _check_number(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}")

@@ -1,0 +1,75 @@
+"""Bytes in, bytes out: UDP, TCP, serial, zenoh, memory, recordings, and a bad radio around any of them.
+
+Only this package touches sockets and ports.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.imports import lazy_exports
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.transport.address import ACCEPTED_FORMS as ACCEPTED_FORMS
+    from aerokit.transport.address import LinkAddress as LinkAddress
+    from aerokit.transport.address import parse_address as parse_address
+    from aerokit.transport.create import create_link as create_link
+    from aerokit.transport.link import BurstListener as BurstListener
+    from aerokit.transport.link import DrainListener as DrainListener
+    from aerokit.transport.link import HelmListener as HelmListener
+    from aerokit.transport.link import Link as Link
+    from aerokit.transport.link import Peer as Peer
+    from aerokit.transport.link import PeerKeeper as PeerKeeper
+    from aerokit.transport.link import PeerListener as PeerListener
+    from aerokit.transport.link import Receiver as Receiver
+    from aerokit.transport.memory import MemoryLink as MemoryLink
+    from aerokit.transport.memory import memory_link_pair as memory_link_pair
+    from aerokit.transport.reconnecting import Interruptible as Interruptible
+    from aerokit.transport.reconnecting import ReconnectingLink as ReconnectingLink
+    from aerokit.transport.replay import Replay as Replay
+    from aerokit.transport.serial import PtyLink as PtyLink
+    from aerokit.transport.serial import SerialLink as SerialLink
+    from aerokit.transport.several import LinkPeer as LinkPeer
+    from aerokit.transport.several import OneOfSeveralListener as OneOfSeveralListener
+    from aerokit.transport.several import SeveralLinks as SeveralLinks
+    from aerokit.transport.tcp import TcpConnect as TcpConnect
+    from aerokit.transport.tcp import TcpListen as TcpListen
+    from aerokit.transport.udp import UdpBroadcast as UdpBroadcast
+    from aerokit.transport.udp import UdpConnect as UdpConnect
+    from aerokit.transport.udp import UdpListen as UdpListen
+    from aerokit.transport.zenoh.connect import ZenohConnect as ZenohConnect
+    from aerokit.transport.zenoh.listen import ZenohListen as ZenohListen
+    from aerokit.transport.zenoh.session import NetworkOptions as NetworkOptions
+
+
+__getattr__: Callable[[str], Any]
+__dir__: Callable[[], list[str]]
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "aerokit.transport.address": ("ACCEPTED_FORMS", "LinkAddress", "parse_address"),
+        "aerokit.transport.create": ("create_link",),
+        "aerokit.transport.link": (
+            "BurstListener",
+            "DrainListener",
+            "HelmListener",
+            "Link",
+            "Peer",
+            "PeerKeeper",
+            "PeerListener",
+            "Receiver",
+        ),
+        "aerokit.transport.memory": ("MemoryLink", "memory_link_pair"),
+        "aerokit.transport.reconnecting": ("Interruptible", "ReconnectingLink"),
+        "aerokit.transport.replay": ("Replay",),
+        "aerokit.transport.serial": ("PtyLink", "SerialLink"),
+        "aerokit.transport.several": ("LinkPeer", "OneOfSeveralListener", "SeveralLinks"),
+        "aerokit.transport.tcp": ("TcpConnect", "TcpListen"),
+        "aerokit.transport.udp": ("UdpBroadcast", "UdpConnect", "UdpListen"),
+        "aerokit.transport.zenoh.connect": ("ZenohConnect",),
+        "aerokit.transport.zenoh.listen": ("ZenohListen",),
+        "aerokit.transport.zenoh.session": ("NetworkOptions",),
+    },
+)

@@ -1,0 +1,395 @@
+"""Connection strings: DroneKit's and pymavlink's spellings and URLs, read into one form."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Literal, NoReturn
+
+from serial import SerialException
+
+from aerokit._internal.values import Snapshot
+from aerokit._internal.wording import did_you_mean
+from aerokit.errors import InvalidArgument
+
+__all__ = ["ACCEPTED_FORMS", "AddressError", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
+
+LinkKind = Literal[
+    "udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"
+]
+
+ACCEPTED_FORMS = """\
+  127.0.0.1:14550  udp:0.0.0.0:14550  udpin:0.0.0.0:14550  udp://:14550   listen for UDP
+  udpout:192.168.1.12:14550  udpout://192.168.1.12:14550                  send UDP to one host
+  udpbcast:192.168.1.255:14550                                            broadcast, then talk to who answers
+  tcp:127.0.0.1:5760  tcp://127.0.0.1:5760  tcpout:127.0.0.1:5760         connect by TCP
+  tcpin:0.0.0.0:5760                                                      wait for TCP clients
+  /dev/ttyACM0  /dev/ttyUSB0,57600  COM14  COM14,115200                   serial port, with its baud rate
+  serial:///dev/ttyUSB0:57600  serial://COM3:57600?rtscts=1               the same, with flow control
+  flight.tlog  replay:flight.tlog?speed=2  file:///logs/flight.tlog       replay a recording
+  pty  pty:/tmp/ttyV0                                                     a pseudo-terminal, and a name for it
+  zenoh://fleet/alpha  zenoh://fleet/alpha?connect=tcp/10.0.0.5:7447      what a zenoh network has of this name
+  zenohin://fleet/alpha?listen=tcp/0.0.0.0:7447                           put it there, for clients of zenoh:
+  an IPv6 address stands in brackets: udpin:[::1]:14550"""
+"""What an address may look like, for error messages and help texts."""
+
+
+class LinkAddress(Snapshot):
+    """A connection string, taken apart; ``str()`` gives the canonical one, which parses back to the same."""
+
+    kind: LinkKind
+    host: str = ""
+    """Name or IP address without brackets; "0.0.0.0" where none was given to listen on."""
+    port: int = 0
+    """0 to 65535; 0 only for listening: the system chooses."""
+    device: str = ""
+    """Serial port, e.g. "/dev/ttyACM0" or "COM14"."""
+    baud: int | None = None
+    """Bits per second; None when the string does not say."""
+    path: str = ""
+    """File of a recording; of a pseudo-terminal the symbolic link to its other end, "" for none.
+
+    On a zenoh network fleet and name: "fleet/alpha".
+    """
+    options: tuple[tuple[str, str], ...] = ()
+    """The rest, sorted.
+
+    ``rtscts`` is "1"; ``speed`` a factor, "inf" as fast as it goes; ``timeout`` is in seconds. ``costly`` is "1" for
+    one of several links that is used only when the others fail.
+    """
+
+    def __str__(self) -> str:
+        as_written = _quote_option if self.kind in _ON_NETWORKS else str
+        query = "&".join(f"{key}={as_written(value)}" for key, value in self.options)
+        return self._without_options() + (f"?{query}" if query else "")
+
+    def option(self, name: str) -> str | None:
+        """The value of one option, None when it was not given."""
+        return dict(self.options).get(name)
+
+    def _without_options(self) -> str:
+        if self.kind == "serial":
+            baud = "" if self.baud is None else f":{self.baud}"
+            return f"serial://{_quote_device(self.device)}{baud}"
+        if self.kind == "replay":
+            return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
+        if self.kind == "pty":
+            return f"pty:{self.path}" if self.path else "pty"
+        if self.kind in _ON_NETWORKS:
+            return f"{self.kind}://{self.path}"
+        return f"{self.kind}:{host_and_port(self.host, self.port)}"
+
+
+def parse_address(text: str) -> LinkAddress:
+    """Reads a connection string.
+
+    A bare ``host:port`` and ``udp:`` listen, as with DroneKit and pymavlink. In the forms with a scheme,
+    ``%20`` and its like in devices and paths are decoded, as in any URL. Raises InvalidArgument that says
+    what is wrong and lists the accepted forms.
+    """
+    return _Parser(text).parse()
+
+
+def host_and_port(host: str, port: int) -> str:
+    """``host:port`` with brackets where the host is an IPv6 address."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+_SCHEMES: dict[str, LinkKind] = {
+    "udp": "udpin",
+    "udpin": "udpin",
+    "udpout": "udpout",
+    "udpbcast": "udpbcast",
+    "tcp": "tcp",
+    "tcpout": "tcp",
+    "tcpin": "tcpin",
+    "serial": "serial",
+    "replay": "replay",
+    "file": "replay",
+    "zenoh": "zenoh",
+    "zenohin": "zenohin",
+}
+
+_OPTIONS: dict[LinkKind, tuple[str, ...]] = {
+    "tcp": ("timeout",),
+    "serial": ("baud", "rtscts"),
+    "replay": ("speed",),
+    "zenoh": ("connect", "listen", "mode", "config", "client", "helm", "timeout"),
+    "zenohin": ("connect", "listen", "mode", "config"),
+}
+
+_LISTENING = ("udpin", "tcpin")
+
+_NEVER_COSTLY = ("replay", "pty")
+
+_ON_NETWORKS = ("zenoh", "zenohin")
+
+_CHOICES = {"mode": ("peer", "client"), "helm": ("free", "take", "never")}
+
+_AS_IT_IS = ("connect", "listen", "config", "client")  # names and paths: in upper and lower case
+
+_NOT_HERE = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")  # pymavlink knows these
+
+_ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^/].*", re.IGNORECASE | re.DOTALL)
+
+_SCHEME = re.compile(r"([a-z][a-z0-9_+.-]+):(.*)", re.IGNORECASE | re.DOTALL)  # one letter is a drive
+
+_URL = re.compile(r"([a-z][a-z0-9_+.-]*)://(.*)", re.IGNORECASE | re.DOTALL)
+
+_RECORDING = re.compile(r".*\.tlog(\?[^/\\]*)?", re.IGNORECASE | re.DOTALL)
+
+_DATAFLASH = re.compile(r".*\.(bin|log|px4log|ulg)", re.IGNORECASE | re.DOTALL)
+
+_WITHOUT_COLON = re.compile(r"([^/\\:.~,][^/\\:]*)(//+|/(?=([^/\\]*:)?\d+$))")
+"""A path of no device: ``udp//:14550``, ``tcp/127.0.0.1:5760``, ``127.0.0.1/14550``."""
+
+_COM_PORT = re.compile(r"com\d+([,:].*)?", re.IGNORECASE)
+
+_COM_COLON_BAUD = re.compile(r"(com\d+):(.*)", re.IGNORECASE)
+
+_COLON_BAUD = re.compile(r"(.*):(\d+)", re.DOTALL | re.ASCII)
+
+_HOST = re.compile(r"[^\s\[\]/\\?#:,@]+")
+
+_YES_AND_NO = {
+    "1": True,
+    "true": True,
+    "yes": True,
+    "on": True,
+    "0": False,
+    "false": False,
+    "no": False,
+    "off": False,
+}
+
+
+class _Parser:
+    """One run over one string; keeps it for the error messages."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def parse(self) -> LinkAddress:
+        text = self.text.strip()
+        if not text:
+            self.fail("it is empty")
+        if "\0" in text:
+            self.fail("it has a NUL character in it")
+        if text.lower() == "pty" or text.lower().startswith("pty:"):
+            return LinkAddress("pty", path=text[len("pty:") :])
+        scheme, rest = self.split_scheme(text)
+        if scheme in _SCHEMES:
+            return self.with_scheme(scheme, rest)
+        if scheme:
+            self.fail_scheme(scheme)
+        return self.bare(text)
+
+    def split_scheme(self, text: str) -> tuple[str, str]:
+        """The scheme in lower case and what follows it; "" when the string has none."""
+        if match := _URL.fullmatch(text):
+            return match[1].lower(), match[2]
+        match = _SCHEME.fullmatch(text)
+        if match and match[1].lower() in (*_SCHEMES, *_NOT_HERE, "http", "https", "ftp"):
+            return match[1].lower(), match[2]
+        return "", text
+
+    def with_scheme(self, scheme: str, rest: str) -> LinkAddress:
+        kind = _SCHEMES[scheme]
+        rest, _, query = rest.partition("?")
+        options = self.options(kind, query)
+        if kind == "serial":
+            return self.serial(rest, options, decode=True)
+        if kind == "replay":
+            drive = scheme == "file" and re.match(r"/[a-z]:[/\\]", rest, re.IGNORECASE)
+            return self.replay(_unquote(rest[1:] if drive else rest), options)
+        if kind in _ON_NETWORKS:
+            return self.named(kind, rest.removesuffix("/"), options)
+        return self.network(kind, rest.removesuffix("/"), options)
+
+    def bare(self, text: str) -> LinkAddress:
+        if _RECORDING.fullmatch(text):
+            end = text.lower().rindex(".tlog") + len(".tlog")
+            return self.replay(text[:end], self.options("replay", text[end + 1 :]))
+        if _DATAFLASH.fullmatch(text):
+            self.fail("this is a log of the autopilot's own format, not a recording of MAVLink (.tlog)")
+        if match := _WITHOUT_COLON.match(text):
+            self.fail_without_colon(match[1].lower(), match[0], text)
+        if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
+            return self.serial(text, {}, decode=False)
+        if ":" not in text:
+            self.fail("it is neither host:port nor the path of a serial port or of a .tlog file")
+        if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
+            self.fail_scheme(text.partition(":")[0])
+        return self.network("udpin", text, {})
+
+    def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        if text.startswith("["):
+            host, bracket, tail = text[1:].partition("]")
+            if not bracket or not _is_ipv6(host):
+                self.fail(f"{text!r} does not begin with an IPv6 address in brackets")
+        else:
+            host, colon, tail = text.rpartition(":")
+            if not colon:
+                host, tail = tail, ""
+            tail = colon + tail
+            if _is_ipv6(host):
+                self.fail("an IPv6 address must stand in brackets, as in [::1]:14550")
+            if host.isdigit() and not tail:
+                self.fail(f"the host is missing, as in {kind}:127.0.0.1:{host}")
+        if not host and kind in _LISTENING:
+            host = "0.0.0.0"
+        if not host:
+            self.fail("the host is missing")
+        if kind == "udpbcast" and _is_ipv6(host):
+            self.fail("broadcast exists in IPv4 only")
+        if not _is_ipv6(host) and not _HOST.fullmatch(host):
+            self.fail(f"{host!r} is not a host")
+        return LinkAddress(
+            kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items()))
+        )
+
+    def named(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+        from aerokit.transport.zenoh.keys import check_name  # few addresses need it
+
+        for key in ("connect", "listen"):
+            for endpoint in filter(None, options.get(key, "").split(",")):
+                if not _ENDPOINT.fullmatch(endpoint):
+                    self.fail(f"{key}={endpoint} is no endpoint of zenoh, as tcp/10.0.0.5:7447 is")
+        fleet, slash, name = text.partition("/")
+        if not slash:
+            self.fail(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")
+        try:
+            check_name("the fleet", fleet)
+            check_name("the name", name)
+            check_name("client", options.get("client", "c"))
+        except InvalidArgument as error:
+            self.fail(str(error))
+        return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
+
+    def port(self, kind: LinkKind, tail: str) -> int:
+        if not tail.startswith(":") or tail == ":":
+            self.fail("the port is missing" if tail in ("", ":") else f"{tail!r} follows the host, not :port")
+        port, lowest = self.whole_number("the port", tail[1:]), 0 if kind in _LISTENING else 1
+        if not lowest <= port <= 65535:
+            self.fail(f"the port {port} is out of range ({lowest} to 65535)")
+        return port
+
+    def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
+        rate: str | None
+        if "," in text:
+            device, _, rate = text.partition(",")
+        elif match := (_COLON_BAUD if decode else _COM_COLON_BAUD).fullmatch(text):
+            device, rate = match[1], match[2]
+        else:
+            device, rate = text, None
+        given = options.pop("baud", rate)
+        device = _unquote(device) if decode else device
+        if not device.strip("/"):
+            self.fail("the serial port is missing")
+        baud = None if given is None else self.whole_number("the baud rate", given)
+        if baud == 0:
+            self.fail("the baud rate is 0")
+        return LinkAddress("serial", device=device, baud=baud, options=tuple(sorted(options.items())))
+
+    def replay(self, path: str, options: dict[str, str]) -> LinkAddress:
+        if not path.strip():
+            self.fail("the path of the recording is missing")
+        return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
+
+    def options(self, kind: LinkKind, query: str) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for item in filter(None, query.split("&")):
+            key, _, value = item.partition("=")
+            key = key.strip().lower()
+            allowed = (*_OPTIONS.get(kind, ()), *(() if kind in _NEVER_COSTLY else ("costly",)))
+            if key not in allowed:
+                known = ", ".join(allowed) or "none"
+                meant = did_you_mean(key, allowed)
+                self.fail(f"{key!r} is not an option of {kind} links (they have: {known}){meant}")
+            if key in _AS_IT_IS:
+                found[key] = _unquote(value.strip()) or self.fail(f"{key}= is empty")
+            else:
+                found[key] = self.option_value(key, value.strip().lower())
+        return {
+            key: value
+            for key, value in found.items()
+            if (key, value) not in (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
+        }
+
+    def option_value(self, key: str, value: str) -> str:
+        if key == "baud":
+            return value
+        if key in _CHOICES:
+            if value not in _CHOICES[key]:
+                self.fail(f"{key}={value} is none of {', '.join(_CHOICES[key])}")
+            return value
+        if key in ("rtscts", "costly"):
+            if value not in _YES_AND_NO:
+                self.fail(f"{key}={value} is neither yes (1) nor no (0)")
+            return str(int(_YES_AND_NO[value]))
+        try:
+            number = float("inf" if value == "max" else value)
+        except ValueError:
+            number = math.nan
+        if not number > 0 or (key == "timeout" and math.isinf(number)):
+            self.fail(f"{key}={value} is not a number above 0")
+        return repr(number).removesuffix(".0")
+
+    def whole_number(self, what: str, text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) <= 9):
+            self.fail(f"{what} {text!r} is not a whole number")
+        return int(text)
+
+    def fail_without_colon(self, scheme: str, begin: str, text: str) -> NoReturn:
+        if scheme not in _SCHEMES:
+            self.fail(
+                f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}"
+            )
+        self.fail(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
+
+    def fail_scheme(self, scheme: str) -> NoReturn:
+        known = (
+            "pymavlink has it, aerokit does not" if scheme in _NOT_HERE else "there is no such kind of link"
+        )
+        self.fail(f"{scheme}: {known}{did_you_mean(scheme, _SCHEMES)}")
+
+    def fail(self, reason: str) -> NoReturn:
+        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # a broker's, with a password
+        raise InvalidArgument(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
+
+
+def _is_ipv6(text: str) -> bool:
+    if ":" not in text:
+        return False
+    import ipaddress  # as urllib below: few addresses need it
+
+    try:
+        ipaddress.IPv6Address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _quote(text: str) -> str:
+    """Percent-encodes only what would be misread: ``%``, ``?`` and white space."""
+    from urllib.parse import quote
+
+    return re.sub(r"[%?\s]", lambda match: quote(match[0], safe=""), text)
+
+
+def _quote_option(text: str) -> str:
+    return _quote(text).replace("&", "%26")
+
+
+def _unquote(text: str) -> str:
+    from urllib.parse import unquote
+
+    return unquote(text)
+
+
+def _quote_device(device: str) -> str:
+    return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))
+
+
+class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
+    """It names no link. pymavlink takes it for a serial port, so it is an OSError; and it is a ValueError."""

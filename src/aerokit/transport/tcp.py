@@ -1,0 +1,370 @@
+"""TCP: connect to one server, or serve several clients."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import socket
+from abc import abstractmethod
+from typing import Any
+
+import anyio
+
+from aerokit.transport.address import host_and_port
+from aerokit.transport.link import LINGER_S, BaseLink, Peer, PeerListener
+from aerokit.transport.outbox import Outbox, unsent_in_kernel
+from aerokit.transport.sockets import AllowedPeers, Endpoint, Peers, bound_socket, discard_unsent, resolve
+
+__all__ = ["CONNECT_TIMEOUT_S", "MAX_CLIENTS", "MAX_PENDING_BYTES", "TcpConnect", "TcpListen"]
+
+CONNECT_TIMEOUT_S = 10.0
+"""Seconds that `TcpConnect.open` waits for the other side by default."""
+
+MAX_PENDING_BYTES = 256 * 1024
+"""With more than this written and not taken by the system, whole writes are dropped; so is what waits for a second."""
+
+SEND_BUFFER = 16 * 1024
+"""So much the system may take (Linux doubles it) before the other side has acknowledged it: it is beyond recall."""
+
+NOT_SENT_LOW_WATER = 1024
+"""So much the system may take that it has never sent (TCP_NOTSENT_LOWAT, where there is one)."""
+
+TURNS_OF_AN_ACCEPT = 5
+"""Turns of the loop from a client that it has accepted to one that we know: before, nobody would close it."""
+MAX_CLIENTS = 64
+"""Further clients of a listening link are turned away, or take the place of one that has said nothing yet."""
+
+
+class _TcpLink(BaseLink):
+    """What both ends have in common: streams that outlive the link by `LINGER_S` at most."""
+
+    def __init__(self, scheme: str, host: str, port: int) -> None:
+        super().__init__(f"{scheme}:{host_and_port(host, port)}")
+        self._host, self._port = host, port
+        self._streams: set[_Stream] = set()  # all that are not quite gone
+        self._stalled: set[_Stream] = set()
+
+    @property
+    def unsent_bytes(self) -> int:
+        """See `Link.unsent_bytes`; of all clients together."""
+        return sum(stream.unsent_bytes for stream in self._streams)
+
+    def discard_unsent(self) -> None:
+        """See `Link.discard_unsent`."""
+        for stream in self._streams:
+            stream.discard_unsent()
+
+    @abstractmethod
+    def _stream_made(self, stream: _Stream) -> None: ...
+
+    @abstractmethod
+    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None: ...
+
+    def _stream_begins(self, stream: _Stream) -> None:
+        self._streams.add(stream)
+        self._released.clear()
+        if self._receiver is None:
+            stream.close()
+        else:
+            self._stream_made(stream)
+
+    def _stream_ends(self, stream: _Stream, error: Exception | None) -> None:
+        self._streams.discard(stream)
+        if not self._streams:
+            self._released.set()
+        self._stream_lost(stream, error)
+        self._stream_stalled(stream, False)
+
+    def _stream_stalled(self, stream: _Stream, is_stalled: bool) -> None:
+        (self._stalled.add if is_stalled else self._stalled.discard)(stream)
+        self._tell_stalled(bool(self._stalled))
+
+    def _release(self) -> None:
+        for stream in tuple(self._streams):
+            stream.close()
+
+
+class TcpConnect(_TcpLink):
+    """``tcp:`` connects to a server; the server's end of stream is a lost link."""
+
+    def __init__(self, host: str, port: int, *, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> None:
+        super().__init__("tcp", host, port)
+        self._connect_timeout_s = connect_timeout_s
+        self._stream: _Stream | None = None
+
+    @property
+    def local_address(self) -> tuple[str, int]:
+        """Our own host and port; ("", 0) when it is not open."""
+        return self._stream.own_address if self._stream is not None else ("", 0)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; drops what is more than `MAX_PENDING_BYTES`, or has waited for a second."""
+        if self._stream is not None:
+            self._stream.write(data)
+
+    async def _connect(self) -> None:
+        with anyio.move_on_after(self._connect_timeout_s):
+            return await self._connect_to_any(await resolve(self._host, self._port, socket.SOCK_STREAM))
+        raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
+
+    async def _connect_to_any(self, endpoints: list[Endpoint]) -> None:
+        first_error: OSError | None = None
+        for endpoint in endpoints:
+            try:
+                return await self._connect_to(endpoint)
+            except OSError as error:
+                first_error = first_error or error
+        raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
+
+    async def _connect_to(self, endpoint: Endpoint) -> None:
+        loop = asyncio.get_running_loop()
+        sock = socket.socket(endpoint.family, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            await loop.sock_connect(sock, endpoint.address)
+        except BaseException:
+            sock.close()
+            raise
+        stream = _Stream(self)
+        try:
+            await loop.create_connection(lambda: stream, sock=sock)
+        except BaseException:
+            self._stream = None  # it was never open: not a loss
+            stream.close()
+            sock.close()  # uvloop leaves that to the garbage collector
+            self._stream_ends(stream, None)  # and does not tell the protocol
+            raise
+
+    def _stream_made(self, stream: _Stream) -> None:
+        self._stream = stream
+
+    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
+        if stream is self._stream:
+            self._lose(_why_lost(error), error)
+
+    def _release(self) -> None:
+        self._stream = None
+        super()._release()
+
+
+class TcpListen(_TcpLink):
+    """``tcpin:`` serves clients; each is a peer, and losing one, or all of them, does not lose the link.
+
+    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
+    IP addresses and networks that may connect (None: all); InvalidArgument for what is none.
+    """
+
+    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
+        super().__init__("tcpin", host, port)
+        self._allowed = AllowedPeers(peers)
+        self._kept: set[Peer] = set()
+        self._socket: socket.socket | None = None  # until the server has it
+        self._server: asyncio.AbstractServer | None = None
+        self._local_address = ("", 0)
+        self._clients: dict[Peer, _Stream] = {}
+
+    @property
+    def local_address(self) -> tuple[str, int]:
+        """Host and port this link listens on; ("", 0) before it is open."""
+        return self._local_address
+
+    @property
+    def peers(self) -> tuple[Peer, ...]:
+        """The clients that are connected now."""
+        return tuple(self._clients)
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; drops for a client what is more than `MAX_PENDING_BYTES`, or has waited for a second."""
+        if peer is None:
+            for client in tuple(self._clients.values()):
+                client.write(data)
+        elif client_of_peer := self._clients.get(peer):
+            client_of_peer.write(data)
+        else:
+            self._drop(1)
+
+    def unsent_bytes_to(self, peer: Peer) -> int:
+        """See `Link.unsent_bytes_to`."""
+        stream = self._clients.get(peer)
+        return 0 if stream is None else stream.unsent_bytes
+
+    def keep_peer(self, peer: Peer) -> None:
+        """See `Link.keep_peer`: it is not turned away for another one."""
+        if peer in self._clients:
+            self._kept.add(peer)
+
+    def forget_peer(self, peer: Peer) -> None:
+        """See `Link.forget_peer`: it may be turned away for another one."""
+        self._kept.discard(peer)
+
+    def has_peer(self, peer: Peer) -> bool:
+        """See `Link.has_peer`."""
+        return peer in self._clients
+
+    def close_clients(self) -> None:
+        """Cut off all clients; they may come again."""
+        for stream in tuple(self._clients.values()):
+            stream.close()
+
+    async def wait_closed(self) -> None:
+        """See `Link.wait_closed`."""
+        for _ in range(TURNS_OF_AN_ACCEPT):
+            await asyncio.sleep(0)
+        await super().wait_closed()
+        if self._server is not None and self._receiver is None:
+            with anyio.move_on_after(LINGER_S):
+                await self._server.wait_closed()
+
+    async def _connect(self) -> None:
+        self._socket = sock = await bound_socket(self._host, self._port, socket.SOCK_STREAM)
+        self._local_address = sock.getsockname()[:2]
+        self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(
+            lambda: _Stream(self), sock=sock, backlog=16, start_serving=False
+        )
+        self._socket = None
+        await self._server.start_serving()
+
+    def _stream_made(self, stream: _Stream) -> None:
+        host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
+        if (host and not self._allowed.allows(host)) or not self._has_room():
+            stream.close()
+        else:
+            self._clients[stream.peer] = stream
+            if isinstance(self._receiver, PeerListener):
+                self._receiver.peer_joined(stream.peer)
+
+    def _has_room(self) -> bool:
+        if len(self._clients) < MAX_CLIENTS:
+            return True
+        silent = next((peer for peer in self._clients if peer not in self._kept), None)
+        if not self._keeps_peers or silent is None:
+            return False
+        self._clients.pop(silent).close()
+        if isinstance(self._receiver, PeerListener):
+            self._receiver.peer_left(silent)
+        return True
+
+    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
+        if self._clients.get(stream.peer) is stream:
+            del self._clients[stream.peer]
+            self._kept.discard(stream.peer)
+            if isinstance(self._receiver, PeerListener):
+                self._receiver.peer_left(stream.peer)
+
+    def _release(self) -> None:
+        self._clients.clear()
+        if self._server is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed, and its sockets with it
+                self._server.close()
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+        super()._release()
+
+
+class _Stream(asyncio.Protocol):
+    """One TCP connection: bounded in what it holds back and for how long, and in how long it lingers."""
+
+    def __init__(self, link: _TcpLink) -> None:
+        self._link = link
+        self._transport: asyncio.Transport | None = None
+        self._outbox: Outbox | None = None
+        self._fd = -1
+        self._loop = asyncio.get_running_loop()
+        self._linger: asyncio.TimerHandle | None = None
+        self.peer: Peer = None
+
+    @property
+    def own_address(self) -> tuple[str, int]:
+        name: Any = self._transport and self._transport.get_extra_info("sockname")
+        return name[:2] if name else ("", 0)
+
+    @property
+    def unsent_bytes(self) -> int:
+        return 0 if self._outbox is None else self._outbox.unsent_bytes
+
+    def write(self, data: bytes) -> None:
+        if self._outbox is None or self._transport is None or self._transport.is_closing():
+            self._link._drop(1)
+        else:
+            self._outbox.write(data)
+
+    def discard_unsent(self) -> None:
+        if self._outbox is not None:
+            self._outbox.discard()
+
+    def close(self) -> None:
+        """Sends what was written, for up to `LINGER_S`, and closes; at once when the connection is stalled."""
+        if self._transport is None or self._outbox is None or self._transport.is_closing():
+            return
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            if self._outbox.is_stalled:
+                self._abort()
+                return
+            self._outbox.close()
+            self._transport.close()
+            if self._transport.get_write_buffer_size():
+                self._linger = self._loop.call_later(LINGER_S, self._abort)
+
+    def _abort(self) -> None:
+        """What has not been sent is not sent any more, when nobody waits for it."""
+        assert self._transport is not None
+        sock = self._transport.get_extra_info("socket")
+        discard_unsent(sock)
+        self._transport.abort()
+
+    def connection_made(self, transport: Any) -> None:  # not every loop's is a Transport by its class
+        self._transport = transport
+        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may be gone already
+        transport.set_write_buffer_limits(high=0)  # what it cannot get rid of at once waits in the outbox
+        sock = transport.get_extra_info("socket")
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, NOT_SENT_LOW_WATER)
+        self._fd = sock.fileno()
+        self._outbox = Outbox(
+            transport.write,
+            self._pending,
+            limit=MAX_PENDING_BYTES,
+            dropped=self._link._drop,
+            stalled=lambda is_stalled: self._link._stream_stalled(self, is_stalled),
+        )
+        self._link._stream_begins(self)
+
+    def data_received(self, data: bytes) -> None:
+        peer = self.peer if isinstance(self._link, TcpListen) else None
+        self._link._deliver(data, peer)
+
+    def pause_writing(self) -> None:
+        if self._outbox is not None:
+            self._outbox.pause()
+
+    def resume_writing(self) -> None:
+        if self._outbox is not None:
+            self._outbox.resume()
+
+    def _pending(self) -> int:
+        if self._transport is None or self._fd < 0:
+            return 0
+        return self._transport.get_write_buffer_size() + unsent_in_kernel(self._fd)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._fd = -1  # another file may have the number soon
+        if self._outbox is not None:
+            self._outbox.discard()
+            self._outbox.close()
+        if self._linger is not None:
+            self._linger.cancel()
+        self._link._stream_ends(self, exc)
+
+
+def _why_lost(error: Exception | None) -> str:
+    if error is None:
+        return "the other side closed the connection"
+    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__

@@ -1,0 +1,263 @@
+"""Sends any MAV_CMD to one vehicle and awaits its result; one command of a kind at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+from aerokit.connection.exchanges import ExchangeRun
+from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
+from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.messages import CommandAck
+from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.messages import CommandInt, CommandLong
+    from aerokit.protocols.command import Standing
+
+__all__ = ["CommandSender"]
+
+UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
+"""What firmware says that does not know a command, or not in the form that it had."""
+ROUND_TRIPS = 2
+"""Nothing is sent again before so many measured round trips: the answer is still under way."""
+LONGEST_ATTEMPT_S = 5.0
+UNDER_WAY_S = 2.0
+"""An answer that has not come by then was lost."""
+
+_Key = tuple[int, int]
+"""Component id, command."""
+
+
+class CommandSender:
+    """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
+
+    COMMAND_ACK carries no request id, so two equal commands to one component follow each other; different
+    commands never wait for each other. An order that a newer one has ended makes way at once, and one that ended while
+    it waited is not sent. What a cancelled or unconfirmed command left under way is not taken for the
+    answer to the next one.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        describe: Callable[[], str],
+        round_trip_s: Callable[[], float | None] = lambda: None,
+    ) -> None:
+        self._connection = connection
+        self._system_id, self._component_id = system_id, component_id
+        self._describe, self._round_trip_s = describe, round_trip_s
+        self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
+        self._standings: dict[_Key, Standing | None] = {}
+        """Of those that run."""
+        self._under_way: dict[_Key, list[float]] = {}
+        self._results: dict[_Key, int] = {}
+        self._accepted_at: dict[_Key, float] = {}
+        self._is_closed = False
+        self._detach = (
+            connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
+            connection.on_end(self._abort),
+        )
+
+    def close(self) -> None:
+        """Stop listening to answers: what waits for one, and what is asked for from now on, raises."""
+        for detach in self._detach:
+            detach()
+        self._is_closed = True
+        self._abort(ConnectionClosed("the block of this vehicle was left"))
+
+    async def send_long(
+        self,
+        command: int,
+        *params: float,
+        component_id: int | None = None,
+        attempts: int | None = None,
+        attempt_timeout: float | None = None,
+        progress_timeout: float = 10.0,
+        on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
+        is_sent: bool = False,
+    ) -> CommandAck:
+        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
+        target = self._component_id if component_id is None else component_id
+        message = command_long(self._system_id, target, command, params)
+        options = (attempts, attempt_timeout, progress_timeout, on_progress, standing, is_sent)
+        return await self._run(message, *options)
+
+    async def send_int(
+        self,
+        command: int,
+        *params: float,
+        frame: int,
+        x: int = 0,
+        y: int = 0,
+        z: float = 0.0,
+        component_id: int | None = None,
+        attempts: int | None = None,
+        attempt_timeout: float | None = None,
+        progress_timeout: float = 10.0,
+        on_progress: Callable[[int | None], None] | None = None,
+        standing: Standing | None = None,
+    ) -> CommandAck:
+        """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
+        target = self._component_id if component_id is None else component_id
+        message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
+        return await self._run(
+            message, attempts, attempt_timeout, progress_timeout, on_progress, standing, False
+        )
+
+    async def send_place(
+        self,
+        command: int,
+        *params: float,
+        x: int,
+        y: int,
+        z: float,
+        standing: Standing | None = None,
+        **options: Any,
+    ) -> CommandAck:
+        """Send a command with a place above the sea: as COMMAND_INT, or COMMAND_LONG where that is not known."""
+        try:
+            return await self.send_int(
+                command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, standing=standing, **options
+            )
+        except CommandRejected as error:
+            is_known = error.result not in UNKNOWN
+            if is_known or (standing is not None and standing.end):
+                raise
+        place = (x * 1e-7, y * 1e-7, z)
+        fill = (0.0,) * (4 - len(params))
+        return await self.send_long(command, *params, *fill, *place, standing=standing, **options)
+
+    def send_unconfirmed(self, command: int, *params: float, component_id: int | None = None) -> None:
+        """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
+        target = self._component_id if component_id is None else component_id
+        self._connection.send(command_long(self._system_id, target, command, params))
+        self._expect_answers((target, command), 1)
+
+    def is_for_us(self, ack: CommandAck) -> bool:
+        """Whether it answers us, and not another ground station; targets are 0 in MAVLink 1 and old firmwares."""
+        return ack.target_system in (0, self._connection.source_system) and ack.target_component in (
+            0,
+            self._connection.source_component,
+        )
+
+    def last_result(self, command: int, component_id: int | None = None) -> int | None:
+        """What it answered last to a command of ours (MAV_RESULT), also if nobody waited any more."""
+        return self._results.get((self._component_id if component_id is None else component_id, command))
+
+    def is_unknown(self, command: int, component_id: int | None = None) -> bool:
+        """Whether it has said that it does not know a command, or not in the form that it had."""
+        return self.last_result(command, component_id) in UNKNOWN
+
+    def accepted_at(self, command: int) -> float:
+        """When the autopilot last accepted a command of ours, by an answer that names us; −inf: it has not."""
+        return self._accepted_at.get((self._component_id, command), -math.inf)
+
+    def forget_result(self, command: int, component_id: int | None = None) -> None:
+        """What was answered does not count any more."""
+        key = (self._component_id if component_id is None else component_id, command)
+        self._results.pop(key, None)
+        self._accepted_at.pop(key, None)
+
+    def forget_results(self) -> None:
+        """The vehicle has rebooted: what it knows may be other commands."""
+        self._results.clear()
+
+    def awaits_answer(self, command: int) -> bool:
+        """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
+        oldest = self._connection.now() - UNDER_WAY_S
+        return any(at >= oldest for at in self._under_way.get((self._component_id, command), ()))
+
+    async def _run(
+        self,
+        message: CommandLong | CommandInt,
+        attempts: int | None,
+        attempt_timeout: float | None,
+        progress_timeout: float,
+        on_progress: Callable[[int | None], None] | None,
+        standing: Standing | None,
+        is_sent: bool,
+    ) -> CommandAck:
+        key = (
+            message.target_component or self._component_id,
+            message.command,
+        )  # to all: the autopilot answers
+        self._make_way(key)
+        end = "" if standing is None else standing.end
+        async with self._locks[key]:
+            if self._is_closed:
+                raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+            if standing is not None and standing.end != end and not is_sent:  # while it waited
+                raise CommandTimeout(f"{command_name(message.command)} was not sent: {standing.end}")
+            exchange = CommandExchange(
+                message,
+                own_system=self._connection.source_system,
+                own_component=self._connection.source_component,
+                attempts=attempts,
+                attempt_timeout=attempt_timeout,
+                answers_within_s=self._answers_within_s(),
+                progress_timeout=progress_timeout,
+                on_progress=on_progress,
+                answers_before_ours=max(0, self._take_answers_under_way(key) - is_sent),
+                standing=standing,
+                is_sent=is_sent,
+            )
+            run = self._runs[key] = ExchangeRun(self._connection, exchange)
+            self._standings[key] = standing
+            try:
+                return await run.result()
+            except CommandTimeout as error:
+                raise CommandTimeout(f"{error}; {self._describe()}") from None
+            finally:
+                del self._runs[key], self._standings[key]
+                self._expect_answers(key, exchange.answers_to_come)
+
+    def _make_way(self, key: _Key) -> None:
+        """An order that has ended keeps no newer one waiting for its answer."""
+        standing = self._standings.get(key)
+        if standing is not None and standing.end:
+            text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {standing.end}"
+            self._runs[key].abort(CommandTimeout(text))
+
+    def _answers_within_s(self) -> float:
+        """A stalled link that comes back has a round trip of all the time it was away: that is no reason to wait."""
+        return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), LONGEST_ATTEMPT_S)
+
+    def _expect_answers(self, key: _Key, count: int) -> None:
+        """Remember that answers may come which nobody waits for."""
+        if count:
+            self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
+
+    def _take_answers_under_way(self, key: _Key) -> int:
+        oldest = self._connection.now() - UNDER_WAY_S
+        return sum(at >= oldest for at in self._under_way.pop(key, ()))
+
+    def _abort(self, error: Exception) -> None:
+        for run in tuple(self._runs.values()):
+            run.abort(error)
+
+    def _on_ack(self, ack: CommandAck) -> None:
+        """Give an answer to the exchange that waits for it; without one, it was one of those under way."""
+        frame = ack.received_frame
+        key = (0 if frame is None else frame.component_id, ack.command)
+        run = self._runs.get(key)
+        is_answer = (run is not None or key in self._under_way) and self.is_for_us(ack)
+        if is_answer and ack.result != MavResult.IN_PROGRESS:
+            self._results[key] = ack.result
+            if ack.result == MavResult.ACCEPTED and ack.target_system == self._connection.source_system:
+                self._accepted_at[key] = self._connection.now()
+        if run is not None:
+            run.receive(ack)
+        elif key in self._under_way and ack.result != MavResult.IN_PROGRESS:
+            self._under_way[key].pop(0)
+            if not self._under_way[key]:
+                del self._under_way[key]

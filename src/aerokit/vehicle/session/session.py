@@ -1,0 +1,426 @@
+"""`Talk`: what is sent to one vehicle and heard of it, under one address."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit.autopilots import autopilot_for
+from aerokit.connection.cells import Source, StateCell
+from aerokit.connection.tasks import Background
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    ConnectionClosed,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.events import (
+    ArmedChanged,
+    ComputerSlept,
+    LandedStateChanged,
+    LinkChosen,
+    LinkReport,
+    LinkRestored,
+    ModeChanged,
+    StatusTextReceived,
+)
+from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
+from aerokit.mavlink.messages import (
+    AutopilotVersion,
+    AvailableModes,
+    CommandAck,
+    GpsGlobalOrigin,
+    HomePosition,
+    SetupSigning,
+)
+from aerokit.vehicle.session.commands import CommandSender
+from aerokit.vehicle.session.rates import Hearing, MessageRates
+from aerokit.vehicle.session.transfers import Transfers
+from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
+from aerokit.vehicle.state.telemetry import Telemetry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from aerokit.autopilots import Autopilot
+    from aerokit.connection.bus import Detach
+    from aerokit.connection.connection import Connection
+    from aerokit.events import Event
+    from aerokit.mavlink.message import Message
+    from aerokit.mavlink.messages import Heartbeat
+    from aerokit.mavlink.signing import Signing
+
+__all__ = ["Talk", "learn_constants", "set_up_signing"]
+
+SEND_AGAIN_S = 1.0
+"""A heartbeat comes each second, and shows whether the key was taken."""
+
+NO_KEY = bytes(32)
+
+A_SECOND = 100_000
+"""The vehicle begins with a time stamp that is surely not before that of the frame which brings it: going back, its
+frames would be taken for replayed ones."""
+
+
+async def set_up_signing(talk: Talk, signing: Signing | None, timeout: float) -> None:
+    """See :meth:`aerokit.Vehicle.setup_signing`."""
+    _check_vehicle(talk)
+    connection, started = talk.connection, talk.connection.now()
+    with connection._gate.handing_over(signing, talk.system_id, talk.component_id) as taken:
+        with anyio.move_on_after(timeout):
+            while not taken.is_set():
+                talk.send(_message(talk, signing))
+                with anyio.move_on_after(SEND_AGAIN_S):
+                    await taken.wait()
+                connection.raise_if_ended()
+        if taken.is_set():
+            return
+    texts = "; ".join(talk.texts_since(started)) or "it said nothing about it"
+    if talk.autopilot.keys_are_taken:
+        texts += f"; {talk.autopilot.keys_are_taken}"
+    wanted = "without a signature" if signing is None else f"signed with {signing.key!r}"
+    raise OperationTimeout(
+        f"setup_signing: no frame {wanted} came within {timeout:g} s; {texts}; {talk.describe_link()}"
+    )
+
+
+def _check_vehicle(talk: Talk) -> None:
+    heard = talk.connection.heard.get((talk.system_id, talk.component_id))
+    frame = None if heard is None else heard.received_frame
+    if talk.connection.mavlink_version == 1 or (frame is not None and frame.version == 1):
+        whose = "our" if talk.connection.mavlink_version == 1 else "the vehicle's"
+        raise NotSupported(f"setup_signing: {whose} frames are MAVLink 1, which has no signatures")
+    if not talk.telemetry.is_surely_disarmed:
+        state = "armed" if talk.telemetry.is_armed else "not known to be disarmed"
+        raise OperationRejected(f"setup_signing: the vehicle is {state}; nothing was sent")
+
+
+def _message(talk: Talk, signing: Signing | None) -> SetupSigning:
+    if signing is None:
+        return SetupSigning(talk.system_id, talk.component_id, NO_KEY, 0)
+    stamp = signing.timestamp_now(talk.connection.unix_time()) + A_SECOND
+    return SetupSigning(talk.system_id, talk.component_id, signing.key.secret, stamp)
+
+
+ASK_AGAIN_S = 3.0
+
+EAGER_REQUESTS, EAGER_S = 4, 0.3
+
+
+async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
+    """Ask until it is known, for as long as the connection is open; a reboot makes it unknown again."""
+    asked_for_modes = False
+    await _learn_version(commands, telemetry)
+    while connection.is_open:
+        for message_id, cell in (
+            (AutopilotVersion.ID, telemetry.version),
+            (HomePosition.ID, telemetry.home),
+            (GpsGlobalOrigin.ID, telemetry.origin),
+        ):
+            if not cell.is_known:
+                await _request(commands, message_id)
+        if not asked_for_modes:
+            asked_for_modes = await _request(commands, AvailableModes.ID)
+        await anyio.sleep(ASK_AGAIN_S)
+
+
+async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
+    """The first transfer waits for what the vehicle can do: ask eagerly, an answer may get lost behind its ack."""
+    version = telemetry.version
+    for _ in range(EAGER_REQUESTS):
+        if version.is_known:
+            return
+        await _request(commands, AutopilotVersion.ID, attempt_timeout=EAGER_S)
+        with anyio.move_on_after(EAGER_S):
+            await version.wait_until(lambda _: True)
+
+
+async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
+    """Ask for one message once; whether there was an answer, also that the vehicle does not have it."""
+    try:
+        await commands.send_long(
+            MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout
+        )
+    except CommandTimeout:
+        return False
+    except CommandRejected:
+        pass
+    return True
+
+
+SETTLE_S = 0.3
+"""How long after a refusal the vehicle's texts about it are waited for."""
+
+ACTION_HZ = 4.0
+"""How fast an action wants to be told what it waits for."""
+
+RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
+
+
+class Talk:
+    """The autopilot of one remote system: its address, its state, its commands, rates and transfers, and its silence.
+
+    ``on_reboot`` are called after the vehicle has rebooted.
+    """
+
+    def __init__(
+        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
+    ) -> None:
+        self.connection: Connection = connection
+        self.system_id: int = system_id
+        self.component_id: int = component_id
+        self.vehicle_type: int = heartbeat.type
+        self.autopilot: Autopilot = autopilot_for(heartbeat)
+        self.telemetry: Telemetry = Telemetry(
+            connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
+        )
+        self.link_quality: StateCell[LinkReport] = StateCell(
+            "link_quality", connection.now, "second of traffic"
+        )
+        self.commands: CommandSender = CommandSender(
+            connection, system_id, component_id, self.describe_link, lambda: self.link_watch.round_trip_s
+        )
+        self.rates: MessageRates = MessageRates(
+            connection, self.commands, system_id, component_id, self.autopilot.stream_groups
+        )
+        self.hearing: Hearing = Hearing(
+            connection, system_id, component_id, self.rates, keep=self.keep, at_close=self.at_close
+        )
+        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._note_reboot)
+        self.link_watch: LinkWatch = LinkWatch(
+            connection, system_id, component_id, self._on_link_report, self.watch.note_answer
+        )
+        self.background: Background = Background(connection.fail)
+        self.transfers: Transfers = Transfers(
+            connection,
+            system_id,
+            component_id,
+            autopilot=self.autopilot,
+            version=self.telemetry.version,
+            background=self.background,
+            describe=self.describe_link,
+            round_trip_s=lambda: self.link_watch.round_trip_s,
+            send_command=self.commands.send_long,
+        )
+        self.is_closed: bool = False
+        self._cells: list[StateCell[Any]] = [self.link_quality]
+        self._detach: list[Detach] = []
+        self._ended_by: Exception | None = None
+        self.on_reboot: list[Callable[[], None]] = [
+            self.rates.ask_again,
+            self.commands.forget_results,
+        ]
+        self._attach_telemetry()
+
+    # ------------------------------------------------------------------------- begin and end
+
+    def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
+        """Take the first heartbeat, ask for streams and constants, and watch."""
+        self.telemetry.receive(heartbeat)
+        for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
+            self.rates.want(message_type, hz, is_optional=rates is None)
+        for function in (self.rates.run, self.rates.watch, self._run_link_watch, self._learn_constants):
+            self.background.start(function, f"aerokit {function.__qualname__}")
+
+    def close(self) -> None:
+        """Say and hear nothing more; who waits gets ConnectionClosed."""
+        self.is_closed = True
+        self.transfers.is_closed = True
+        self._on_end(ConnectionClosed("the block of this vehicle was left"))
+        for detach in self._detach:
+            detach()
+        self.commands.close()
+        self.watch.close()
+        self.link_watch.close()
+        self.rates.close()
+
+    def at_close(self, *functions: Detach) -> None:
+        """Have these called when the vehicle is let go; at once if it was."""
+        self._detach += functions
+        if self.is_closed:
+            for function in functions:
+                function()
+
+    def keep(self, cell: StateCell[Any]) -> None:
+        """Have a cell end with the talk, and be forgotten when the vehicle has rebooted."""
+        self._cells.append(cell)
+        self.explain_timeouts(cell)
+        self.on_reboot.append(cell.forget)
+        if self._ended_by is not None:
+            cell.close(self._ended_by)
+
+    def explain_timeouts(self, *cells: StateCell[Any]) -> None:
+        """Have who waits for these in vain told of signatures that keep us and the vehicle apart."""
+        for cell in cells:
+            cell._explain_timeout = self._describe_signatures
+
+    def send(self, message: Message) -> None:
+        """Send one message as it is; ConnectionClosed after :meth:`close`."""
+        if self.is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+        self.connection.send(message)
+
+    # ------------------------------------------------------------------------------- hearing
+
+    @contextmanager
+    def streaming(self, *names: str) -> Iterator[None]:
+        """Have what tells these states sent, also when the program asked for no rates of its own."""
+        releases = [
+            self.rates.want(message_type, ACTION_HZ, is_optional=True)
+            for name in names
+            for message_type in self.telemetry.required_messages(name)
+        ]
+        try:
+            yield
+        finally:
+            for release in releases:
+                release()
+
+    @contextmanager
+    def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
+        """Collect later acks of a command that refuse what an earlier one accepted (PX4 acks some twice)."""
+        refusals: list[CommandAck] = []
+
+        def note(ack: CommandAck) -> None:
+            frame = ack.received_frame
+            is_its = frame is not None and frame.component_id == self.component_id
+            if ack.command != command or not is_its or not self.commands.is_for_us(ack):
+                return
+            if ack.result == MavResult.ACCEPTED:
+                refusals.clear()
+            elif ack.result in RESULTS_OF_REFUSAL:
+                refusals.append(ack)
+
+        detach = self.connection.bus.attach(CommandAck, note, system_id=self.system_id)
+        try:
+            yield refusals
+        finally:
+            detach()
+
+    async def settle(self) -> None:
+        """Give the vehicle's texts the time to come."""
+        await anyio.sleep(SETTLE_S)
+
+    def explained(
+        self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()
+    ) -> CommandRejected:
+        """The same refusal with what the vehicle has said of it since then, and these reasons; each once.
+
+        What it says as mere information ("ArduPilot Ready") is no reason.
+        """
+        texts = [
+            each.text
+            for each in self.telemetry.texts_since(since)
+            if each.severity <= MavSeverity.WARNING or self.autopilot.is_refusal(each.text)
+        ]
+        return CommandRejected(
+            str(error).partition("\n")[0],
+            command=error.command,
+            result=error.result,
+            reasons=self.each_reason_once(*error.reasons, *texts, *reasons),
+        )
+
+    def each_reason_once(self, *texts: str) -> tuple[str, ...]:
+        """ArduPilot says the same as "PreArm: …" and as "Arm: …"."""
+        reasons: dict[str, str] = {}
+        for text in texts:
+            reasons.setdefault(self.autopilot.arming_reason(text) or text, text)
+        return tuple(reasons.values())
+
+    def texts_since(self, at: float) -> tuple[str, ...]:
+        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        return tuple(each.text for each in self.telemetry.texts_since(at))
+
+    @property
+    def heartbeat_age(self) -> float:
+        """Seconds since the last heartbeat of the autopilot."""
+        return self.connection.now() - self.watch.last_heartbeat_at
+
+    def describe_link(self) -> str:
+        """One line on how well the vehicle is heard, for error texts."""
+        received, lost = self.connection.counts(self.system_id)
+        loss = (
+            f"{100 * lost / (received + lost):.0f} % of its frames lost"
+            if received + lost
+            else "nothing heard"
+        )
+        signatures = self._describe_signatures()
+        why = f"{signatures}; " if signatures else ""
+        texts = self.texts_since(self.connection.now() - 10.0)
+        said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
+        return f"{why}last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
+
+    def _describe_signatures(self) -> str:
+        return self.connection.describe_signatures(self.system_id)
+
+    # -------------------------------------------------------------------------------- events
+
+    def publish(self, event_type: type[Event], *fields: Any) -> None:
+        """Tell who listens to events of this vehicle."""
+        self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
+
+    def _attach_telemetry(self) -> None:
+        bus, streams = self.connection.bus, self.telemetry.streams
+        for message_id, handler in self.telemetry.handles.items():
+            message_type = bus.dialect.get(message_id)
+            if message_type is None:
+                continue
+            if message_id in streams:
+                detach = bus.attach_lazily(message_type, streams[message_id].take, system_id=self.system_id)
+            else:
+                detach = bus.attach(message_type, handler, system_id=self.system_id)
+            self._detach.append(detach)
+        telemetry, publish = self.telemetry, self.publish
+        self.explain_timeouts(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
+        self._detach += [
+            telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
+            telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),
+            telemetry.landed_state.observe(lambda old, new: publish(LandedStateChanged, old, new)),
+            telemetry.status_text.observe(
+                lambda _, new: publish(StatusTextReceived, new.severity, new.text), every_arrival=True
+            ),
+            bus.attach_event(LinkRestored, lambda _: self.rates.ask_again()),
+            bus.attach_event(LinkChosen, self._on_link_chosen),
+            bus.attach_event(ComputerSlept, self._on_computer_slept),
+            self.connection.on_end(self._on_end),
+        ]
+
+    def _on_link_chosen(self, event: LinkChosen) -> None:
+        """An autopilot keeps rates for each of its ports."""
+        if event.system_id == self.system_id and event.before is not None:
+            self.rates.ask_again()
+
+    def _on_computer_slept(self, event: ComputerSlept) -> None:
+        self.watch.last_heartbeat_at -= event.seconds
+        for cell in (*self.telemetry.cells.values(), *self._cells):
+            cell._grow_older(event.seconds)
+
+    def _on_link_report(self, report: LinkReport) -> None:
+        self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
+
+    async def _run_link_watch(self) -> None:
+        await self.link_watch.run(self._on_second)
+
+    def _on_second(self) -> None:
+        self.watch.check()
+        self.telemetry.expire(self.connection.now())
+
+    async def _learn_constants(self) -> None:
+        await learn_constants(self.connection, self.commands, self.telemetry)
+
+    def _note_reboot(self) -> None:
+        self.telemetry.forget()
+        for each in self.on_reboot:
+            each()
+
+    def _on_end(self, error: Exception) -> None:
+        self.background.cancel()
+        self.watch.end(error)
+        self.telemetry.close(error)
+        self._ended_by = error
+        for cell in self._cells:
+            cell.close(error)

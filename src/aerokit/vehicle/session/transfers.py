@@ -1,0 +1,145 @@
+"""``Transfers``: what parameters, missions, files and logs of one vehicle share: its timing, its features, its end."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import anyio
+
+from aerokit.connection.exchanges import run_exchange
+from aerokit.errors import AerokitError, ConnectionClosed, OperationTimeout
+from aerokit.protocols.exchange import RoundTrip
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    from aerokit.autopilots.base import Autopilot
+    from aerokit.autopilots.telemetry import AutopilotVersion
+    from aerokit.connection.bus import Detach
+    from aerokit.connection.cells import StateCell
+    from aerokit.connection.connection import Connection
+    from aerokit.connection.tasks import Background
+    from aerokit.protocols.exchange import Exchange
+
+__all__ = ["Talking", "Transfers"]
+
+ResultT = TypeVar("ResultT")
+
+VERSION_TIMEOUT_S = 3.0
+IN_BACKGROUND_S = 5.0
+
+
+class Talking(Protocol):
+    """What a part needs of the talk with the autopilot, or with another component."""
+
+    on_reboot: list[Callable[[], None]]
+
+    @property
+    def transfers(self) -> Transfers:
+        """What its exchanges go through."""
+        ...
+
+    def at_close(self, *functions: Detach) -> None:
+        """Have these called when the vehicle is let go."""
+
+
+class Transfers:
+    """Runs exchanges with the autopilot of one vehicle, and knows what that autopilot can do."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        *,
+        autopilot: Autopilot,
+        version: StateCell[AutopilotVersion],
+        background: Background,
+        describe: Callable[[], str],
+        round_trip_s: Callable[[], float | None] = lambda: None,
+        send_command: Callable[..., Awaitable[object]] | None = None,
+    ) -> None:
+        self.connection = connection
+        self.began_at: float = connection.now()
+        """When the talk with the vehicle began: numbers that must not be those of a program before count from here."""
+        self.system_id: int = system_id
+        self.component_id: int = component_id
+        self.autopilot = autopilot
+        self.background = background
+        self.round_trip: RoundTrip = RoundTrip()
+        """Measured by whatever was transferred before, at first by what keeps the clocks together."""
+        self.is_closed: bool = False
+        self._send_command = send_command
+        self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
+
+    async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
+        """Run one exchange to its end and return its result.
+
+        A time-out of the exchange comes out with what the link is like added to its text; ``timeout`` seconds for all
+        of it end in :class:`OperationTimeout`. Cancellation ends it at once.
+        """
+        if self.is_closed:
+            raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
+        with self.limit(timeout):
+            self._measure_link()
+            try:
+                result = await run_exchange(self.connection, self.system_id, exchange)
+            except OperationTimeout as error:
+                self._explain(error)
+                raise
+            if isinstance(result, dict):  # an answer for each name
+                for answer in result.values():
+                    if isinstance(answer, OperationTimeout):
+                        self._explain(answer)
+            return result
+
+    def _explain(self, error: OperationTimeout) -> None:
+        error.args = (f"{error}; {self._describe()}",)
+
+    def _measure_link(self) -> None:
+        seconds = self._round_trip_s() if self.round_trip.smoothed_s is None else None
+        if seconds is not None:
+            self.round_trip.measured(seconds)
+
+    @contextmanager
+    def limit(self, timeout: float | None) -> Iterator[None]:
+        """Seconds for all of a block; then :class:`OperationTimeout`. None: no limit."""
+        try:
+            with anyio.fail_after(timeout):
+                yield
+        except OperationTimeout:
+            raise
+        except TimeoutError:
+            raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
+
+    def command_in_background(self, command: int, *params: float) -> None:
+        """Send a command that makes things better, with nobody waiting; its failure is nobody's."""
+        send = self._send_command
+
+        async def order() -> None:
+            if send is not None:
+                with suppress(AerokitError), anyio.move_on_after(IN_BACKGROUND_S):
+                    await send(command, *params)
+
+        if not self.is_closed:
+            self.background.start(order, "aerokit command of a transfer")
+
+    @property
+    def version(self) -> AutopilotVersion | None:
+        """What the autopilot said of itself, None while it has not."""
+        return self._version.latest
+
+    @property
+    def known_capabilities(self) -> int | None:
+        """MAV_PROTOCOL_CAPABILITY bits of the autopilot, None while it has not told them."""
+        version = self._version.latest
+        return None if version is None else version.capabilities
+
+    async def capabilities(self) -> int | None:
+        """MAV_PROTOCOL_CAPABILITY bits of the autopilot; None when it does not tell within a few seconds."""
+        if not self._version.is_known:
+            with anyio.move_on_after(VERSION_TIMEOUT_S):
+                await self._version.wait_until(lambda _: True)
+        version = self._version.latest
+        return None if version is None else version.capabilities

@@ -1,0 +1,306 @@
+"""Watches one vehicle and its link: silence, reboots, loss, delay and rate, told as events."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit.connection.cells import StateCell
+from aerokit.connection.link_state import LinkStateWatch
+from aerokit.connection.loop_watch import PERIOD_S
+from aerokit.errors import LinkLost
+from aerokit.events import (
+    SILENT_AFTER_S,
+    LinkInterrupted,
+    LinkReport,
+    VehicleBack,
+    VehicleRebooted,
+    VehicleSilent,
+)
+from aerokit.mavlink.messages import Attitude, GlobalPositionInt, Heartbeat, SystemTime, Timesync
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from aerokit.connection.bus import Detach
+    from aerokit.connection.connection import Connection
+    from aerokit.events import LinkState
+    from aerokit.mavlink.frame import Frame
+
+__all__ = ["LinkWatch", "VehicleWatch"]
+
+REBOOT_STEP_MS = 3000
+"""Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
+REBOOT_SEEN_S = 0.2
+"""So long, and in at least two messages, must the new time run before it is believed: one late message is no reboot."""
+LATE_MS = 2000
+"""Once the vehicle has accepted to reboot: it boots for longer than this, and no message is so late."""
+CLOCK_SPAN_S = 5.0
+REPORT_PERIOD_S = 1.0
+TIMESYNC_PERIOD_S = 2.0
+QUESTIONS = 64
+"""So many questions may be under way; what is older is taken for lost."""
+
+
+class VehicleWatch:
+    """Tells when the heartbeats of one vehicle stop and come back, and when it has rebooted."""
+
+    reboots: int
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        on_reboot: Callable[[], None],
+    ) -> None:
+        self._connection, self._system_id, self._component_id = connection, system_id, component_id
+        self._on_reboot = on_reboot
+        self.last_heartbeat_at: float = connection.now()
+        self._heartbeat_read_at = connection.now()
+        self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
+        self._state_watch = LinkStateWatch(
+            self.link_state, connection.bus, system_id=system_id, component_id=component_id
+        )
+        self._state_watch.heard(connection.now())
+        self._is_told_silent = self._has_ended = False
+        self.reboots = 0
+        self._times: dict[str, tuple[int, float]] = {}
+        self._first_time: tuple[int, float] | None = None
+        connection.boot_clocks[system_id, component_id] = self.boot_time_ms
+        self._candidates: dict[str, tuple[int, float]] = {}
+        self._expects_reboot = False
+        self._last_answer = (-math.inf, 0)
+        attach = connection.bus.attach
+        self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
+        attach_frames = connection.bus.attach_frames
+        for message_type, take in (
+            (Attitude, self._on_boot_time),
+            (GlobalPositionInt, self._on_boot_time),
+            (SystemTime, self._on_system_time),
+        ):
+            self._detach.append(attach_frames(message_type, take, system_id=system_id))
+        self._detach.append(attach(Timesync, self._on_timesync, system_id=system_id))
+        self._detach.append(connection.bus.attach_event(LinkInterrupted, self._on_link_interrupted))
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether no heartbeat comes any more: for more than 3.5 seconds, or because the link has gone."""
+        return self._is_told_silent or self._has_ended or self.silent_for_s > SILENT_AFTER_S
+
+    @property
+    def silent_for_s(self) -> float:
+        """Seconds in which no heartbeat was read.
+
+        It may be older than that (:attr:`last_heartbeat_at`) when the loop was kept from reading: a pause of ours does
+        not make the vehicle silent.
+        """
+        return self._connection.now() - self._heartbeat_read_at
+
+    def end(self, error: Exception) -> None:
+        """Nothing will be heard any more."""
+        self._has_ended = True
+        self._state_watch.lost(self._connection.now(), is_told=isinstance(error, LinkLost))
+        self.link_state.close(error)
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
+        for detach in self._detach:
+            detach()
+
+    def boot_time_ms(self, now: float) -> float | None:
+        """The vehicle's time since boot at ``now``, by what its messages said last; None when they said nothing.
+
+        A simulation may be faster than time.
+        """
+        if "time_boot_ms" not in self._times or self._first_time is None:
+            return None
+        (last, at), (first, since) = self._times["time_boot_ms"], self._first_time
+        speed = (last - first) / (at - since) if at - since > CLOCK_SPAN_S else 1000.0
+        return last + speed * (now - at)
+
+    @contextmanager
+    def expecting_reboot(self) -> Iterator[None]:
+        """The vehicle has accepted to reboot: in the block it is noticed even if it had just booted before."""
+        self._expects_reboot = True
+        try:
+            yield
+        finally:
+            self._expects_reboot = False
+
+    def note_answer(self, asked_at: float, milliseconds: int) -> None:
+        """The vehicle's time since boot, as told in answer to a question of ours.
+
+        Asked after another answer had come, it tells an earlier time only if it has rebooted: that needs no patience,
+        and holds however fast a simulation runs.
+        """
+        before_at, before = self._last_answer
+        if asked_at <= before_at:
+            return
+        self._last_answer = (self._connection.now(), milliseconds)
+        if milliseconds < before:
+            self._has_rebooted("TIMESYNC", milliseconds)
+
+    def check(self) -> None:
+        """Publish VehicleSilent when heartbeats have stopped; called once a second."""
+        now = self._connection.now()
+        silent_for = self.silent_for_s
+        self._state_watch.check(now)
+        if silent_for > SILENT_AFTER_S and not self._is_told_silent:
+            self._is_told_silent = True
+            self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
+
+    def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        frame = heartbeat.received_frame
+        if frame is None or frame.component_id != self._component_id:
+            return
+        now = self._connection.now()
+        silent_for, self._heartbeat_read_at = self.silent_for_s, now
+        self.last_heartbeat_at = frame.received_at
+        self._state_watch.heard(now)
+        if self._is_told_silent:
+            self._is_told_silent = False
+            self._connection.bus.publish(VehicleBack(now, self._system_id, silent_for))
+
+    def _on_link_interrupted(self, event: LinkInterrupted) -> None:
+        self._state_watch.lost(event.at)
+
+    def _on_boot_time(self, frame: Frame) -> None:
+        """``time_boot_ms`` is the payload's beginning."""
+        if frame.component_id == self._component_id:
+            self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
+
+    def _on_system_time(self, frame: Frame) -> None:
+        """``time_boot_ms`` comes after ``time_unix_usec``."""
+        if frame.component_id == self._component_id:
+            self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
+
+    def _on_timesync(self, message: Timesync) -> None:
+        """Answers to our own questions come also from a vehicle that streams nothing (yet)."""
+        frame = message.received_frame
+        if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
+            self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
+
+    def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
+        now = self._connection.now()
+        before, then = self._times.get(clock, (milliseconds, now))
+        late = 1000 * (frame.received_at - then) - (milliseconds - before)  # at least: it may have come later
+        if self._expects_reboot and late > LATE_MS:
+            self._has_rebooted(clock, milliseconds)
+        elif milliseconds + REBOOT_STEP_MS >= before:
+            self._times[clock] = (milliseconds, now)
+            if self._first_time is None and clock == "time_boot_ms":
+                self._first_time = (milliseconds, now)
+            if self._candidates:
+                self._candidates.pop(clock, None)
+        elif self._is_confirmed(clock, milliseconds):
+            self._has_rebooted(clock, milliseconds)
+
+    def _is_confirmed(self, clock: str, milliseconds: int) -> bool:
+        """Whether the earlier time has been running for a while, with nothing of the later time in between."""
+        now = self._connection.now()
+        first, since = self._candidates.setdefault(clock, (milliseconds, now))
+        if milliseconds < first:
+            self._candidates[clock] = (milliseconds, now)
+            return False
+        return milliseconds > first and now - since >= REBOOT_SEEN_S
+
+    def _has_rebooted(self, clock: str, milliseconds: int) -> None:
+        now = self._connection.now()
+        self._times, self._candidates, self._first_time = {clock: (milliseconds, now)}, {}, None
+        self._expects_reboot, self._last_answer = False, (now, 0)
+        self.reboots += 1
+        self._on_reboot()
+        self._connection.bus.publish(VehicleRebooted(now, self._system_id))
+
+
+class LinkWatch:
+    """Measures the link to one vehicle once a second: loss by sequence numbers, delay by TIMESYNC, rates by counting.
+
+    See https://mavlink.io/en/services/timesync.html; ArduPilot and PX4 both answer.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        system_id: int,
+        component_id: int,
+        on_report: Callable[[LinkReport], None],
+        on_answer: Callable[[float, int], None],
+    ) -> None:
+        self._connection, self._system_id, self._component_id = connection, system_id, component_id
+        self._on_report, self._on_answer = on_report, on_answer
+        self._round_trip_s: float | None = None
+        self._asked: deque[int] = deque(maxlen=QUESTIONS)
+        self._ask_at = connection.now()
+        self._before = self._count()
+        self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
+
+    def close(self) -> None:
+        """Stop measuring."""
+        self._detach()
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """The last round trip in seconds; None before the first answer."""
+        return self._round_trip_s
+
+    async def run(self, on_tick: Callable[[], None]) -> None:
+        """Report once a second until cancelled or the connection ends; ``on_tick`` is called as often."""
+        self.ask()
+        self._ask_at = self._connection.now()  # once more with the first report
+        while self._connection.is_open:
+            await anyio.sleep(REPORT_PERIOD_S)
+            if self._connection.is_open:
+                if self._connection.now() >= self._ask_at:
+                    self.ask()
+                self._report()
+                on_tick()
+
+    def ask(self) -> None:
+        """Ask for the vehicle's time now, besides every two seconds."""
+        now = self._connection.now()
+        self._ask_at = now + TIMESYNC_PERIOD_S
+        self._asked.append(int(now * 1e9))
+        self._connection.send(Timesync(0, self._asked[-1]), to=self._system_id)
+
+    def _on_timesync(self, message: Timesync) -> None:
+        """Take the answer to our question; questions of the vehicle and answers to others are not ours.
+
+        Nor are the answers of its other components, such as a companion computer, which may be the first ones.
+        """
+        frame = message.received_frame
+        if frame is None or frame.component_id != self._component_id:
+            return
+        if message.tc1 != 0 and message.ts1 in self._asked:
+            self._asked.remove(message.ts1)
+            now = self._connection.now()
+            if now - frame.received_at < PERIOD_S:  # else it had waited for us
+                self._round_trip_s = now - message.ts1 / 1e9
+            self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
+
+    def _report(self) -> None:
+        at, (received, lost), total = count = self._count()
+        then, (received_before, lost_before), total_before = self._before
+        self._before = count
+        seconds = max(at - then, 1e-9)
+        frames, missing = max(0, received - received_before), max(0, lost - lost_before)
+        report = LinkReport(
+            at,
+            self._system_id,
+            100 * missing / (frames + missing) if frames + missing else None,
+            self._round_trip_s,
+            frames / seconds,
+            (total - total_before) / seconds,
+        )
+        self._on_report(report)
+        self._connection.bus.publish(report)
+
+    def _count(self) -> tuple[float, tuple[int, int], int]:
+        total = sum(each.bytes for each in self._connection.statistics())
+        return self._connection.now(), self._connection.counts(self._system_id), total
