@@ -15,7 +15,7 @@ from aerokit.vehicle.camera.cameras import Camera
 from aerokit.vehicle.camera.part import CameraBlock
 from aerokit.vehicle.camera.shooting import PhotoInterval
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
-from aerokit.vehicle.commanding.posting import PostedOrder
+from aerokit.vehicle.commanding.posted import PostedOrder
 from aerokit.vehicle.components.component import Component
 from aerokit.vehicle.components.settings import Settings
 from aerokit.vehicle.files.files import Files

@@ -61,7 +61,7 @@ def commands(stage: Stage, order: Any) -> list[tuple[int, tuple[float | None, ..
     """The commands of an order, until it is done or was refused."""
     since = stage.fc.mark()
     order()
-    stage.vehicle._handler.orders.wait(10.0)
+    stage.vehicle._handler.calls.wait(10.0)
     stage.reached()
     frames = stage.fc.commands(since=since)
     assert {frame.target for frame in frames} <= {(1, 1)}

@@ -47,7 +47,7 @@ def test_a_refused_calibration_is_a_warning_with_the_reason(stage: Stage) -> Non
     stage.fc.reasons[CALIBRATION] = "Disarm to allow calibration"
     with stage.logged() as lines:
         stage.vehicle.send_calibrate_gyro()
-        stage.vehicle._handler.orders.wait(10.0)
+        stage.vehicle._handler.calls.wait(10.0)
     assert [line for line in lines if "FAILED" in line and "Disarm to allow calibration" in line]
 
 
@@ -59,7 +59,7 @@ def test_a_long_calibration_is_sent_once(stage: Stage) -> None:
         stage.fc.wait_for_command(CALIBRATION, since=since)
         stage.settle()
         stage.tell("COMMAND_ACK", command=CALIBRATION, result=0)
-        stage.vehicle._handler.orders.wait(10.0)
+        stage.vehicle._handler.calls.wait(10.0)
     assert len(stage.fc.commands(CALIBRATION, since=since)) == 1
     assert not [line for line in lines if line.startswith("WARNING")]
 
@@ -79,7 +79,7 @@ def test_calibration_or_reboot_with_a_lost_answer_is_sent_once(
     since = stage.fc.mark()
     with stage.logged() as lines:
         getattr(stage.vehicle, name)()
-        stage.vehicle._handler.orders.wait(10.0)
+        stage.vehicle._handler.calls.wait(10.0)
     stage.settle()
     assert len(stage.fc.commands(since=since)) == 1
     assert [line for line in lines if line.startswith("WARNING") and "COMMAND_ACK" in line]

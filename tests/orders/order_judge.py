@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.commanding.helm import FIRST_HEARTBEAT_S
+from aerokit.vehicle.commanding.arbiter import FIRST_HEARTBEAT_S
 from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
 ENDS_FLIGHT = ("disarm", "land", "return_to_launch")

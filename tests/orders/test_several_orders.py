@@ -21,7 +21,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, SetPositionTargetLocalNed
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
-from aerokit.vehicle.commanding.helm import MODE_GRACE_S
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 
 SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
 COMMANDS = (176, 192, 400, 20)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.dronekit.attributes import VehicleAttributes
-    from aerokit.dronekit.line import Order
+    from aerokit.dronekit.line import BackgroundCall
     from aerokit.dronekit.values import LocationGlobal
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -137,7 +137,7 @@ class CommandSequence:
         self._uploaded: tuple[tuple[Any, ...], ...] = ()
         """What the commands said when the vehicle had them last."""
         self._downloads = 0
-        self._download: Order | None = None
+        self._download: BackgroundCall | None = None
         self._current = vehicle._dk_current_command
 
     # ------------------------------------------------------------------- from and to the vehicle

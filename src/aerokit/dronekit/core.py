@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from aerokit.connection.tasks import Background
-    from aerokit.dronekit.line import Order, Work
+    from aerokit.dronekit.line import BackgroundCall, Work
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
@@ -268,13 +268,13 @@ class Core:
         with classic_errors():
             return self.handler.loop.run(function, *args, **kwargs)
 
-    def order(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> Order:
+    def order(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
         """Give an order without waiting; a newer one of its kind replaces it."""
         self.check_link()
         with classic_errors():
-            return self.handler.orders.give(kind, function, *args, **kwargs)
+            return self.handler.calls.give(kind, function, *args, **kwargs)
 
-    def command(self, kind: str, command: int, *params: float, **options: Any) -> Order:
+    def command(self, kind: str, command: int, *params: float, **options: Any) -> BackgroundCall:
         """Order that a command is sent to all components, of which the autopilot's answer counts."""
         options.setdefault("retries", attempts_of(command, params) - 1)
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from concurrent.futures import Future
 
-    from aerokit.dronekit.line import Order
+    from aerokit.dronekit.line import BackgroundCall
 
 __all__ = ["FlightMethods"]
 
@@ -35,7 +35,7 @@ class FlightMethods(VehicleAttributes):
     All of them raise APIException while the link is down.
     """
 
-    _dk_arming: Order | None = None
+    _dk_arming: BackgroundCall | None = None
 
     # --------------------------------------------------------------------------------- modes
 
@@ -53,7 +53,7 @@ class FlightMethods(VehicleAttributes):
     def mode(self, value: VehicleMode | str | int) -> None:
         self._dk_set_mode(value)
 
-    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, Order]:
+    def _dk_set_mode(self, value: VehicleMode | str | int) -> tuple[str, BackgroundCall]:
         aio = self._dk.check_link()
         wanted = flight_orders.mode_named(aio, value.name if isinstance(value, VehicleMode) else value)
         return wanted.name, self._dk.order("mode", flight_orders.change_mode, aio, wanted)
@@ -82,7 +82,7 @@ class FlightMethods(VehicleAttributes):
         else:
             self._dk.check_link()
 
-    def _dk_set_armed(self, value: bool) -> Order:
+    def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
         self._dk_arming = order = self._dk.order(ARMING[value], flight_orders.change_armed, aio, value)
         return order
@@ -126,7 +126,7 @@ class FlightMethods(VehicleAttributes):
         if alt is not None:
             self._dk_take_off(float(alt))
 
-    def _dk_take_off(self, altitude: float) -> Order:
+    def _dk_take_off(self, altitude: float) -> BackgroundCall:
         """Altitude above home in metres."""
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
@@ -317,7 +317,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_wait_for_order(
         self,
-        order: Order,
+        order: BackgroundCall,
         is_done: Callable[[], bool],
         timeout: float | None,
         text: str,
@@ -338,5 +338,5 @@ class FlightMethods(VehicleAttributes):
         try:
             self.wait_for(is_over, timeout, ORDERS_LOOK_S, text)
         except BaseException:
-            self._handler.orders.withdraw(order)
+            self._handler.calls.withdraw(order)
             raise

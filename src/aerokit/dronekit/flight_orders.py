@@ -27,7 +27,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.messages import PlayTune
 from aerokit.protocols.command import command_long
-from aerokit.vehicle.commanding.helm import KNOWN_S
+from aerokit.vehicle.commanding.arbiter import KNOWN_S
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot, Purpose

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 __all__ = [
     "CHANNELS_OF_MAVLINK_1",
     "RELEASE_UPPER",
+    "BackgroundCall",
+    "BackgroundCalls",
     "Line",
-    "Order",
-    "Orders",
     "OverrideRelease",
     "Work",
     "weakly",
@@ -69,7 +69,7 @@ class Line:
         self._held = held
         self.connection: Connection = held.value
         """The asynchronous connection, for code that runs on its loop."""
-        self.orders: Orders = Orders(loop)
+        self.calls: BackgroundCalls = BackgroundCalls(loop)
         """What was ordered without waiting."""
         self.overrides = overrides
         """The RC channels that are given back when the connection ends."""
@@ -96,7 +96,7 @@ class Line:
         message.encode()  # so that what is wrong with it is told to who made it
         with classic_errors():
             self.connection.raise_if_ended()
-            self.orders.post(self._send, message, to)
+            self.calls.post(self._send, message, to)
 
     def _send(self, message: Message, to: int | None) -> None:
         try:
@@ -117,7 +117,7 @@ class Line:
             self._is_closed.set()
         atexit.unregister(self._at_exit)
         try:
-            self.orders.wait(ORDERS_END_S)
+            self.calls.wait(ORDERS_END_S)
         finally:
             self.listener_thread.stop()
             try:
@@ -171,8 +171,8 @@ def _let_go(
         function()
 
 
-class Order(concurrent.futures.Future[None]):
-    """What was ordered: done when it has ended, with its failure."""
+class BackgroundCall(concurrent.futures.Future[None]):
+    """A call that runs on the loop while the program goes on: done when it has ended, with its failure."""
 
     def __init__(self, kind: str) -> None:
         super().__init__()
@@ -180,25 +180,26 @@ class Order(concurrent.futures.Future[None]):
         self.task: asyncio.Task[None] | None = None
 
 
-class Orders:
-    """Runs coroutine functions on the loop in the background, one of each kind at a time: a newer one replaces it.
+class BackgroundCalls:
+    """Runs coroutine functions on the loop in the background; a failure becomes one warning, too.
 
-    A failure becomes one warning, too.
+    A newer call of a kind ends the wait of the one before. What may still be sent is not decided here, but by the
+    vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter`.
     """
 
     def __init__(self, loop: LoopThread) -> None:
         self._loop = loop
-        self._newest: dict[str, Order] = {}
-        self._pending: set[Order] = set()
+        self._newest: dict[str, BackgroundCall] = {}
+        self._pending: set[BackgroundCall] = set()
         self.describe: Callable[[], str] | None = None
         """What to say of the vehicle when it has refused an order."""
 
-    def give(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> Order:
+    def give(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
         """Start it; what it sends first goes out in the order of these calls. Never blocks; from any thread.
 
         ConnectionClosed when the connection was closed.
         """
-        order = Order(kind)
+        order = BackgroundCall(kind)
         self._pending.add(order)
         order.add_done_callback(self._pending.discard)
         try:
@@ -208,7 +209,7 @@ class Orders:
             raise
         return order
 
-    def withdraw(self, order: Order) -> None:
+    def withdraw(self, order: BackgroundCall) -> None:
         """What :meth:`give` returned is not wanted any more: it is not sent again. Never blocks; from any thread."""
         with contextlib.suppress(ConnectionClosed):
             self._loop.call_soon(self._withdraw, order)
@@ -226,7 +227,7 @@ class Orders:
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
 
-    def _begin(self, order: Order, work: Work) -> None:
+    def _begin(self, order: BackgroundCall, work: Work) -> None:
         place = REPLACES.get(order.kind, order.kind)
         if place in self._newest:
             self._withdraw(self._newest[place])
@@ -236,18 +237,18 @@ class Orders:
             order.task.add_done_callback(lambda _: self._end(place, order))
             self._newest[place] = order
 
-    def _withdraw(self, order: Order) -> None:
+    def _withdraw(self, order: BackgroundCall) -> None:
         if order.task is not None and order in self._newest.values():
             order.task.cancel()
 
-    def _end(self, place: str, order: Order) -> None:
+    def _end(self, place: str, order: BackgroundCall) -> None:
         if self._newest.get(place) is order:
             del self._newest[place]
         if not order.done():  # it was cancelled before its first step, or while it waited
             why = "a newer order replaced it, it was withdrawn, or the connection was closed"
             order.set_exception(ConnectionClosed(f"{order.kind}: {why}"))
 
-    async def _run(self, order: Order, work: Work) -> None:
+    async def _run(self, order: BackgroundCall, work: Work) -> None:
         try:
             await work()
         except Exception as error:

@@ -81,7 +81,7 @@ class ParameterReading:
     def seek(self) -> None:
         """As :meth:`begin`, from any thread; silent when the connection is closed."""
         with contextlib.suppress(AerokitError):
-            self._core.handler.orders.post(self.begin)
+            self._core.handler.calls.post(self.begin)
 
     async def find(self, name: str) -> None:
         """Return when the parameter has come, by itself or with the list, or when it is certain that there is none."""

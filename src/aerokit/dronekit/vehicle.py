@@ -261,7 +261,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         core = self._dk
         core.begin(aio, tasks)
         self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
-        self._handler.orders.describe = self._dk_describe
+        self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weakly(self._dk_on_status_text), every_arrival=True)
         first = aio.connection.heard.get((aio.system_id, aio.component_id))
         if first is not None:

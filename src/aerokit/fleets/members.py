@@ -133,7 +133,7 @@ class Member:
         """The program orders it again: what somebody else has done until now does not count."""
         self._taken_back = self._who_steers()
         self._forgiven_state = self.vehicle.system_status.latest
-        self.vehicle._helm.forgive_failsafe()
+        self.vehicle._arbiter.forgive_failsafe()
         if self.vehicle.is_silent:
             self._lost_at = self.vehicle.connection.now()
             self._change(MemberState.LOST, self.vehicle.describe_link())
@@ -159,11 +159,11 @@ class Member:
         has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
         if has_ended_mission or self._who_steers() == self._taken_back:
             return ""
-        is_others = vehicle.is_armed and vehicle._helm.current is None
+        is_others = vehicle.is_armed and vehicle._arbiter.current is None
         return vehicle.taken_over or ("somebody else has armed it" if is_others else "")
 
     def _who_steers(self) -> tuple[object, object]:
-        return self.vehicle._helm.newest, self.vehicle.mode.latest
+        return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
     def _soon(self, function: Callable[[], None], *_: Any) -> None:
         """After all of the HEARTBEAT has been read: who landed disarms and changes its mode in the same one."""

@@ -74,7 +74,7 @@ TWINS = (
     Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids")),
-    Twin("aerokit.vehicle.commanding.posting.PostedOrder"),
+    Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.logs.Logs"),
     Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),

@@ -90,7 +90,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.videos import SourceName
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
     from aerokit.vehicle.commanding.order import Subject
-    from aerokit.vehicle.commanding.posting import PostedOrder as AsyncPostedOrder
+    from aerokit.vehicle.commanding.posted import PostedOrder as AsyncPostedOrder
     from aerokit.vehicle.commanding.setpoints import (
         AttitudeSetpoint,
         LocalPositionSetpoint,
@@ -957,8 +957,9 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
         Raises:
             InvalidArgument: a parameter is no number or does not fit, or the block was left. Nothing was sent.
+            OperationRejected: the order has ended: a newer one was given, or somebody else steers.
             CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent, or not again, for a reason.
+            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
         """
         self._loop.run(self.aio.command, command, *params, component_id=component_id)
 
@@ -1012,6 +1013,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
         Raises:
             CommandRejected: the vehicle took its acceptance back, as PX4 does.
+            HeartbeatTimeout: the vehicle was silent for 10 seconds.
             OperationTimeout: it was not told within ``timeout`` seconds.
         """
         self._loop.run(self.aio.until_told, timeout)

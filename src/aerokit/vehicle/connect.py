@@ -226,7 +226,7 @@ async def _attached(
 
 def tell_how_it_is_left(vehicle: Vehicle) -> None:
     """Log what a vehicle does that a program lets go in flight without having meant to, if it does so by its orders."""
-    if vehicle._helm.is_obeyed and not vehicle.is_surely_disarmed:
+    if vehicle._arbiter.is_obeyed and not vehicle.is_surely_disarmed:
         logger.warning("vehicle %d is let go: %s", vehicle.system_id, vehicle.describe_now())
 
 

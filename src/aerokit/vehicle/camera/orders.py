@@ -10,14 +10,13 @@ import anyio
 
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout
 from aerokit.protocols.command import command_long, command_name
-from aerokit.vehicle.commanding.newest import OVERRULED
+from aerokit.vehicle.commanding.order import OVERRULED
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
     from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.commanding.order import Sending
-    from aerokit.vehicle.commanding.subjects import Given, Subject
+    from aerokit.vehicle.commanding.order import Order, SentCommand, Topic
     from aerokit.vehicle.components.component import Component
     from aerokit.vehicle.session.session import Talk
 
@@ -28,24 +27,23 @@ SENT = 8
 
 
 class _Standing:
-    """Whether an order to a camera may be sent again: the newest of its subject, to a camera that has told of itself.
+    """Whether a command to a camera may be sent again: to one that has told of itself.
 
     One with a component id of its own must have been heard since the order: HEARTBEAT of the autopilot is none of its.
     """
 
-    def __init__(self, line: Ordering, sending: Sending, given: Given | None) -> None:
-        self._line, self._sending, self._given = line, sending, given
+    def __init__(self, line: Ordering, sent: SentCommand) -> None:
+        self._line, self._sent = line, sent
 
     @property
     def end(self) -> str:
         """Why it must not be sent again, as a clause; empty while it may."""
-        is_overruled = self._given is not None and not self._given.is_newest
-        return self._sending.end or (OVERRULED if is_overruled else "")
+        return self._sent.end
 
     @property
     def told_at(self) -> float:
         """When the camera last told of itself, of a vehicle that is not silent either."""
-        return self._sending.told_at if self._line.is_behind else self._line.heard_at()
+        return self._sent.told_at if self._line.is_behind else self._line.heard_at()
 
 
 class Ordering:
@@ -74,21 +72,29 @@ class Ordering:
     def heard_at(self) -> float:
         """When its own HEARTBEAT came last; never, while the vehicle is silent."""
         heard_at = self._talk.connection.heard_at(self._talk.system_id, self.component.component_id)
-        return heard_at if self._bridge.helm.is_known else -math.inf
+        return heard_at if self._bridge.arbiter.is_known else -math.inf
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
         """What is to be sent when the vehicle's block ends, without waiting."""
         return self._bridge.on_finish
 
-    def subject(self, name: str) -> Subject:
+    def topic(self, subject: str) -> Topic:
         """What orders to this camera are about; the same for all objects of it."""
-        return self._bridge.subjects[(self.component.component_id, self.device, name)]
+        return ("camera", self.component.component_id, self.device, subject)
+
+    def begin(self, subject: str) -> Order:
+        """A new order about this; withdrawn, it lets the one before count again."""
+        return self._bridge.arbiter.of_device(self.topic(subject), may_be_withdrawn=True)
+
+    def latest(self, subject: str) -> Order | None:
+        """The newest order about this that was not withdrawn."""
+        return self._bridge.arbiter.latest(self.topic(subject))
 
     @contextmanager
-    def giving(self, subject: str) -> Iterator[Given]:
+    def giving(self, subject: str) -> Iterator[Order]:
         """A new order about this is given, for the time of the block; one that fails lets those before count again."""
-        given = self.subject(subject).begin()
+        given = self.begin(subject)
         try:
             yield given
         except BaseException:
@@ -96,7 +102,7 @@ class Ordering:
             raise
         given.settle()
 
-    async def order(self, command: int, *params: float, given: Given | None = None, **options: Any) -> None:
+    async def order(self, command: int, *params: float, given: Order | None = None, **options: Any) -> None:
         """A command that changes something; sent again as docs/reliability.md has it.
 
         ``given`` is the order that it is of, if a newer one about the same may end it.
@@ -104,16 +110,16 @@ class Ordering:
         if given is not None and not given.is_newest:
             raise CommandTimeout(f"{command_name(command)} was not sent: {OVERRULED}")
         if given is not None and not self._talk.is_closed:
-            given.is_sent = True
+            given.is_given = True
         talk, started = self._talk, self._talk.connection.now()
-        helm = self._bridge.helm
-        with helm.aside() as order, helm.sending(order) as sending:
+        arbiter = self._bridge.arbiter
+        with arbiter.aside(given) as order, arbiter.sending(order) as sent:
             try:
                 await talk.commands.send_long(
                     command,
                     *params,
                     component_id=self.component.component_id,
-                    standing=_Standing(self, sending, given),
+                    standing=_Standing(self, sent),
                     **options,
                 )
             except CommandRejected as error:
@@ -122,7 +128,7 @@ class Ordering:
 
     async def order_once(
         self,
-        given: Given,
+        given: Order,
         send: Callable[[], Awaitable[None]],
         has_worked: Callable[[], Awaitable[bool | None]],
     ) -> None:
@@ -152,7 +158,7 @@ class Ordering:
         target = self._component.component_id
         self._talk.connection.send(command_long(self._talk.system_id, target, command, params))
 
-    async def finish(self, given: Given, command: int, *params: float, is_awaited: bool) -> None:
+    async def finish(self, given: Order, command: int, *params: float, is_awaited: bool) -> None:
         """The end of a block: the command leaves at once, and is sent again beside the program until it is answered.
 
         Not if a newer order about the same was given meanwhile. Raises, if ``is_awaited``, what :meth:`order` does.

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from aerokit.vehicle.camera.link import CameraLine
-    from aerokit.vehicle.commanding.subjects import Given
+    from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["Begun", "CameraBlock", "CameraPart"]
 
@@ -28,13 +28,13 @@ class Begun:
 
     def __init__(self, line: CameraLine, subject: str, stop: Callable[[], tuple[float, ...]]) -> None:
         self._line, self._stop = line, stop
-        self.given: Given = line.subject(subject).begin()
+        self.given: Order = line.begin(subject)
         self._is_over = False
         line.on_finish.append(self._finish)
 
     def settle(self, error: BaseException | None = None) -> bool:
         """It was begun, unless there was an error; whether it may have begun in spite of that, and is to be ended."""
-        if error is not None and (not self.given.is_sent or isinstance(error, CommandRejected)):
+        if error is not None and (not self.given.is_given or isinstance(error, CommandRejected)):
             self.given.withdraw()
             self.drop()
             return False
@@ -56,7 +56,7 @@ class Begun:
 
     def _finish(self) -> None:
         """The block of the vehicle is left: the order leaves at once, and nobody waits for its answer."""
-        is_meant = self.given.is_sent and self.given.is_newest
+        is_meant = self.given.is_given and self.given.is_newest
         self.drop()
         if is_meant:
             command, *params = self._stop()
@@ -75,7 +75,7 @@ class CameraBlock:
         line: CameraLine,
         subject: str,
         able: Callable[[], Awaitable[None]],
-        start: Callable[[Given], Awaitable[None]],
+        start: Callable[[Order], Awaitable[None]],
         stop: Callable[[], tuple[float, ...]],
     ) -> None:
         self._line, self._subject = line, subject

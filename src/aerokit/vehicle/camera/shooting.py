@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.link import CameraLine
-    from aerokit.vehicle.commanding.subjects import Given
+    from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["PhotoInterval", "Shutter"]
 
@@ -74,7 +74,7 @@ class Shutter:
     async def take(self, timeout: float) -> Capture:
         """One picture; see `Camera.take_photo`."""
         async with self._lock:
-            series = self.line.subject("series").latest
+            series = self.line.latest("series")
             before = await self.status_before()
             known = {each.index for each in self.album.captures()}
             error: CommandTimeout | None = None
@@ -97,7 +97,7 @@ class Shutter:
                         missed = await self.album.ask_for(newest) if is_there else None
                     elif now.image_count > before.image_count:
                         missed = await self.album.ask_for(before.image_count)
-                    elif self.line.subject("series").latest is not series:
+                    elif self.line.latest("series") is not series:
                         continue  # a series was begun or ended since: this one is not ordered again
                     elif error is not None and sent < SENT and not now.is_capturing:
                         # it says, after the order, that it takes and has taken none: the order was lost
@@ -151,7 +151,7 @@ class Shutter:
             raise refusal from None
 
     async def start_series(
-        self, given: Given, seconds: float, count: int, before: CameraStatus | None
+        self, given: Order, seconds: float, count: int, before: CameraStatus | None
     ) -> None:
         """Order pictures one after the other; again only when the camera says, after that, that it takes none."""
         if self.line.by_trigger:

@@ -23,7 +23,7 @@ from aerokit.vehicle.camera.values import (
 if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.camera.link import CameraLine
-    from aerokit.vehicle.commanding.subjects import Given
+    from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["SourceName", "VideoCalls"]
 
@@ -82,7 +82,7 @@ class VideoCalls(CameraPart):
         with self._line.giving("video") as given:
             await self._start(given, status_hz, timeout)
 
-    async def _start(self, given: Given, status_hz: float, timeout: float) -> None:
+    async def _start(self, given: Order, status_hz: float, timeout: float) -> None:
         order = (START, self._line.video_stream, status_hz, self._line.device)
         await self._line.order_once(
             given, lambda: self._line.order(*order, given=given, attempts=1), self._is_recording

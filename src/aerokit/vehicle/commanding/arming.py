@@ -18,7 +18,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.commanding.cleanup import LATE_S, give_arm
+from aerokit.vehicle.commanding.cleanup import LATE_S
 from aerokit.vehicle.commanding.context import Part
 from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, Arrivals, await_progress
 
@@ -126,9 +126,9 @@ class ArmingActions(Part):
             await self._go_to_arming_mode(wanted)
         self._late_arming.stop()
         started, was_armed = self.connection.now(), self.telemetry.is_armed
-        with self._helm.aside() as order:
+        with self._arbiter.aside() as order:
             try:
-                await give_arm(self._talk, self._orders, order, True, force=force)
+                await self._sender.give_arm(order, True, force=force)
                 await self._await_armed(True, order, started, timeout, max_silence_s)
             except CommandRejected as error:
                 reasons = await self._health.arming_reasons(started)
@@ -162,8 +162,8 @@ class ArmingActions(Part):
         """
         self._late_arming.stop()
         started = self.connection.now()
-        with self._helm.aside(ends_flight=True) as order:
-            await give_arm(self._talk, self._orders, order, False, force=force)
+        with self._arbiter.aside(ends_flight=True) as order:
+            await self._sender.give_arm(order, False, force=force)
             await self._await_armed(False, order, started, timeout, max_silence_s)
 
     async def _await_armed(
@@ -209,13 +209,13 @@ class ArmingActions(Part):
 
     async def _go_to_arming_mode(self, wanted: Mode) -> None:
         """Afterwards the order to arm is not meant any more, or not yet, if anything has come between."""
-        order, count = self._helm.order(wanted), self._helm.arming_orders
-        await self._orders.ensure_mode(wanted, order)
+        order, count = self._arbiter.order(wanted), self._arbiter.arming_orders
+        await self._sender.ensure_mode(wanted, order)
         await self._settle_in_mode()
-        self._orders.raise_if_over(order)
-        if self._helm.arming_orders != count:
+        self._sender.raise_if_over(order)
+        if self._arbiter.arming_orders != count:
             raise OperationRejected("arm(): another order to arm or disarm was given; it was not told to arm")
-        if not self._helm.is_known:
+        if not self._arbiter.is_known:
             raise HeartbeatTimeout(f"arm(): {self._talk.describe_link()}; it was not told to arm")
 
     async def _settle_in_mode(self) -> None:
@@ -265,8 +265,8 @@ class ArmingActions(Part):
         """Once: a vehicle that has rebooted, and whose answer was lost, would do it again."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
-        with self._helm.aside() as order:
-            await self._orders.give(
+        with self._arbiter.aside() as order:
+            await self._sender.give(
                 order, self._talk.commands.send_long, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
             )
 

@@ -14,18 +14,18 @@ import anyio
 from aerokit.connection.tasks import Cancellation
 from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags
-from aerokit.vehicle.commanding.helm import FIRST_HEARTBEAT_S
+from aerokit.vehicle.commanding.arbiter import FIRST_HEARTBEAT_S, is_first_told
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
     from aerokit.autopilots import Mode
-    from aerokit.vehicle.commanding.helm import Helm
+    from aerokit.vehicle.commanding.arbiter import CommandArbiter
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.commanding.orders import Orders
+    from aerokit.vehicle.commanding.sender import OrderSender
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["LATE_S", "Holding", "LateArming", "Leftover", "give_arm"]
+__all__ = ["LATE_S", "Holding", "LateArming", "Leftover"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -107,31 +107,31 @@ class Holding:
     ``end_stream`` ends the set-point stream that is open, for a reason.
     """
 
-    def __init__(self, talk: Talk, helm: Helm, orders: Orders) -> None:
-        self._talk, self._helm, self._orders = talk, helm, orders
+    def __init__(self, talk: Talk, arbiter: CommandArbiter, sender: OrderSender) -> None:
+        self._talk, self._arbiter, self._sender = talk, arbiter, sender
         self.end_stream: Callable[[str], None] | None = None
         self._flight: Order | None = None
         self._leftover = Leftover(talk, "aerokit hold", "before it confirmed that it holds")
-        helm.on_new(self._leftover.drop)  # what an earlier order left is not confirmed any more
+        arbiter.on_steering(self._leftover.drop)  # what an earlier order left is not confirmed any more
 
     async def hold(self) -> None:
         """Order it, as :meth:`aerokit.Vehicle.hold` says."""
-        mode = self._orders.mode_for("hold", "hold")
-        await self.stop_in(mode, self._helm.order(mode))
+        mode = self._sender.mode_for("hold", "hold")
+        await self.stop_in(mode, self._arbiter.order(mode))
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order it in any case; PX4 in LOITER may be on its way somewhere, where the mode alone would not stop it."""
         if self._holds_by_reposition:
-            await self._orders.command_of(order, *STOP_HERE)
-            await self._orders.ensure_mode(mode, order)
+            await self._sender.command_of(order, *STOP_HERE)
+            await self._sender.ensure_mode(mode, order)
         else:
-            await self._orders.change_mode(mode, order, told_since=order.given_at)
+            await self._sender.change_mode(mode, order, told_since=order.given_at)
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
         """What :meth:`_send_hold` has sent is answered, or sent again."""
         by_mode = (MavCmd.DO_SET_MODE, *self._talk.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else by_mode
-        await self._orders.give(
+        await self._sender.give(
             order,
             self._talk.commands.send_long,
             int(command),
@@ -162,11 +162,11 @@ class Holding:
             or order.end
         ):
             return False
-        is_sent = self._helm.is_known
+        is_sent = self._arbiter.is_known
         if is_sent:
             self._send_hold(mode)
-            order = self._helm.order(*order.modes, mode)
-            self._helm.doubt_mode()
+            order = self._arbiter.order(*order.modes, mode)
+            self._arbiter.doubt_mode()
         self._leftover.start(partial(self._hold_when_known, mode, order, is_sent=is_sent))
         return True
 
@@ -187,7 +187,7 @@ class Holding:
                 await self._hear()
                 if not order.end and not self._talk.telemetry.is_surely_disarmed:
                     with self._leftover.spared():  # it is this task that gives the newer order
-                        order = self._helm.order(*order.modes, mode)
+                        order = self._arbiter.order(*order.modes, mode)
                     await self.stop_in(mode, order)
                 return
             except OperationTimeout as error:
@@ -210,7 +210,7 @@ class Holding:
 
     async def finish(self) -> None:
         """At the end of everything: give an order to hold the time to be answered, or to be given again."""
-        await self._leftover.finish(HOLD_AT_END_S if self._helm.is_known else 0)
+        await self._leftover.finish(HOLD_AT_END_S if self._arbiter.is_known else 0)
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
@@ -245,21 +245,12 @@ ACK_S = 3.0
 ARMING_AT_END_S = 1.5
 """How long the end of a block waits for it."""
 
-FORCE = 21196
-
-
-async def give_arm(talk: Talk, orders: Orders, order: Order, armed: bool, *, force: bool = False) -> None:
-    """Order it to arm or disarm."""
-    talk.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
-    params = (float(armed), FORCE if force else 0)
-    await orders.give(order, talk.commands.send_long, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed)
-
 
 class LateArming:
     """Watches a vehicle after an order to arm was given up."""
 
-    def __init__(self, talk: Talk, helm: Helm, orders: Orders) -> None:
-        self._talk, self._helm, self._orders = talk, helm, orders
+    def __init__(self, talk: Talk, arbiter: CommandArbiter, sender: OrderSender) -> None:
+        self._talk, self._arbiter, self._sender = talk, arbiter, sender
         unsure = "while an order to arm may still be carried out"
         self._leftover = Leftover(talk, "aerokit late arming", unsure)
 
@@ -272,7 +263,7 @@ class LateArming:
     def watch(self, order: Order, was_armed: bool) -> None:
         """The order to arm was given up; it may have been heard, or may still arrive."""
         self._talk.connection.discard_unsent()
-        self._leftover.start(partial(self._look, order, was_armed, self._helm.arming_orders))
+        self._leftover.start(partial(self._look, order, was_armed, self._arbiter.arming_orders))
 
     async def _look(self, order: Order, was_armed: bool, count: int) -> None:
         armed = self._talk.telemetry.armed
@@ -303,7 +294,7 @@ class LateArming:
 
     async def _disarm_again(self, order: Order, count: int, disarmed_at: float) -> None:
         """What somebody else has armed is left alone."""
-        if self._helm.arming_orders != count:  # the program has ordered it by a command of its own
+        if self._arbiter.arming_orders != count:  # the program has ordered it by a command of its own
             return
         if not await self._has_armed(order, disarmed_at):
             logger.warning(
@@ -314,8 +305,8 @@ class LateArming:
         logger.warning("the vehicle armed although the order to arm was given up: it is disarmed again")
         with anyio.CancelScope(shield=True):
             try:
-                with self._helm.aside(ends_flight=True) as order:
-                    await give_arm(self._talk, self._orders, order, False)
+                with self._arbiter.aside(ends_flight=True) as order:
+                    await self._sender.give_arm(order, False)
             except AerokitError as error:
                 logger.error(
                     "the vehicle armed after the order was given up, and could not be disarmed: %s", error
@@ -336,7 +327,7 @@ class LateArming:
 
     def _is_accepted(self, disarmed_at: float) -> bool:
         accepted_at = self._talk.commands.accepted_at(MavCmd.COMPONENT_ARM_DISARM)
-        return disarmed_at <= accepted_at + FIRST_HEARTBEAT_S
+        return is_first_told(disarmed_at, accepted_at)
 
     def stop(self) -> None:
         """Another order about arming is given."""

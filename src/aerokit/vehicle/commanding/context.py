@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
+from aerokit.vehicle.commanding.arbiter import CommandArbiter
 from aerokit.vehicle.commanding.cleanup import Holding, LateArming
 from aerokit.vehicle.commanding.health import Health
-from aerokit.vehicle.commanding.helm import Helm
-from aerokit.vehicle.commanding.newest import Newest
-from aerokit.vehicle.commanding.orders import Orders
 from aerokit.vehicle.commanding.progress import Whereabouts
-from aerokit.vehicle.commanding.subjects import Subject
+from aerokit.vehicle.commanding.sender import OrderSender
 from aerokit.vehicle.state.states import States
 
 if TYPE_CHECKING:
@@ -28,23 +25,19 @@ __all__ = ["Bridge", "Part"]
 
 
 class Bridge:
-    """The talk with the vehicle, the helm, and what gives orders by them."""
+    """The talk with the vehicle, the arbiter of its orders, and what gives orders by them."""
 
     def __init__(self, talk: Talk) -> None:
         self.talk = talk
-        self.helm: Helm = Helm(talk.connection.now, talk.telemetry)
-        self.orders: Orders = Orders(talk, self.helm)
-        self.holding: Holding = Holding(talk, self.helm, self.orders)
-        self.late_arming: LateArming = LateArming(talk, self.helm, self.orders)
+        self.arbiter: CommandArbiter = CommandArbiter(talk.connection.now, talk.telemetry)
+        self.sender: OrderSender = OrderSender(talk, self.arbiter)
+        self.holding: Holding = Holding(talk, self.arbiter, self.sender)
+        self.late_arming: LateArming = LateArming(talk, self.arbiter, self.sender)
         self.health: Health = Health(talk)
         self.where: Whereabouts = Whereabouts(talk)
-        self.looking: Newest = Newest(self.helm)
-        """What the autopilot's gimbal, or its nose, looks at."""
-        self.subjects: defaultdict[tuple[int, int, str], Subject] = defaultdict(Subject)
-        """What orders to cameras are about: component id, device there, and the name of it."""
         self.on_finish: list[Callable[[], None]] = []
         """What is to be sent when the vehicle's block ends, without waiting."""
-        talk.on_reboot.append(self.helm.note_reboot)
+        talk.on_reboot.append(self.arbiter.note_reboot)
 
     async def finish(self) -> bool:
         """At the end of everything: what was given up is told to hold, as far as that can be; whether there was any."""
@@ -89,7 +82,7 @@ class Part(States):
         """The state cells; most are properties of the vehicle too."""
         self.link_quality: StateCell[LinkReport] = talk.link_quality
         """Loss, delay and rates of the last second."""
-        self._talk, self._helm, self._orders = talk, bridge.helm, bridge.orders
+        self._talk, self._arbiter, self._sender = talk, bridge.arbiter, bridge.sender
         self._holding, self._late_arming = bridge.holding, bridge.late_arming
         self._health, self._where = bridge.health, bridge.where
 

@@ -11,8 +11,8 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import CommandRejected, NotSupported, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.commanding.context import Part
-from aerokit.vehicle.commanding.helm import MODE_GRACE_S
 from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class FlightActions(Part):
             plan.mode_after,
             self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol),
         )
-        order = self._helm.order(*(mode for mode in modes if mode is not None))
+        order = self._arbiter.order(*(mode for mode in modes if mode is not None))
         try:
             await self._begin_take_off(plan, order)
             with self._holding.flying(order):
@@ -120,11 +120,11 @@ class FlightActions(Part):
 
     async def _begin_take_off(self, plan: TakeOff, order: Order) -> None:
         if plan.mode is not None:
-            await self._orders.ensure_mode(plan.mode, order)
+            await self._sender.ensure_mode(plan.mode, order)
         if plan.command is not None:
             is_rising = self._rises_from_here()
             with self._talk.streaming("position", "landed_state"):
-                await self._orders.give(
+                await self._sender.give(
                     order,
                     self._talk.commands.send_long,
                     plan.command,
@@ -164,7 +164,7 @@ class FlightActions(Part):
                 self._talk,
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
-                trouble=self._orders.stays_in(order, *order.modes),
+                trouble=self._sender.stays_in(order, *order.modes),
                 describe=lambda: f"it is at {self._where.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -190,16 +190,15 @@ class FlightActions(Part):
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
             OperationTimeout: not on the ground in time.
         """
-        mode = self._orders.mode_for("land", "land")
+        mode = self._sender.mode_for("land", "land")
         if self.autopilot.landing_ends_in is None:
-            order = self._helm.order(mode)
-            await self._orders.change_mode(mode, order, told_since=order.given_at)
+            order = self._arbiter.order(mode)
+            await self._sender.change_mode(mode, order, told_since=order.given_at)
         else:
-            order = self._helm.order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
-            with self._helm.changing_mode():
-                await self._orders.request_mode(
-                    mode, order, MODE_TIMEOUT_S
-                )  # it may be over before HEARTBEAT tells it
+            order = self._arbiter.order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
+            with self._arbiter.changing_mode():
+                # The landing may be over before HEARTBEAT tells its mode.
+                await self._sender.request_mode(mode, order, attempt_timeout=min(1.0, MODE_TIMEOUT_S / 4))
         await self._await_ground("land", order, timeout, max_silence_s)
 
     async def return_to_launch(
@@ -209,9 +208,9 @@ class FlightActions(Part):
 
         Raises as :meth:`land`.
         """
-        mode = self._orders.mode_for("return_to_launch", "return")
-        order = self._helm.order(mode)
-        await self._orders.change_mode(mode, order, told_since=order.given_at)
+        mode = self._sender.mode_for("return_to_launch", "return")
+        order = self._arbiter.order(mode)
+        await self._sender.change_mode(mode, order, told_since=order.given_at)
         if self.autopilot.lands_after_return:
             await self._await_ground("return_to_launch", order, timeout, max_silence_s)
         else:
@@ -237,7 +236,7 @@ class FlightActions(Part):
         def is_deep() -> bool:
             return self._where.is_known_since(order.given_at) and self._where.altitude_relative() < -SURFACE_M
 
-        stays = self._orders.stays_in(order, *order.modes)
+        stays = self._sender.stays_in(order, *order.modes)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
@@ -273,7 +272,7 @@ class FlightActions(Part):
                 self._talk,
                 "return_to_launch",
                 is_done=is_back,
-                trouble=self._orders.stays_in(order, *order.modes),
+                trouble=self._sender.stays_in(order, *order.modes),
                 describe=lambda: f"it is {self._where.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -302,7 +301,7 @@ class ModeActions(Part):
             OperationTimeout: it accepted and stayed in another mode, or did not answer.
         """
         wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
-        await self._orders.change_mode(wanted, self._helm.order(wanted), timeout)
+        await self._sender.change_mode(wanted, self._arbiter.order(wanted), timeout)
 
     async def hold(self) -> None:
         """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
@@ -329,7 +328,7 @@ class ModeActions(Part):
         The program has armed it, or has given an order that steers since somebody else did; and no pilot, failsafe or
         other program has taken it from that. False for a vehicle that others fly and that this program only watches.
         """
-        return self.telemetry.is_armed and self._helm.is_flown_by_program
+        return self.telemetry.is_armed and self._arbiter.is_flown_by_program
 
     @property
     def taken_over(self) -> str:
@@ -339,7 +338,7 @@ class ModeActions(Part):
         "a failsafe became active (MAV_STATE_CRITICAL)", which may come some seconds before the mode changes.
         A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
         """
-        order = self._helm.current or self._helm.newest
+        order = self._arbiter.current or self._arbiter.newest
         if order is None or not order.has_lost_mode:
             return "" if order is None else order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR

@@ -229,10 +229,10 @@ class SetpointStream(Generic[SetpointT]):
         self._take(self._setpoint)  # refuse nonsense before anything is sent
         if self._holding.end_stream is not None:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
-        mode = self._bridge.orders.mode_for("a set-point stream", "setpoint")
+        mode = self._bridge.sender.mode_for("a set-point stream", "setpoint")
         self._was_entered = True
         self._holding.end_stream = self._stop
-        order = self._order = self._bridge.helm.order(mode)
+        order = self._order = self._bridge.arbiter.order(mode)
         order.is_given = order.is_given or self._talk.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
@@ -258,7 +258,7 @@ class SetpointStream(Generic[SetpointT]):
             self._stopped = SetpointStreamStopped("the block of this set-point stream was left")
             if exc is not None:
                 self._hold()
-            elif not self._bridge.helm.is_known:  # whoever steers by then is left alone
+            elif not self._bridge.arbiter.is_known:  # whoever steers by then is left alone
                 self._stop(f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s")
                 raise self._stopped
             elif not self._talk.telemetry.is_surely_disarmed:
@@ -273,7 +273,7 @@ class SetpointStream(Generic[SetpointT]):
             await self.fly(self._setpoint, ENTRY_S)
             await self._feeding_initial(mode, order)
         else:
-            await self._bridge.orders.ensure_mode(mode, order)
+            await self._bridge.sender.ensure_mode(mode, order)
             self._begin()
         self._mode = mode
 
@@ -281,7 +281,7 @@ class SetpointStream(Generic[SetpointT]):
         """Not in a task group: what is raised here reaches the user as it is."""
         self._is_entering = True
         try:
-            await self._bridge.orders.ensure_mode(mode, order)
+            await self._bridge.sender.ensure_mode(mode, order)
         finally:
             self._is_entering = False
             self._set_at = self._now()

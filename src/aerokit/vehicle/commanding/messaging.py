@@ -21,7 +21,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
 from aerokit.vehicle.commanding.context import Part
 from aerokit.vehicle.commanding.order import ARM_ALONE, Subject, subjects_of
-from aerokit.vehicle.commanding.posting import PostedOrder
+from aerokit.vehicle.commanding.posted import PostedOrder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -170,7 +170,7 @@ class TalkActions(Part):
             CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
             CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
         """
-        return await self._orders.answered(
+        return await self._sender.answered(
             self._talk.commands.send_long,
             command,
             *params,
@@ -205,7 +205,7 @@ class TalkActions(Part):
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
         kind = {} if or_long else {"frame": frame}
-        return await self._orders.answered(
+        return await self._sender.answered(
             self._talk.commands.send_place if or_long else self._talk.commands.send_int,
             command,
             *params,
@@ -238,7 +238,7 @@ class TalkActions(Part):
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
-            self._helm.note_own_arming(message.param1 == 1)
+            self._arbiter.note_own_arming(message.param1 == 1)
         elif subjects and isinstance(message, (CommandInt, CommandLong, SetMode)):
             names = self.telemetry.mode_names
             modes: tuple[Mode, ...] = ()
@@ -247,9 +247,9 @@ class TalkActions(Part):
                 modes = self.autopilot.modes_of_command(message.command, params, names)
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
-            self._helm.order_of_the_programs_own(subjects, modes=modes)
+            self._arbiter.order_of_the_programs_own(subjects, modes=modes)
         elif subjects:
-            self._helm.note_newer(subjects)
+            self._arbiter.overrule(subjects)
 
     @contextmanager
     def posted(
@@ -277,10 +277,10 @@ class TalkActions(Part):
         if "arm" in subjects and armed is None:
             raise InvalidArgument("posted: an order about arm needs armed=True or armed=False")
         with (
-            self._helm.posting(subjects, modes=modes, armed=armed) as posted,
-            PostedOrder(self._talk, self._helm, posted) as order,
+            self._arbiter.post(subjects, modes=modes, armed=armed) as order,
+            PostedOrder(self._talk, self._arbiter, self._sender, order) as posted,
         ):
-            yield order
+            yield posted
 
     # ----------------------------------------------------------------------- subscriptions
 

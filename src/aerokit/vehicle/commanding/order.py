@@ -1,4 +1,4 @@
-"""Orders: what has been heard since one was given, and so whether it may be sent again or still be meant.
+"""Orders of the program to one vehicle: whether each is still the newest, and whether it may be sent again.
 
 docs/reliability.md has the table of all orders; nothing is sent again that is not in it.
 """
@@ -6,12 +6,14 @@ docs/reliability.md has the table of all orders; nothing is sent again that is n
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from typing import TYPE_CHECKING, Any, Literal
 
 from aerokit.mavlink.enums import MavCmd, MavState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
+    from typing import TypeAlias
 
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
@@ -19,16 +21,26 @@ if TYPE_CHECKING:
 __all__ = [
     "ARM_ALONE",
     "CHANGED_BY_COMMAND",
-    "FAILSAFE_STATES",
+    "LOOKING",
+    "OVERRULED",
     "QUESTIONS",
     "Order",
-    "Sending",
+    "SentCommand",
     "Subject",
+    "Topic",
     "subjects_of",
 ]
 
 Subject = Literal["mode", "motion", "arm"]
-"""What an order is about."""
+"""What an order to the vehicle itself is about."""
+Topic: TypeAlias = Hashable
+"""What an order is about: a subject of the vehicle, or any key for a device: a camera's video, a gimbal."""
+
+LOOKING: Topic = "region of interest"
+"""What the autopilot's gimbal, or the nose, looks at."""
+
+OVERRULED = "another order was given"
+"""Why an older order ends."""
 
 _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
@@ -108,6 +120,10 @@ def failsafe_text(state: int) -> str:
 class Order:
     """One order of the program, from when it is given until it is done, overruled or taken over.
 
+    A newer order about any of the topics in ``ended_by`` overrules it. If the arbiter has it watch the vehicle,
+    somebody else's doing ends it, too: a mode that it does not explain, a failsafe, disarming, a reboot. That is for
+    good, also if the mode comes back.
+
     ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
     that may still be told because the program had ordered them just before, and until ``settles_at`` in any order;
     until ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a
@@ -117,23 +133,36 @@ class Order:
     def __init__(
         self,
         given_at: float,
-        *,
-        mode_before: Mode | None,
-        modes: Collection[Mode],
-        expected: Collection[Mode],
-        armed_before: bool | None,
-        state_before: int | None,
+        number: int,
         is_newest: Callable[[Order], bool],
+        *,
+        ended_by: Collection[Topic] = (),
+        modes: Collection[Mode] = (),
+        armed: bool | None = None,
+        mode_before: Mode | None = None,
+        expected: Collection[int] = (),
+        armed_before: bool | None = None,
+        state_before: int | None = None,
         settles_at: float = -math.inf,
         any_until: float = -math.inf,
         ends_flight: bool = False,
+        minds_mode: bool = True,
+        minds_disarming: bool = True,
     ) -> None:
-        self.given_at = given_at
+        self.given_at, self.number = given_at, number
+        self.ended_by: tuple[Topic, ...] = tuple(ended_by)
+        self.modes: tuple[Mode, ...] = tuple(modes)
+        self.armed = armed
+        """Whether it arms or disarms; None: neither."""
+        self.is_given = False
+        """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
         self.was_refused: bool = False
         """Whether the vehicle has said no to it: it does what it did before."""
         self.was_flown_before: bool = False
         """Whether the vehicle did what this program had ordered before."""
-        self.modes: tuple[Mode, ...] = tuple(modes)
+        self.before: Order | None = None
+        """The one about the same device that counts again when this one is withdrawn."""
+        self.is_withdrawn: bool = False
         self.taken_by: str = ""
         """What somebody else has done, as a clause; empty: nothing that was told."""
         self.failsafe: str = ""
@@ -144,49 +173,77 @@ class Order:
         """Whether that was another mode."""
         self.mode_lost_at: float = -math.inf
         """When that was told: by CURRENT_MODE sooner than by the HEARTBEAT that may say that it has disarmed, too."""
-        self.is_given = False
-        """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
-        late = {each.custom_mode for each in expected}
-        self._before = set() if mode_before is None else {mode_before.custom_mode} - late
-        self._allowed = self._before | late
-        self._own = {each.custom_mode for each in modes}
+        self.has_worked: bool = False
+        """Whether a change to one of its modes, or to armed or disarmed as it orders, has been told since."""
+        self._before = set() if mode_before is None else {mode_before.custom_mode} - set(expected)
+        self._mode_now = None if mode_before is None else mode_before.custom_mode
+        self._late = set(expected)
+        self._allowed = self._before | self._late
+        self._own = {mode.custom_mode for mode in modes}
         self._is_mode_known = mode_before is not None
-        self._was_armed = armed_before
+        self._armed_now = armed_before
         self._state_before, self._ends_flight = state_before, ends_flight
+        self._minds_mode, self._minds_disarming = minds_mode, minds_disarming
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
-        self.is_overruled: bool = False
-        """Whether a newer order steers that is not one of an action."""
+
+    @property
+    def is_newest(self) -> bool:
+        """Whether no newer order overrules it."""
+        return self._is_newest(self)
 
     @property
     def end(self) -> str:
         """Why nothing of it may be sent any more, as a clause; empty while it may."""
-        failsafe = "" if self._ends_flight else self.failsafe
-        is_over = self.is_overruled or not self._is_newest(self)
-        return self.taken_by or failsafe or ("another order was given" if is_over else "")
-
-    def note_newer(self) -> None:
-        """A newer order steers, which is none of these."""
-        self.is_overruled = True
+        if not self.is_newest:
+            return OVERRULED
+        return self.taken_by or ("" if self._ends_flight else self.failsafe)
 
     def is_own(self, mode: Mode) -> bool:
         """Whether this mode is one that the order may bring about."""
         return mode.custom_mode in self._own
 
+    def expect(self, modes: Collection[Mode]) -> None:
+        """The program has given an order beside it that brings these about."""
+        self._own |= {mode.custom_mode for mode in modes}
+
+    def withdraw(self) -> None:
+        """It was refused, or never accepted: the one before about the same device counts again."""
+        self.is_withdrawn = True
+
+    def settle(self) -> None:
+        """It was accepted, or is told to end: there is no way back to the one before."""
+        self.before = None
+
+    def close(self) -> None:
+        """The block in which it was given is left."""
+        self.taken_by = self.taken_by or "its block was left"
+
+    def forgive_failsafe(self) -> None:
+        """The program orders the vehicle again, which is still in a mode of this order."""
+        self.failsafe = ""
+
+    # ------------------------------------------------------------------- what the vehicle tells
+
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
-        if self.is_own(mode):
+        number = mode.custom_mode
+        is_change = self._mode_now is not None and number != self._mode_now
+        self.has_worked = self.has_worked or (is_change and number in self._own)
+        if number in self._own:
             self._allowed -= self._allowed if at >= self._settles_at else self._before
+        elif number in self._late & self._allowed and at >= self._settles_at:
+            self._allowed -= self._before
         elif not self._is_mode_known or at < self._any_until:
-            if self._is_mode_known and mode.custom_mode not in self._allowed:
+            if self._is_mode_known and number not in self._allowed:
                 self.unexplained = f"the mode changed to {mode}"
-            self._allowed.add(mode.custom_mode)
-        elif mode.custom_mode not in self._allowed:
+            self._allowed.add(number)
+        elif number not in self._allowed and self._minds_mode:
             if not self.has_lost_mode:
                 self.mode_lost_at = at
             self.has_lost_mode = True
             self.taken_by = self.taken_by or f"the mode changed to {mode}"
-        self._is_mode_known = True
+        self._is_mode_known, self._mode_now = True, number
 
     def note_state(self, state: int) -> None:
         """Take MAV_STATE. A failsafe that was active when the order was given does not end it: the program knew it.
@@ -197,26 +254,20 @@ class Order:
             self.failsafe = self.failsafe or failsafe_text(state)
         self._state_before = state
 
-    def forgive_failsafe(self) -> None:
-        """The program orders the vehicle again, which is still in a mode of this order."""
-        self.failsafe = ""
-
-    def expect(self, modes: Collection[Mode]) -> None:
-        """The program has posted an order that brings these about."""
-        self._own |= {each.custom_mode for each in modes}
-
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed."""
-        if self._was_armed and not armed:
+        before, self._armed_now = self._armed_now, armed
+        if before is not None and before is not armed and armed is self.armed:
+            self.has_worked = True
+        elif before and not armed and self._minds_disarming:
             self.taken_by = self.taken_by or "the vehicle disarmed"
-        self._was_armed = armed
 
     def note_reboot(self) -> None:
         """The vehicle has rebooted: nothing that was ordered before is meant any more."""
         self.taken_by = self.taken_by or "the vehicle rebooted"
 
 
-class Sending:
+class SentCommand:
     """One command of an order, from its first sending on: whether it may be sent again.
 
     It may while what was heard since speaks neither of its effect nor of somebody else's doing. ``modes`` and
@@ -238,7 +289,7 @@ class Sending:
         """When HEARTBEAT came last."""
         self._was_told = False
         is_there = None if mode_now is None else mode_now.custom_mode
-        self._modes = {each.custom_mode for each in modes} - {is_there}
+        self._modes = {mode.custom_mode for mode in modes} - {is_there}
         self._armed = None if armed is armed_now else armed
         self.arms = armed
         """Whether it arms, or disarms; None: neither."""
@@ -256,16 +307,12 @@ class Sending:
         """Why it must not be sent again, as a clause; empty while it may."""
         if self.has_worked:
             return "its effect was told"
-        overruled = "another order was given" if self._is_overruled else ""
-        return self.order.end or overruled or self.order.unexplained
+        return self.order.end or (OVERRULED if self._is_overruled else "") or self.order.unexplained
 
     def note_newer(self, armed: bool | None) -> None:
         """Another command is given: one to disarm ends one to arm, and the other way round."""
         if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
-
-    def note_state(self, state: int) -> None:
-        """Take MAV_STATE, which is the order's to judge."""
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""

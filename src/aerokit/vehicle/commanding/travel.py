@@ -21,6 +21,7 @@ from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavPro
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
 from aerokit.position import Position
 from aerokit.vehicle.commanding.context import Part
+from aerokit.vehicle.commanding.order import LOOKING
 from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, MAX_DISTANCE_M, Stillness, await_progress
 
 if TYPE_CHECKING:
@@ -89,8 +90,8 @@ class TravelActions(Part):
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
         if self._where.stands_on_the_ground():
             raise OperationRejected("go_to: the vehicle is on the ground: take_off() first; nothing was sent")
-        mode = self._orders.mode_for("go_to", self.autopilot.reposition_purpose)
-        order = self._helm.order(mode, self._orders.mode_for("go_to", "setpoint"))
+        mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
+        order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
         under_way = False
         try:
@@ -98,9 +99,9 @@ class TravelActions(Part):
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot obeys it only once it is under way
-                await self._orders.command_of(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+                await self._sender.command_of(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
-                await self._orders.command_of(order, MavCmd.CONDITION_YAW, heading_deg % 360)
+                await self._sender.command_of(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._holding.flying(order):
                 await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
@@ -126,17 +127,17 @@ class TravelActions(Part):
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
         place: dict[str, Any] = {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
-        modes = (self._orders.mode_for("go_to", self.autopilot.reposition_purpose),)
+        modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
         try:
-            with self._helm.changing_mode():
-                await self._orders.give(
+            with self._arbiter.changing_mode():
+                await self._sender.give(
                     order, self._talk.commands.send_int, MavCmd.DO_REPOSITION, *params, modes=modes, **place
                 )
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
-            await self._orders.ensure_mode(self._orders.mode_for("go_to", "setpoint"), order)
-            self._orders.raise_if_over(order)
+            await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
+            self._sender.raise_if_over(order)
             resend = self._position_target(latitude, longitude, altitude, frame)
             self.connection.send(resend)
             return resend
@@ -166,7 +167,7 @@ class TravelActions(Part):
         def is_there() -> bool:
             nonlocal sent_at
             now = self.connection.now()
-            if resend is not None and now - sent_at >= RESEND_S and self._helm.is_known and not order.end:
+            if resend is not None and now - sent_at >= RESEND_S and self._arbiter.is_known and not order.end:
                 sent_at = now
                 self.connection.send(resend)
             is_near = self._where.is_known_since(started) and self._where.way_left(target) <= near_m
@@ -177,7 +178,7 @@ class TravelActions(Part):
                 self._talk,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
-                trouble=self._orders.stays_in(order, mode),
+                trouble=self._sender.stays_in(order, mode),
                 describe=lambda: f"it is {self._where.way_left(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -195,7 +196,7 @@ class TravelActions(Part):
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._orders.command_aside(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+        await self._sender.command_aside(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
         self,
@@ -231,20 +232,20 @@ class TravelActions(Part):
         check_range("rate_deg_s", rate_deg_s, 0, 360)
         check_range("tolerance_deg", tolerance_deg, 0, 180, above=True)
         self._check_can_turn(heading_deg)
-        mode = self._orders.mode_for("set_heading", self.autopilot.reposition_purpose)
+        mode = self._sender.mode_for("set_heading", self.autopilot.reposition_purpose)
         goal = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
-        order = self._helm.order(mode)
+        order = self._arbiter.order(mode)
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
-            await self._orders.give(
+            await self._sender.give(
                 order, self._talk.commands.send_long, MavCmd.DO_REPOSITION, *params, modes=(mode,)
             )
         else:
-            await self._orders.ensure_mode(mode, order)
+            await self._sender.ensure_mode(mode, order)
             # a goal, not an angle: sent again, it does not turn it further
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            await self._orders.command_of(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
+            await self._sender.command_of(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -267,7 +268,7 @@ class TravelActions(Part):
                 self._talk,
                 f"set_heading({goal:g}°)",
                 is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
-                trouble=self._orders.stays_in(order, mode),
+                trouble=self._sender.stays_in(order, mode),
                 describe=lambda: f"it is {off():.0f}° off",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
@@ -292,13 +293,13 @@ class TravelActions(Part):
         if place is not None and place.altitude_amsl_m is None:
             raise InvalidArgument("place has no altitude_amsl_m: home needs one above mean sea level")
         home = self.telemetry.home
-        with self._helm.aside() as order:
+        with self._arbiter.aside() as order:
             if place is None:
-                await self._orders.give(order, self._talk.commands.send_long, MavCmd.DO_SET_HOME, 1)
+                await self._sender.give(order, self._talk.commands.send_long, MavCmd.DO_SET_HOME, 1)
             else:
                 latitude, longitude, altitude, _ = self._where.global_target(place)
                 where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
-                await self._orders.give(order, self._talk.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
+                await self._sender.give(order, self._talk.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
         asked_at = self.connection.now()
         await self._talk.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
         await home.wait_until(lambda _: home.updated_at >= asked_at, timeout=timeout, description="set_home")
@@ -371,10 +372,10 @@ class LookActions(Part):
         """False for firmware that does not know it, or no COMMAND_INT at all: that says nothing."""
         with self._newest() as order:
             try:
-                await self._orders.give(order, self._talk.commands.send_int, LOCATION, **place)
+                await self._sender.give(order, self._talk.commands.send_int, LOCATION, **place)
             except CommandTimeout:
                 knows_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
-                if knows_int or not self._helm.is_known:
+                if knows_int or not self._arbiter.is_known:
                     raise
                 self._raise_if_overruled(order)
                 return False
@@ -387,11 +388,11 @@ class LookActions(Part):
 
     async def _give(self, command: int, *params: float) -> None:
         with self._newest() as order:
-            await self._orders.give(order, self._talk.commands.send_long, command, *params)
+            await self._sender.give(order, self._talk.commands.send_long, command, *params)
 
     @contextmanager
     def _newest(self) -> Iterator[Order]:
-        with self._bridge.looking.begin().order() as order:
+        with self._arbiter.aside(self._arbiter.of_device(LOOKING)) as order:
             yield order
 
     @staticmethod
@@ -410,7 +411,7 @@ class LookActions(Part):
         """
         with self._newest() as order:
             try:
-                await self._orders.give(order, self._talk.commands.send_long, MavCmd.DO_SET_ROI_NONE)
+                await self._sender.give(order, self._talk.commands.send_long, MavCmd.DO_SET_ROI_NONE)
                 return
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:

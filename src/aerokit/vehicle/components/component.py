@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.events import Event
     from aerokit.mavlink.messages import CommandAck, ComponentInformationBasic, Heartbeat
-    from aerokit.vehicle.commanding.orders import Orders
+    from aerokit.vehicle.commanding.sender import OrderSender
     from aerokit.vehicle.components.session import ComponentTalk
     from aerokit.vehicle.components.settings import Settings
     from aerokit.vehicle.files.files import Files
@@ -124,12 +124,12 @@ class Component(ReadOnly):
     def __init__(
         self,
         talk: ComponentTalk | Talk,
-        orders: Orders,
+        sender: OrderSender,
         files: Callable[[], Files],
         parameters: Callable[[], Parameters],
         beside: Callable[[int], Component],
     ) -> None:
-        self._talk, self._orders, self._beside = talk, orders, beside
+        self._talk, self._sender, self._beside = talk, sender, beside
         self._make_files, self._make_parameters = files, parameters
         self.system_id: int = talk.system_id
         """The vehicle's system id."""
@@ -214,7 +214,7 @@ class Component(ReadOnly):
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
         """Send it any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
-        return await self._orders.answered(
+        return await self._sender.answered(
             self._talk.commands.send_long,
             command,
             *params,

@@ -62,12 +62,12 @@ class Components:
         return self._made[component_id]
 
     def _new(self, component_id: int) -> Component:
-        orders = self._bridge.orders
+        sender = self._bridge.sender
         if component_id == self._talk.component_id:
-            return Component(self._talk, orders, self._files, self._parameters, self.component)
+            return Component(self._talk, sender, self._files, self._parameters, self.component)
         talk = ComponentTalk(self._talk, component_id)
         files = Files(talk.transfers)
-        return Component(talk, orders, lambda: files, lambda: Parameters(talk, files), self.component)
+        return Component(talk, sender, lambda: files, lambda: Parameters(talk, files), self.component)
 
     def _on_heartbeat(self, heartbeat: m.Heartbeat) -> None:
         frame = heartbeat.received_frame

@@ -20,7 +20,6 @@ from aerokit.errors import (
 from aerokit.events import SILENT_AFTER_S, GimbalControlLost
 from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.messages import GimbalManagerStatus, Heartbeat
-from aerokit.vehicle.commanding.newest import Newest
 from aerokit.vehicle.gimbal.device import Claim
 from aerokit.vehicle.gimbal.orders import CONFIGURE, GimbalOrders
 
@@ -62,7 +61,7 @@ class LastWord:
         """
         if not self._is_meant():
             return
-        if not self._orders.bridge.helm.is_known:
+        if not self._orders.bridge.arbiter.is_known:
             self.leave()
             raise OperationTimeout(
                 f"{what}: not sent yet, because the vehicle is silent: it will be when it is heard again;"
@@ -75,7 +74,7 @@ class LastWord:
         """At the end of a block that is left by an error or cancelled: do not wait."""
         if not self._talk.connection.is_open or self._talk.is_closed or not self._is_meant():
             return
-        is_sent = self._orders.bridge.helm.is_known
+        is_sent = self._orders.bridge.arbiter.is_known
         if is_sent:
             self._send()
 
@@ -102,8 +101,8 @@ class LastWord:
         self._talk.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
-        with self._orders.bridge.helm.aside() as order:
-            await self._orders.bridge.orders.give(
+        with self._orders.bridge.arbiter.aside() as order:
+            await self._orders.bridge.sender.give(
                 order,
                 self._talk.commands.send_long,
                 self._command,
@@ -267,7 +266,7 @@ class GimbalControl:
         orders = self._orders
         params = orders.configure(is_primary=self._is_primary)
         try:
-            await orders.give(Newest(orders.bridge.helm).begin(), CONFIGURE, *params)
+            await orders.give(None, CONFIGURE, *params)
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
                 orders.not_supported("has no gimbal manager, whose control could be taken")

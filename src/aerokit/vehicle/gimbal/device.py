@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from aerokit._internal.values import Snapshot
 from aerokit.connection.cells import Source, StateCell
 from aerokit.mavlink.enums import GimbalDeviceErrorFlags, GimbalManagerCapFlags
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.commanding.newest import Newest
 from aerokit.vehicle.session.rates import SUBSCRIPTION_HZ
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
         GimbalManagerStatus,
     )
     from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.gimbal.control import GimbalControl
+    from aerokit.vehicle.commanding.order import Topic
     from aerokit.vehicle.session.session import Talk
     from aerokit.vehicle.state.equipment import GimbalAttitude
 
@@ -176,6 +175,17 @@ class _AttitudeStream:
             self._release = rates.want(GimbalDeviceAttitudeStatus, SUBSCRIPTION_HZ, is_optional=True)
 
 
+class ControlBlock(Protocol):
+    """What a gimbal knows of a block that is about its control."""
+
+    @property
+    def is_held(self) -> bool:
+        """Whether this program is in control."""
+
+    def raise_if_taken(self) -> None:
+        """Raise GimbalTaken if it was, and somebody else is."""
+
+
 class Device:
     """One gimbal: ``component_id`` tells where it points, ``number`` is 1 to 6 behind that one, 0 of the component
     itself. Nobody is heard of yet while ``component_id`` is 0.
@@ -194,14 +204,14 @@ class Device:
         """GIMBAL_DEVICE_FLAGS and GIMBAL_DEVICE_ERROR_FLAGS as told last."""
         self.manager_information: GimbalManagerInformation | None = None
         self.device_information: GimbalDeviceInformation | None = None
-        self.controls: dict[bool, GimbalControl] = {}
+        self.controls: dict[bool, ControlBlock] = {}
         """The blocks that are open: of primary control (True), of secondary (False)."""
         self.checks_limits = False
         """Whether the program has asked for its limits, so that it may be held to them."""
         self.boots = 0
         """How often the vehicle has rebooted since."""
-        self.newest: Newest = Newest(bridge.helm)
-        """Of the orders to it."""
+        self.topic: Topic = ("gimbal", *self.key)
+        """What orders to it are about."""
         name = f"gimbal {self.device_id}" if component_id else "gimbal"
         self.attitude: StateCell[GimbalAttitude] = bridge.talk.connection.new_cell(
             f"{name}.attitude", ATTITUDE_COMES_IN

@@ -15,6 +15,7 @@ from aerokit.mavlink.messages import (
     MountOrientation,
     MountStatus,
 )
+from aerokit.vehicle.commanding.order import LOOKING
 from aerokit.vehicle.gimbal.device import LAST_NUMBER, Claims, Device
 from aerokit.vehicle.state.equipment import GimbalAttitude, from_device, from_orientation, from_status
 
@@ -46,7 +47,7 @@ class Hearing:
         """Those that were heard of, by their keys."""
         self.nobody: Device = Device(bridge, 0, 0)
         """What stands for the first one while none is heard of; its cells tell of the first one."""
-        self.nobody.newest = bridge.looking
+        self.nobody.topic = LOOKING
         self.claims: Claims = Claims()
         """Of control of all its gimbals."""
         self._heard: dict[int, float] = {}
@@ -107,7 +108,7 @@ class Hearing:
         if device is None and len(self.devices) < MOST:
             device = self.devices[key] = Device(self._bridge, *key)
             if component_id == self._talk.component_id and number == 1:
-                device.newest = self._bridge.looking  # what the vehicle looks at, this one does
+                device.topic = LOOKING  # what the vehicle looks at, this one does
         return device
 
     # ----------------------------------------------------------------------------- receiving

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.commanding.newest import Turn
+    from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.gimbal.device import Claims, Device, GimbalControllers
     from aerokit.vehicle.gimbal.discovery import Hearing
     from aerokit.vehicle.session.session import Talk
@@ -126,10 +126,10 @@ class GimbalOrders:
 
     # ----------------------------------------------------------------------------- sending
 
-    async def give(self, turn: Turn, command: int, *params: float, is_sent: bool = False) -> None:
-        """One command to the manager, of an order."""
-        with turn.order() as order:
-            await self.bridge.orders.give(
+    async def give(self, turn: Order | None, command: int, *params: float, is_sent: bool = False) -> None:
+        """One command to the manager, of an order, or on its own."""
+        with self.bridge.arbiter.aside(turn) as order:
+            await self.bridge.sender.give(
                 order,
                 self.talk.commands.send_long,
                 command,
@@ -138,9 +138,9 @@ class GimbalOrders:
                 is_sent=is_sent,
             )
 
-    def begin(self) -> Turn:
+    def begin(self) -> Order:
         """A new order: those before end."""
-        return self.device.newest.begin()
+        return self.bridge.arbiter.of_device(self.device.topic)
 
     async def insist(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
         """Send a command, and claim control if that is denied, now or to somebody who did not wait for the answer."""
@@ -154,7 +154,7 @@ class GimbalOrders:
                 raise
             await send()
 
-    async def manage(self, turn: Turn, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
+    async def manage(self, turn: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
         """PITCHYAW, in degrees; False for a manager that does not know it. Control is claimed if that is denied."""
         if self.talk.commands.is_unknown(PITCHYAW, self.manager_id):
             return False
@@ -168,13 +168,13 @@ class GimbalOrders:
             return False
         return True
 
-    async def look(self, turn: Turn, command: int, *params: float, **place: Any) -> None:
+    async def look(self, turn: Order, command: int, *params: float, **place: Any) -> None:
         """A command about a region of interest, as COMMAND_INT if it has a place."""
 
         async def send() -> None:
-            with turn.order() as order:
+            with self.bridge.arbiter.aside(turn) as order:
                 commands = self.talk.commands
-                await self.bridge.orders.give(
+                await self.bridge.sender.give(
                     order,
                     commands.send_int if place else commands.send_long,
                     command,
@@ -188,7 +188,7 @@ class GimbalOrders:
         else:
             await send()
 
-    async def mount(self, turn: Turn, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
+    async def mount(self, turn: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
         """DO_MOUNT_CONTROL; False for firmware that is older, and was told the mode by a message without an answer."""
         if not self.talk.commands.is_unknown(MOUNT, self.manager_id):
             try:
@@ -203,7 +203,7 @@ class GimbalOrders:
         self.talk.send(MountConfigure(self.talk.system_id, self.manager_id, mode, 1, 1, 1))
         return False
 
-    async def mount_to(self, turn: Turn, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
+    async def mount_to(self, turn: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
         """The mount's angles, whose yaw is from the nose: right at the moment of the order."""
         heading = self.talk.telemetry.attitude.latest
         nose = 0.0 if heading is None else heading.yaw_deg
@@ -286,7 +286,7 @@ class GimbalOrders:
         self._claimed = manager_id
         return True
 
-    async def let_go(self, turn: Turn) -> None:
+    async def let_go(self, turn: Order) -> None:
         """What was claimed without a block."""
         if self._claimed == self.manager_id:
             self._claimed = None

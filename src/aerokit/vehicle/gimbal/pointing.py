@@ -11,7 +11,7 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import GimbalDeviceFlags, MavMountMode
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.commanding.newest import OVERRULED
+from aerokit.vehicle.commanding.order import OVERRULED
 from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, OLD_POSITION_S, TICK_S, Arrivals
 from aerokit.vehicle.gimbal.device import Frame, information_of
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, GimbalPart
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from aerokit.position import Position
     from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.commanding.newest import Turn
+    from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.gimbal.device import Device
     from aerokit.vehicle.gimbal.orders import GimbalOrders
 
@@ -101,7 +101,7 @@ def told_often(orders: GimbalOrders) -> Iterator[None]:
 
 
 async def arrive(
-    orders: GimbalOrders, turn: Turn, what: str, is_there: Aim | Rest, *, since: float, timeout: float
+    orders: GimbalOrders, turn: Order, what: str, is_there: Aim | Rest, *, since: float, timeout: float
 ) -> None:
     """Return when it is there, told by an attitude that came after ``since``.
 

@@ -13,7 +13,7 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import AerokitError, BusyError, CommandRejected, NotSupported, SetpointStreamStopped
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.messages import GimbalManagerSetAttitude, GimbalManagerSetPitchyaw
-from aerokit.vehicle.commanding.newest import OVERRULED
+from aerokit.vehicle.commanding.order import OVERRULED
 from aerokit.vehicle.gimbal.control import LastWord
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, PITCHYAW, GimbalOrders
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.commanding.newest import Turn
+    from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["FASTEST_DEG_S", "GimbalRates"]
 
@@ -66,7 +66,7 @@ class GimbalRates:
         self._rates, self._flags = first, int(LOCKED if is_from_north else LEVEL)
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
         self._set_at = self._began_at = -math.inf
-        self._turn: Turn | None = None
+        self._turn: Order | None = None
         self._release = ExitStack()
         """What keeps the first gimbal the first one meanwhile."""
         self._timer: asyncio.TimerHandle | None = None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots.modes import Mode
     from aerokit.connection.cells import StateCell
     from aerokit.missions import Mission
-    from aerokit.vehicle.commanding.order import Order, Sending
+    from aerokit.vehicle.commanding.order import Order, SentCommand
     from aerokit.vehicle.missions.context import PlanContext
     from aerokit.vehicle.state.condition import MissionProgress
 
@@ -80,7 +80,7 @@ class MissionControl(HeldPlan["Mission"]):
             OperationTimeout: MISSION_CURRENT did not confirm it.
         """
         self._check_item(item)
-        with self._bridge.helm.aside() as order:
+        with self._bridge.arbiter.aside() as order:
             await self._set_current(item, timeout, order)
 
     async def start(self, item: int = 0, *, timeout: float = 10.0) -> None:
@@ -100,12 +100,12 @@ class MissionControl(HeldPlan["Mission"]):
         """
         self._check_item(item)
         bridge, talk = self._bridge, self._talk
-        mode = bridge.orders.mode_for("mission.start", "mission")
+        mode = bridge.sender.mode_for("mission.start", "mission")
         if not talk.telemetry.is_armed:
             raise OperationRejected(
                 "mission.start: the vehicle is not armed: arm() comes first; nothing was sent"
             )
-        order = self._order = bridge.helm.order(mode)
+        order = self._order = bridge.arbiter.order(mode)
         self._is_paused = False
         self._watch.start()
         try:
@@ -121,13 +121,13 @@ class MissionControl(HeldPlan["Mission"]):
         Raises OperationRejected when it does not fly its mission, else as :meth:`Vehicle.hold`.
         """
         bridge, talk = self._bridge, self._talk
-        mode = bridge.orders.mode_for("mission.pause", "hold")
+        mode = bridge.sender.mode_for("mission.pause", "hold")
         if not self._context.is_flown:
             raise OperationRejected(
                 f"mission.pause: the vehicle does not fly its mission, it is in {talk.telemetry.mode_name};"
                 " nothing was sent"
             )
-        self._order = bridge.helm.order(mode)
+        self._order = bridge.arbiter.order(mode)
         self._is_paused = True
         await bridge.holding.stop_in(mode, self._order)
 
@@ -137,10 +137,10 @@ class MissionControl(HeldPlan["Mission"]):
         ArduPilot begins anew if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
         bridge, talk = self._bridge, self._talk
-        mode = bridge.orders.mode_for("mission.resume", "mission")
+        mode = bridge.sender.mode_for("mission.resume", "mission")
         if not talk.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
-        order = self._order = bridge.helm.order(mode)
+        order = self._order = bridge.arbiter.order(mode)
         self._watch.start()
         try:
             await self._enter(mode, order, timeout)
@@ -167,7 +167,7 @@ class MissionControl(HeldPlan["Mission"]):
             HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
         """
         bridge, talk = self._bridge, self._talk
-        mode = bridge.orders.mode_for("mission.wait_finished", "mission")
+        mode = bridge.sender.mode_for("mission.wait_finished", "mission")
         end = MissionEnd(bridge, self._watch, mode, self._context.memories[0].items)
         with talk.streaming("mission_current", "landed_state"):
             await await_progress(
@@ -187,7 +187,7 @@ class MissionControl(HeldPlan["Mission"]):
         That is so when the mission was ordered last, and is complete or at its last item; it is nobody else's doing.
         """
         talk = self._bridge.talk
-        if self._order is None or self._bridge.helm.newest is not self._order:
+        if self._order is None or self._bridge.arbiter.newest is not self._order:
             return False
         ends_in = [
             talk.autopilot.mode_for(purpose, is_vtol=talk.telemetry.is_vtol)
@@ -219,7 +219,7 @@ class MissionControl(HeldPlan["Mission"]):
         seq = item + self._context.offset_of(0)
         if talk.autopilot.sets_current_by_command:
             try:
-                await bridge.orders.command_of(
+                await bridge.sender.command_of(
                     order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
                 )
             except CommandRejected as error:
@@ -227,7 +227,7 @@ class MissionControl(HeldPlan["Mission"]):
                     raise
             else:
                 return
-        with bridge.helm.sending(order) as sending:
+        with bridge.arbiter.sending(order) as sending:
             try:
                 await self._set_current_by_message(seq, timeout, sending)
             except OperationTimeout as error:
@@ -236,7 +236,7 @@ class MissionControl(HeldPlan["Mission"]):
                 raise
 
     async def _set_current_by_message(
-        self, seq: int, timeout: float, standing: Sending | None = None
+        self, seq: int, timeout: float, standing: SentCommand | None = None
     ) -> None:
         from aerokit.protocols.missions import MissionSetCurrent
 
@@ -244,7 +244,7 @@ class MissionControl(HeldPlan["Mission"]):
         target = (transfers.system_id, transfers.component_id)
         async with self._context.lock:  # PX4 does not hear it during a transfer
             if standing is not None:
-                self._bridge.orders.raise_if_over(standing.order)
+                self._bridge.sender.raise_if_over(standing.order)
             await transfers.run(
                 MissionSetCurrent(
                     *target,
@@ -265,13 +265,13 @@ class MissionControl(HeldPlan["Mission"]):
     async def _enter(self, mode: Mode, order: Order, timeout: float) -> None:
         bridge, talk = self._bridge, self._talk
         if not talk.autopilot.mission_starts_by_command:
-            await bridge.orders.change_mode(mode, order, timeout, told_since=order.given_at)
+            await bridge.sender.change_mode(mode, order, timeout, told_since=order.given_at)
             return
         try:
-            with bridge.helm.changing_mode():
-                await bridge.orders.give(order, talk.commands.send_long, MavCmd.MISSION_START, modes=(mode,))
-                await bridge.orders.await_mode(mode, order, [], timeout, order.given_at)
+            with bridge.arbiter.changing_mode():
+                await bridge.sender.give(order, talk.commands.send_long, MavCmd.MISSION_START, modes=(mode,))
+                await bridge.sender.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
-            await bridge.orders.change_mode(mode, order, timeout, told_since=order.given_at)
+            await bridge.sender.change_mode(mode, order, timeout, told_since=order.given_at)

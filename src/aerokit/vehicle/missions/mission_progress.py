@@ -10,7 +10,7 @@ from aerokit.errors import ConnectionClosed
 from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MissionState
 from aerokit.position import Position
-from aerokit.vehicle.commanding.helm import MODE_GRACE_S
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
 from aerokit.vehicle.state.condition import MissionProgress
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ class MissionEnd:
         talk = bridge.talk
         self._bridge, self._talk = bridge, talk
         self._watch, self._mode = watch, mode
-        self._order = bridge.helm.newest
+        self._order = bridge.arbiter.newest
         last = items[-1].command if items else None
         self._ends_by_landing = last in LANDINGS
         self._stays_up = last == MavCmd.NAV_RETURN_TO_LAUNCH and not talk.autopilot.lands_after_return
@@ -225,12 +225,12 @@ class MissionEnd:
     def trouble(self, order: Order | None, *, is_paused: bool) -> str | None:
         """Why it will not come to its end any more. ``order`` is the last one that was given for the mission."""
         talk, now = self._talk, self._talk.connection.now()
-        if self._bridge.helm.newest not in (self._order, order):
+        if self._bridge.arbiter.newest not in (self._order, order):
             return "another order was given"
         is_in_mode = talk.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         if not talk.telemetry.is_surely_disarmed and (
-            is_paused or is_in_mode or self._is_landing or now < self._bridge.helm.mode_settles_at
+            is_paused or is_in_mode or self._is_landing or now < self._bridge.arbiter.mode_settles_at
         ):
             self._left_at = None
             return None

@@ -180,7 +180,7 @@ class FenceControl(HeldPlan["Fence"]):
             CommandRejected: the vehicle refused; PX4 does not know the command.
             CommandTimeout: it did not answer.
         """
-        await self._context.bridge.orders.command_aside(MavCmd.DO_FENCE_ENABLE, float(on))
+        await self._context.bridge.sender.command_aside(MavCmd.DO_FENCE_ENABLE, float(on))
 
     def _plan_type(self) -> type[Fence]:
         from aerokit.missions import Fence

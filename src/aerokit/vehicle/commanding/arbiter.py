@@ -1,4 +1,4 @@
-"""``Helm``: who steers: the program's newest order, and a pilot or a failsafe before all orders."""
+"""``CommandArbiter``: which orders of the program stand; a pilot or a failsafe comes before all of them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from collections import deque
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from aerokit.errors import CommandRejected
-from aerokit.vehicle.commanding.order import Order, Sending
-from aerokit.vehicle.commanding.posted import OWN_MODES_S, Posted
+from aerokit.errors import CommandRejected, OperationRejected
+from aerokit.vehicle.commanding.order import OVERRULED, Order, SentCommand
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from aerokit.autopilots import Mode
-    from aerokit.vehicle.commanding.order import Subject
+    from aerokit.vehicle.commanding.order import Subject, Topic
     from aerokit.vehicle.state.telemetry import Telemetry
 
-__all__ = ["FIRST_HEARTBEAT_S", "KNOWN_S", "MODE_GRACE_S", "Helm"]
+__all__ = ["FIRST_HEARTBEAT_S", "KNOWN_S", "MODE_GRACE_S", "CommandArbiter", "is_first_told"]
 
 MODE_GRACE_S = 3.0
 """How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
@@ -28,13 +27,25 @@ FIRST_HEARTBEAT_S = 1.5
 KNOWN_S = 2.5
 """What a vehicle does is known while its last HEARTBEAT is not older: two may be missing. No failsafe of ArduPilot or
 PX4 that minds a silent ground station acts sooner (FS_GCS_TIMEOUT 5 s, COM_DL_LOSS_T 10 s)."""
+OWN_MODES_S = 10.0
+"""A mode that the program ordered so long ago may be told only now: that is nobody who takes over."""
+
+STEERING, ACTION = "steering", "action"
+"""Topics of each order that steers, and of those among them that an action gives, or a command of the program."""
 
 
-class Helm:
-    """Keeps the orders of one vehicle, and tells each what HEARTBEAT says.
+def is_first_told(disarmed_told_at: float, accepted_at: float) -> bool:
+    """Whether a vehicle that arms does so by an order to arm that it accepted then.
 
-    An order ends when a newer one is given, and when the mode becomes one that it does not explain or the vehicle
-    disarms: that is for good, also if the mode comes back.
+    Told to be disarmed again after that, it was armed by somebody else.
+    """
+    return disarmed_told_at <= accepted_at + FIRST_HEARTBEAT_S
+
+
+class CommandArbiter:
+    """Keeps the orders of one vehicle, says which is the newest about its topics, and tells each what HEARTBEAT says.
+
+    Every order of the program passes here, waited for or not: flights, set-points, devices, fleets, classic programs.
     """
 
     arming_orders: int
@@ -42,7 +53,7 @@ class Helm:
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
         self.newest: Order | None = None
-        """The last order that steers."""
+        """The last order that steers and that an action or a command of the program has given."""
         self.arming_orders = 0
         """How many orders to arm or disarm were sent."""
         self.mode_is_in_doubt: bool = False
@@ -53,33 +64,64 @@ class Helm:
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
         self._orders: list[Order] = []
-        self._sendings: list[Sending] = []
-        self._posted: list[Posted] = []
+        self._posted: list[Order] = []
+        self._sent: list[SentCommand] = []
         self._numbers = itertools.count(1)
-        self._newest_about: dict[Subject, int] = {}
-        self._ordered_since_disarmed: set[Subject] = set()
+        self._latest: dict[Topic, Order] = {}
+        self._ordered_since_disarmed: set[Topic] = set()
         self._modes_ordered: deque[tuple[float, int]] = deque(maxlen=16)
-        self._on_new: list[Callable[[], None]] = []
+        self._on_steering: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
         telemetry.system_status.observe(self._on_state, every_arrival=True)
         telemetry.armed.observe(self._on_armed, every_arrival=True)
 
-    # ------------------------------------------------------------------------------- orders
+    # ---------------------------------------------------------------------------------- topics
+
+    def latest(self, topic: Topic) -> Order | None:
+        """The newest order about this that was not withdrawn."""
+        order = self._latest.get(topic)
+        while order is not None and order.is_withdrawn:
+            order = order.before
+        return order
+
+    def _is_newest(self, order: Order) -> bool:
+        newer = (self.latest(topic) for topic in order.ended_by)
+        return all(each is None or each.number <= order.number for each in newer)
+
+    def _register(self, order: Order, topics: Iterable[Topic]) -> Order:
+        for topic in topics:
+            self._latest[topic] = order
+        return order
+
+    def overrule(self, topics: Iterable[Topic]) -> None:
+        """A newer order about these is given, which nobody waits for: what was posted about them ends."""
+        topics = tuple(topics)
+        self._ordered_since_disarmed.update(topics)
+        self._register(Order(self._now(), next(self._numbers), self._is_newest), topics)
+
+    def of_device(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
+        """A new order about a device: those before end, and count again if it is withdrawn."""
+        order = Order(self._now(), next(self._numbers), self._is_newest, ended_by=(topic,))
+        order.before = self.latest(topic) if may_be_withdrawn else None
+        self._register(order, (topic,))
+        return order
+
+    # ------------------------------------------------------------------------------- steering
 
     def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion")) -> Order:
         """A new order that steers, and may bring about these modes: the one before ends, and what was posted about
         these subjects.
         """
-        for each in self._on_new:
-            each()
-        self.note_newer(subjects)
-        self._modes_ordered.extend((self._now(), each.custom_mode) for each in modes)
+        self._tell_steering()
+        self._modes_ordered.extend((self._now(), mode.custom_mode) for mode in modes)
         if self._posted_modes():
             self.doubt_mode()
         was_flown = self.is_flown_by_program
-        order = self._new(modes, lambda order: order is self.newest, self._end_flights(modes))
+        order = self._watching(modes, (STEERING,), self._end_flights(modes))
         order.was_flown_before = was_flown
         order.is_given = self._steers()
+        self._register(order, (*subjects, STEERING, ACTION))
+        self._ordered_since_disarmed.update(subjects)
         self.newest = order
         self._orders = [order]
         return order
@@ -92,29 +134,81 @@ class Helm:
             self._any_mode_until = self._now() + MODE_GRACE_S
         return self.order(*modes, subjects=subjects)
 
+    def on_steering(self, callback: Callable[[], None]) -> None:
+        """Have this called before each new order that steers."""
+        self._on_steering.append(callback)
+
+    def _tell_steering(self) -> None:
+        for callback in self._on_steering:
+            callback()
+
     def note_reboot(self) -> None:
         """The vehicle has rebooted: all orders end."""
-        orders: tuple[Order | Posted, ...] = (*self._orders, *self._posted)
-        for order in orders:
+        for order in (*self._orders, *self._posted):
             order.note_reboot()
         self._ordered_since_disarmed.clear()
         self._armed_by_program, self._armed_at = None, math.inf
 
+    # ---------------------------------------------------------------- orders beside it, in blocks
+
     @contextmanager
-    def aside(self, *, ends_flight: bool = False) -> Iterator[Order]:
-        """An order that does not steer (speed, home, arming …), for the time of the block."""
-        steering = self.newest
-        modes = () if steering is None else steering.modes
-        order = self._new(modes, lambda _: self.newest is steering, ends_flight)
+    def aside(self, of: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
+        """An order that does not steer (speed, home, arming …), or one command ``of`` an order to a device.
+
+        Raises:
+            OperationRejected: a newer order to the device was given since.
+        """
+        if of is not None and not of.is_newest:
+            raise OperationRejected(f"{OVERRULED}; the rest of the order was not sent")
+        modes = () if self.newest is None else self.newest.modes
+        order = self._watching(modes, (ACTION, *(() if of is None else of.ended_by)), ends_flight)
         self._orders.append(order)
         try:
             yield order
         finally:
             self._orders = [each for each in self._orders if each is not order]
 
-    def on_new(self, callback: Callable[[], None]) -> None:
-        """Have this called before each new order that steers."""
-        self._on_new.append(callback)
+    @contextmanager
+    def post(
+        self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
+    ) -> Iterator[Order]:
+        """An order that others may follow before it is answered, for the time of the block.
+
+        A newer one about the first of its subjects ends it. It ends what was posted about any of them before, and if
+        it steers, the order of an action.
+        """
+        is_steering = "arm" not in subjects[:1]
+        if is_steering:
+            self._tell_steering()
+            if self.newest is not None:
+                self.newest.expect(modes)
+        self._note_arming(armed)
+        now = self._now()
+        recent = {mode for at, mode in self._modes_ordered if at > now - OWN_MODES_S}
+        self._modes_ordered.extend((now, mode.custom_mode) for mode in modes)
+        order = Order(
+            now,
+            next(self._numbers),
+            self._is_newest,
+            ended_by=subjects[:1],
+            modes=modes,
+            armed=armed,
+            mode_before=self._telemetry.mode.latest,
+            expected=recent,
+            armed_before=self._telemetry.armed.latest,
+            state_before=self._telemetry.system_status.latest,
+            ends_flight=self._end_flights(modes) or armed is False,
+            minds_mode=armed is not False,
+            minds_disarming=subjects[0] == "motion",
+        )
+        self._register(order, (*subjects, STEERING) if is_steering else subjects)
+        self._ordered_since_disarmed.update(subjects)
+        self._posted.append(order)
+        try:
+            yield order
+        finally:
+            self._posted.remove(order)
+            order.close()
 
     @contextmanager
     def sending(
@@ -124,9 +218,9 @@ class Helm:
         modes: Collection[Mode] = (),
         armed: bool | None = None,
         is_done: Callable[[], bool] = lambda: False,
-    ) -> Iterator[Sending]:
-        """Watch what becomes of one command of this order, for the time of the block; see :class:`Sending`."""
-        sending = Sending(
+    ) -> Iterator[SentCommand]:
+        """Watch what becomes of one command of this order, for the time of the block; see :class:`SentCommand`."""
+        sent = SentCommand(
             order,
             mode_now=self._telemetry.mode.latest,
             armed_now=self._telemetry.armed.latest,
@@ -134,59 +228,14 @@ class Helm:
             armed=armed,
             is_done=is_done,
         )
-        self._note_arming(armed)
-        self._sendings.append(sending)
+        if order.armed is None:  # one that was posted to arm has ended those before already
+            self._note_arming(armed)
+        self._sent.append(sent)
         try:
-            yield sending
+            yield sent
             self._note_accepted(armed)
         finally:
-            self._sendings.remove(sending)
-
-    # --------------------------------------------------------------------------------- posted
-
-    @contextmanager
-    def posting(
-        self, subjects: Sequence[Subject], *, modes: Collection[Mode] = (), armed: bool | None = None
-    ) -> Iterator[Posted]:
-        """An order about the first of these subjects that is given without waiting, for the time of the block.
-
-        It ends what was posted about any of them before, and if it steers, the order of an action.
-        """
-        if "arm" not in subjects[:1]:
-            for each in self._on_new:
-                each()
-            if self.newest is not None:
-                self.newest.note_newer()
-                self.newest.expect(modes)
-        self._note_arming(armed)
-        number, now = self.note_newer(subjects), self._now()
-        own_modes = {mode for at, mode in self._modes_ordered if at > now - OWN_MODES_S}
-        self._modes_ordered.extend((now, each.custom_mode) for each in modes)
-        posted = Posted(
-            lambda: self._newest_about[subjects[0]] == number,
-            modes=modes,
-            own_modes=own_modes,
-            armed=armed,
-            mode_now=self._telemetry.mode.latest,
-            armed_now=self._telemetry.armed.latest,
-            state_now=self._telemetry.system_status.latest,
-            moves=subjects[0] == "motion",
-            ends_flight=self._end_flights(modes),
-        )
-        self._posted.append(posted)
-        try:
-            yield posted
-            self._note_accepted(armed)
-        finally:
-            self._posted.remove(posted)
-
-    def note_newer(self, subjects: Iterable[Subject]) -> int:
-        """A newer order about these is given: what was posted about them before ends; the number of it."""
-        number = next(self._numbers)
-        about = dict.fromkeys(subjects, number)
-        self._newest_about.update(about)
-        self._ordered_since_disarmed.update(about)
-        return number
+            self._sent.remove(sent)
 
     def note_own_arming(self, armed: bool) -> None:
         """The program has sent an order to arm or disarm, and nobody waits for its answer."""
@@ -202,9 +251,9 @@ class Helm:
         if armed is None:
             return
         self.arming_orders += 1
-        self.note_newer(("arm",))
-        for each in self._sendings:
-            each.note_newer(armed)
+        self.overrule(("arm",))
+        for sent in self._sent:
+            sent.note_newer(armed)
 
     # --------------------------------------------------------------------------------- doubts
 
@@ -239,7 +288,7 @@ class Helm:
         """
         order, about = self.newest, self._ordered_since_disarmed
         # of an order without modes, such as a command of the program's own, it is not known what it brings about
-        is_taken = order is not None and order.modes and order.taken_by and not order.is_overruled
+        is_taken = order is not None and order.modes and order.taken_by and order.is_newest
         return "arm" in about if is_taken else bool(about)
 
     @property
@@ -268,8 +317,8 @@ class Helm:
 
     # --------------------------------------------------------------------------------- inside
 
-    def _new(
-        self, modes: Collection[Mode], is_newest: Callable[[Order], bool], ends_flight: bool = False
+    def _watching(
+        self, modes: Collection[Mode], ended_by: Sequence[Topic], ends_flight: bool = False
     ) -> Order:
         before, mode = self.newest, self._telemetry.mode.latest
         is_under_way = before is not None and mode is not None and before.is_own(mode)
@@ -277,12 +326,14 @@ class Helm:
         expected = before.modes if is_unsettled and before is not None else ()
         return Order(
             self._now(),
-            mode_before=mode,
+            next(self._numbers),
+            self._is_newest,
+            ended_by=ended_by,
             modes=modes,
-            expected=(*expected, *self._posted_modes()),
+            mode_before=mode,
+            expected={each.custom_mode for each in (*expected, *self._posted_modes())},
             armed_before=self._telemetry.armed.latest,
             state_before=self._telemetry.system_status.latest,
-            is_newest=is_newest,
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
             ends_flight=ends_flight,
@@ -311,12 +362,13 @@ class Helm:
         )
 
     def _on_mode(self, _: Mode | None, mode: Mode) -> None:
-        for each in self._followers():
+        followers: tuple[Order | SentCommand, ...] = (*self._watched(), *self._sent)
+        for each in followers:
             each.note_mode(mode, self._telemetry.mode.updated_at)
 
     def _on_state(self, _: int | None, state: int) -> None:
-        for each in self._followers():
-            each.note_state(state)
+        for order in self._watched():
+            order.note_state(state)
 
     def _on_armed(self, before: bool | None, armed: bool) -> None:
         if before and not armed:
@@ -325,20 +377,20 @@ class Helm:
             self._note_armed_anew()
         if not armed:
             self._disarmed_told_at = self._telemetry.armed.updated_at
-        for each in self._followers():
+        followers: tuple[Order | SentCommand, ...] = (*self._watched(), *self._sent)
+        for each in followers:
             each.note_armed(armed, self._telemetry.armed.updated_at)
 
     def _note_armed_anew(self) -> None:
         self._armed_at = self._telemetry.armed.updated_at
-        is_under_way = any(each.arms for each in self._sendings) or any(each.armed for each in self._posted)
-        # Disarmed again after an order to arm was accepted, it was armed by somebody else.
+        is_under_way = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         is_accepted = math.isfinite(self._arming_accepted_at)
-        is_first = self._disarmed_told_at <= self._arming_accepted_at + FIRST_HEARTBEAT_S
-        is_ordered = is_under_way or (is_accepted and is_first)
+        is_first = is_first_told(self._disarmed_told_at, self._arming_accepted_at)
         newest = self.newest
         modes = () if newest is None or newest.taken_by else newest.modes
-        self._armed_by_program = self._new(modes, lambda _: True) if is_ordered else None
+        is_ordered = is_under_way or (is_accepted and is_first)
+        self._armed_by_program = self._watching(modes, ()) if is_ordered else None
 
-    def _followers(self) -> tuple[Order | Sending | Posted, ...]:
+    def _watched(self) -> tuple[Order, ...]:
         own = () if self._armed_by_program is None else (self._armed_by_program,)
-        return (*own, *self._orders, *self._sendings, *self._posted)
+        return (*own, *self._orders, *self._posted)
