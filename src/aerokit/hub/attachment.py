@@ -44,7 +44,6 @@ class Attachment:
 
     filters: Filters
     is_open: bool
-    tells_bursts: bool
     totals: Totals
 
     def __init__(
@@ -61,7 +60,7 @@ class Attachment:
             self.link = address
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
-        self.is_open = self.tells_bursts = False
+        self.is_open = False
         self._is_on_link = self._is_single = False
         self._ports: dict[Peer, Port] = {}
         self._guard = IdentityGuard(self.link, self._tell_of_peer)
@@ -184,7 +183,6 @@ class Attachment:
     def _come_up(self) -> None:
         self.is_open = True
         self._is_single = self.link.has_peer(None)
-        self.tells_bursts = self.link.tells_bursts
         if self._is_single and None not in self._ports:
             self._add_port(None)
 
@@ -198,14 +196,16 @@ class Attachment:
             self.link,
             peer,
             self.totals,
+            endpoint=self.name,
             dialect=self._dialect,
             hold_above=self._hold_above(),
+            period=self.filters.period,
+            report=partial(self._tell, self),
             tell=self._dropped,
             border=self._border,
             guard=None if self._is_single else self._guard,
             is_mute=self.endpoint.read_only,
         )
-        port.owner = self
         self._guard.is_shared = len(self._ports) > 1
         self._switch.add(port)
         return port

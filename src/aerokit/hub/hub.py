@@ -270,10 +270,10 @@ class Hub:
                 logger.exception("a listener (%r) raised; the others are told all the same", listener)
 
     def _on_change(self, kind: HubEventKind, source: int, port: Port, before: Port | None) -> None:
-        if port.owner is None or (before is not None and before.owner is port.owner and kind == "moved"):
+        if before is not None and before.endpoint == port.endpoint and kind == "moved":
             return  # its guard has told it
         who = f"{source & 0xFF}/{source >> 8}"
-        other = "an endpoint that has gone" if before is None or before.owner is None else before.owner.name
+        other = "an endpoint that has gone" if before is None else before.endpoint
         text = {
             "heard_twice": f"{who} is heard here and at {other}, where what is for it goes: two links to one vehicle,"
             " or two vehicles with the same ids",
@@ -281,11 +281,10 @@ class Hub:
             "loop": f"what {who} said at {other} comes back here: both lead to the same network in a circle; what comes"
             " round is dropped",
         }[kind]
-        self._tell(port.owner, kind, text)
+        port.report(kind, text)
 
     def _on_mistake(self, port: Port, error: Exception) -> None:
-        if port.owner is not None:
-            self._tell(port.owner, "mistake", f"what was to be sent is lost: {error}")
+        port.report("mistake", f"what was to be sent is lost: {error}")
 
     def _on_background_mistake(self, error: Exception) -> None:
         logger.error("a mistake inside aerokit's hub; its endpoints go on", exc_info=error)
@@ -296,7 +295,7 @@ def _endpoint(given: str | Endpoint | Link) -> Endpoint:
 
 
 def _gate(port: Port, message_id: int) -> float | None:
-    return 0.0 if port.owner is None else port.owner.filters.period(message_id)
+    return port.period(message_id)
 
 
 async def _closed(attachments: list[Attachment]) -> None:

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable
 
-    from aerokit.hub.attachment import Attachment
     from aerokit.hub.guards import Border, IdentityGuard
     from aerokit.hub.routing import Node, Plan
+    from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.dialect import Dialect
     from aerokit.transport.link import Link, Peer
 
@@ -41,7 +41,9 @@ class Port:
     more than ``hold_above`` bytes (`NEVER`: it is not asked) have not left it, they wait in a queue that knows what
     they are.
 
-    ``tell(reason, held)`` is called for each frame that was dropped out of the queue.
+    ``endpoint`` is the endpoint's name, ``period(message_id)`` its filters' answer (`Filters.period`). ``report(kind,
+    text)`` tells an event of the endpoint, ``tell(reason, held)`` is called for each frame that was dropped out of the
+    queue.
     """
 
     link: Link
@@ -53,8 +55,11 @@ class Port:
         peer: Peer,
         totals: Totals,
         *,
+        endpoint: str,
         dialect: Dialect,
         hold_above: int,
+        period: Callable[[int], float | None],
+        report: Callable[[HubEventKind, str], object],
         tell: Callable[[str, Held], object],
         border: Border | None = None,
         guard: IdentityGuard | None = None,
@@ -62,6 +67,9 @@ class Port:
     ) -> None:
         self.link, self.peer = link, peer
         self.totals = totals
+        self.endpoint, self.period, self.report = endpoint, period, report
+        self.tells_bursts: bool = link.tells_bursts
+        """Whether its link says when nothing more comes for now."""
         self.border: Border | None = border
         self.guard: IdentityGuard | None = guard
         self.is_mute: bool = is_mute
@@ -70,17 +78,11 @@ class Port:
         """Whether each frame is written by itself: autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         self.node: Node[Port] | None = None
-        self.owner: Attachment | None = None
         self._dialect = dialect
         self._hold_above, self._may_hold = hold_above, hold_above < NEVER
         self._tell = tell
         self._held = HeldFrames()
         self._due: dict[int, float] = {}
-
-    @property
-    def tells_bursts(self) -> bool:
-        """Whether its link says when nothing more comes for now."""
-        return self.owner is not None and self.owner.tells_bursts
 
     @property
     def is_holding(self) -> bool:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.events import VehicleFound
     from aerokit.fleets.formations import Following
-    from aerokit.sync.twins import Gimbal
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.part import CameraBlock
     from aerokit.vehicle.camera.shooting import PhotoInterval
@@ -226,8 +225,8 @@ class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):
     """Set-points are sent while its ``with`` lasts."""
 
 
-class GimbalsTwin(TwinOf["Gimbals"]):
-    """They are found by their ids; an iterable."""
+class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
+    """They are found by their ids; an iterable of ``T``, the twin of a gimbal."""
 
     if TYPE_CHECKING:  # generated
 
@@ -236,14 +235,14 @@ class GimbalsTwin(TwinOf["Gimbals"]):
             """Of those that were heard of."""
             raise NotImplementedError
 
-        def get(self, device_id: int) -> Gimbal:
+        def get(self, device_id: int) -> T:
             """The gimbal of this id."""
             raise NotImplementedError
 
-    def __getitem__(self, device_id: int) -> Gimbal:
+    def __getitem__(self, device_id: int) -> T:
         return self.get(device_id)
 
-    def __iter__(self) -> Iterator[Gimbal]:
+    def __iter__(self) -> Iterator[T]:
         return iter([self.get(each) for each in self.ids])
 
     def __len__(self) -> int:

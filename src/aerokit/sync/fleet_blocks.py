@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from aerokit.fleets.fleet import Fleet as AsyncFleet
     from aerokit.fleets.fleet import Selection as AsyncSelection
     from aerokit.fleets.members import Member
-    from aerokit.sync.fleet_twins import Selection
 
 __all__ = ["FleetTwin", "SelectionTwin", "opened_fleet"]
 
@@ -46,11 +45,6 @@ class SelectionTwin(TwinOf[SelectionT]):
         """Name → vehicle."""
         return {name: _vehicle(self._loop, each) for name, each in self.aio.vehicles.items()}
 
-    def __getitem__(self, pattern: str) -> Selection:
-        from aerokit.sync.fleet_twins import Selection
-
-        return Selection(self._loop, self.aio[pattern])
-
     def __len__(self) -> int:
         return len(self.aio)
 
@@ -66,8 +60,8 @@ def _vehicle(loop: LoopThread, vehicle: Any) -> Vehicle:
     return Vehicle(loop, lent, owns_loop=False)
 
 
-class FleetTwin(SelectionTwin["AsyncFleet"], BlockingBlock):
-    """A context manager. What was opened for it is closed with it."""
+class FleetTwin(TwinOf["AsyncFleet"], BlockingBlock):
+    """What a fleet has beside a selection: a context manager. What was opened for it is closed with it."""
 
     _opened_by = "fleet"
 

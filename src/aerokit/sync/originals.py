@@ -21,15 +21,18 @@ __all__ = ["TWINS", "Member", "Twin", "decorators_of", "function_node", "imports
 class Twin:
     """One class to be made: ``base`` is what is written by hand for it, in ``blocks.py``.
 
-    ``only``: these members alone; ``without``: all but these. ``direct``: methods that only read, and are called on
-    the thread of the program; ``called``: properties that are read on the loop; ``parts``: those that are made
-    there when they are first read. ``page``: the file that it is written to.
+    ``inherits``: the twin of a base of the original, which has that one's members. ``only``: these members alone;
+    ``without``: all but these; ``special``: of methods like ``__getitem__``, these too. ``direct``: methods that only
+    read, and are called on the thread of the program; ``called``: properties that are read on the loop; ``parts``:
+    those that are made there when they are first read. ``page``: the file that it is written to.
     """
 
     path: str
     base: str = "TwinOf"
+    inherits: str = ""
     only: frozenset[str] = frozenset()
     without: frozenset[str] = frozenset()
+    special: frozenset[str] = frozenset()
     direct: frozenset[str] = frozenset()
     called: frozenset[str] = frozenset()
     parts: frozenset[str] = frozenset()
@@ -73,7 +76,7 @@ TWINS = (
     Twin("aerokit.vehicle.gimbal.control.GimbalControl", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),
-    Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids")),
+    Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids"), parameter='"Gimbal"'),
     Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.logs.Logs"),
@@ -98,8 +101,15 @@ TWINS = (
         ),
     ),
     Twin("aerokit.fleets.formations.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
-    Twin("aerokit.fleets.fleet.Selection", "SelectionTwin", without=_names("vehicles"), page="fleet_twins"),
-    Twin("aerokit.fleets.fleet.Fleet", "FleetTwin", without=_names("vehicles"), page="fleet_twins"),
+    Twin(
+        "aerokit.fleets.fleet.Selection",
+        "SelectionTwin",
+        without=_names("vehicles"),
+        special=_names("__getitem__"),
+        direct=_names("__getitem__"),
+        page="fleet_twins",
+    ),
+    Twin("aerokit.fleets.fleet.Fleet", "FleetTwin", inherits="Selection", page="fleet_twins"),
 )
 """The classes that programs without ``async`` use, each below those that it gives."""
 
@@ -151,14 +161,20 @@ class Member:
 
 def members_of(twin: Twin) -> list[Member]:
     """Those of the class and of what it inherits, each once, in the order of the oldest definition."""
-    cls = getattr(importlib.import_module(twin.module), twin.name)
+    cls = _class_of(twin)
+    inherited = next((_class_of(each).__mro__ for each in TWINS if each.name == twin.inherits), ())
     found: dict[str, Member] = {}
     filled = _filled(cls)
     for each in reversed(cls.__mro__):
-        if each.__module__.startswith("aerokit."):
+        if each.__module__.startswith("aerokit.") and each not in inherited:
             found |= {member.name: filled(member) for member in _own(each)}
-    wanted = twin.only or frozenset(found)
+    wanted = twin.only or {name for name in found if not name.startswith("_")} | twin.special
     return [each for name, each in found.items() if name in wanted and name not in twin.without]
+
+
+def _class_of(twin: Twin) -> type:
+    original: type = getattr(importlib.import_module(twin.module), twin.name)
+    return original
 
 
 def _filled(cls: type) -> Callable[[Member], Member]:
@@ -188,7 +204,7 @@ def _own(cls: type) -> Iterator[Member]:
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             if node.name == "__init__" and isinstance(node, ast.FunctionDef):
                 yield from _attributes(node, (cls.__module__,))
-            elif not node.name.startswith("_") and not _is_setter(node):
+            elif not _is_setter(node):
                 yield Member(node.name, (cls.__module__,), node, node.returns, ast.get_docstring(node))
         elif isinstance(node, ast.AnnAssign) and _is_told(node.annotation):
             assert isinstance(node.target, ast.Name)
