@@ -18,7 +18,7 @@ from aerokit.dronekit.observers import message_of
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
-from aerokit.mavlink.pymavlink import MessageFactory, from_pymavlink
+from aerokit.mavlink.message_factory import MessageFactory, from_pymavlink
 
 if TYPE_CHECKING:
     from aerokit.dronekit.line import Line

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.master import Master
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.dronekit.observers import AttributeListener
-    from aerokit.mavlink.pymavlink import MessageFactory
+    from aerokit.mavlink.message_factory import MessageFactory
     from aerokit.sync.loop_thread import Held
     from aerokit.vehicle.state.condition import StatusText
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle

@@ -1,0 +1,190 @@
+"""Dialects that are not committed: read from XML or from a pymavlink module, and compiled to classes.
+
+Imported only when a program reads one: the reader of the XML and the renderer of the sources come with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from struct import Struct
+from types import ModuleType
+from typing import Any, Protocol
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink import message as message_module
+from aerokit.mavlink.definitions import (
+    EntryDefinition,
+    EnumDefinition,
+    FieldDefinition,
+    MessageDefinition,
+    carries_bytes,
+    merged_enums,
+    read_dialect,
+)
+from aerokit.mavlink.enumeration import make_enum
+from aerokit.mavlink.generator import xml_folder
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.rendering import render_message
+
+__all__ = ["Read", "class_from_pymavlink", "compile_message", "read_pymavlink_dialect", "read_xml_dialect"]
+
+Read = tuple[str, list[type[Message]], dict[str, type[Any]]]
+"""Name, classes, and enums by the standard's spelling."""
+
+
+class Standard(Protocol):
+    """The committed messages, of which those that say the same are taken."""
+
+    rows: dict[int, tuple[int, int, int]]
+
+    def __getitem__(self, message_id: int, /) -> type[Message]: ...
+
+
+def read_xml_dialect(path: Path, standard: Standard) -> Read:
+    """Name, classes and enums of an XML file and of all that it includes; see `Dialect.from_xml`."""
+    dialects = read_dialect(path, [xml_folder()])
+    definitions = [message for dialect in dialects for message in dialect.messages]
+    return _read(path.stem, definitions, merged_enums(dialects), standard)
+
+
+def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Read:
+    """Name, classes and enums of a dialect of pymavlink; see `Dialect.from_pymavlink`."""
+    if isinstance(module, str):
+        module = _import(module)
+    known: dict[int, Any] | None = getattr(module, "mavlink_map", None)
+    if known is None:
+        raise InvalidArgument(f"{module.__name__} is no pymavlink dialect: it has no mavlink_map")
+    definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
+    enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
+    name = module.__name__.rpartition(".")[2]
+    return _read(name, definitions, [enum for enum in enums if enum.entries], standard)
+
+
+def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message]:
+    """The class for one of pymavlink's message classes: the committed one, if that says the same about the bytes.
+
+    Raises InvalidArgument when pymavlink's class does not agree with its own CRC_EXTRA.
+    """
+    definition = _message(message_class)
+    return _standard_class(definition, standard) or compile_message(definition)
+
+
+def compile_message(definition: MessageDefinition) -> type[Message]:
+    """A class like the generated ones; it cannot be pickled, because no module holds it."""
+    source = "from __future__ import annotations\n" + render_message(definition, docs=False)
+    namespace: dict[str, Any] = {
+        "__name__": f"{__name__}.{definition.origin}",
+        "Struct": Struct,
+        "Message": Message,
+        "PACK_ERRORS": message_module.PACK_ERRORS,
+        "pack_bytes": message_module.pack_bytes,
+        "pack_items": message_module.pack_items,
+        "pack_text": message_module.pack_text,
+        "_new": object.__new__,
+    }
+    exec(compile(source, f"<{definition.origin} {definition.name}>", "exec"), namespace)
+    message_class: type[Message] = namespace[definition.class_name]
+    message_class.__doc__ = f"{definition.name} ({definition.id}): {definition.description}"
+    return message_class
+
+
+def _read(
+    name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
+) -> Read:
+    by_id: dict[int, MessageDefinition] = {}
+    for definition in definitions:
+        other = by_id.setdefault(definition.id, definition)
+        if other != definition and (other.name, other.crc_extra) != (definition.name, definition.crc_extra):
+            raise InvalidArgument(
+                f"message id {definition.id} is defined twice in {name}: {other.name} in {other.origin},"
+                f" {definition.name} in {definition.origin}"
+            )
+    classes = [
+        _standard_class(definition, standard) or compile_message(definition) for definition in by_id.values()
+    ]
+    return name, classes, {enum.name: _enum_type(name, enum) for enum in enums}
+
+
+def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
+    members = [(member, entry.value) for member, entry in enum.members()]
+    try:
+        return make_enum(
+            f"{__name__}.{dialect}",
+            enum.class_name,
+            enum.bitmask,
+            enum.description,
+            members,
+            is_from_outside=True,
+        )
+    except (TypeError, ValueError) as error:  # two of a name, names that Python keeps for itself
+        raise InvalidArgument(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
+
+
+def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
+    """The committed class, when it says the same about the bytes, or knows more extension fields behind them."""
+    row = standard.rows.get(definition.id)
+    if row is None or row[:2] != (definition.crc_extra, definition.base_length):
+        return None
+    committed = standard[definition.id]
+    fields = [(f.attribute, f.type, f.array_length) for f in definition.fields]
+    known = [(f.name, f.type, f.array_length) for f in committed.FIELDS[: len(fields)]]
+    return committed if definition.name == committed.NAME and known == fields else None
+
+
+# -------------------------------------------------------------------------------- pymavlink modules
+def _import(name: str) -> ModuleType:
+    candidates = [name] if "." in name else [f"pymavlink.dialects.v20.{name}", name]
+    for candidate in candidates:
+        try:
+            return import_module(candidate)
+        except ModuleNotFoundError as error:
+            if error.name is None or not candidate.startswith(error.name):
+                raise
+    raise InvalidArgument(f"no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
+
+
+def _message(cls: Any) -> MessageDefinition:
+    order = list(cls.ordered_fieldnames)
+    message_name = getattr(cls, "msgname", None) or cls.name
+    fields = []
+    for name, kind in zip(cls.fieldnames, cls.fieldtypes):  # noqa: B905 - of one length
+        array_length = int(cls.array_lengths[order.index(name)])
+        units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
+        enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
+        default = 3 if name == "mavlink_version" else None
+        is_bytes = carries_bytes(message_name, name, kind)
+        fields.append(
+            FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes)
+        )
+    description = " ".join((cls.__doc__ or "").split())
+    definition = MessageDefinition(
+        int(cls.id), message_name, tuple(fields), description, cls.__module__.rpartition(".")[2]
+    )
+    return _with_extensions(definition, order, int(cls.crc_extra))
+
+
+def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
+    """Pymavlink's classes do not say where the extensions begin; CRC_EXTRA and the order on the wire do."""
+    fields = definition.fields
+    for base in range(len(fields), -1, -1):
+        guess = MessageDefinition(
+            definition.id,
+            definition.name,
+            tuple(replace(f, extension=i >= base) for i, f in enumerate(fields)),
+            definition.description,
+            definition.origin,
+        )
+        if guess.crc_extra == crc_extra and [f.name for f in guess.wire_fields] == order:
+            return guess
+    raise InvalidArgument(f"{definition.name}: CRC_EXTRA {crc_extra} fits none of its field orders")
+
+
+def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
+    end_marker = f"{name}_ENUM_END"
+    kept = [
+        EntryDefinition(e.name, value, e.description) for value, e in entries.items() if e.name != end_marker
+    ]
+    return EnumDefinition(name, tuple(kept))
