@@ -18,7 +18,8 @@ from aerokit.dronekit.master import Master
 from aerokit.dronekit.mavlink import MAVConnection
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.message_factory import MessageFactory, from_pymavlink
+from aerokit.mavlink.message_factory import MessageFactory
+from aerokit.mavlink.pymavlink import from_pymavlink
 
 v10: Any = import_module("pymavlink.dialects.v10.ardupilotmega")
 v20: Any = import_module("pymavlink.dialects.v20.ardupilotmega")

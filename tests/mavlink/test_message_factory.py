@@ -8,7 +8,8 @@ import pytest
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import Message, messages
-from aerokit.mavlink.message_factory import MessageFactory, from_pymavlink
+from aerokit.mavlink.message_factory import MessageFactory
+from aerokit.mavlink.pymavlink import from_pymavlink
 
 TARGET = 7
 

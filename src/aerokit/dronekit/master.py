@@ -18,7 +18,8 @@ from aerokit.dronekit.observers import message_of
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
-from aerokit.mavlink.message_factory import MessageFactory, from_pymavlink
+from aerokit.mavlink.message_factory import MessageFactory
+from aerokit.mavlink.pymavlink import from_pymavlink
 
 if TYPE_CHECKING:
     from aerokit.dronekit.line import Line

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Field
 
-__all__ = ["MessageFactory", "from_pymavlink", "to_pymavlink"]
+__all__ = ["from_pymavlink", "to_pymavlink"]
 
 REAL_TYPES = ("float", "double")
 
@@ -373,19 +373,3 @@ def _unknown(frame: Frame, timestamp: float) -> Any:
     header.seq, header.srcSystem, header.srcComponent = frame.sequence, frame.system_id, frame.component_id
     vars(message)["_timestamp"] = timestamp
     return message
-
-
-if TYPE_CHECKING:  # its own types are stricter than what is taken here
-
-    class _MAVLink:
-        total_packets_sent: int
-        send_callback: Callable[..., object] | None
-        send_callback_args: tuple[Any, ...] | None
-        send_callback_kwargs: dict[str, Any] | None
-
-        def __init__(self, file: object, source_system: int, source_component: int) -> None: ...
-else:
-    _MAVLink = ardupilotmega.MAVLink
-
-
-_take_text_in(MessageFactory)
