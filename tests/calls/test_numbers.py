@@ -22,7 +22,7 @@ import aerokit
 from aerokit._internal.values import Snapshot
 
 KEPT = Path(__file__).with_name("numbers.txt")
-ROOMS = ("autopilots", "links", "mavlink", "protocols", "runtime", "vehicle")
+ROOMS = ("autopilots", "transport", "mavlink", "protocols", "connection", "vehicle")
 LEFT_OUT = ("aerokit.mavlink.messages", "aerokit.mavlink.enums", "aerokit.mavlink.additions")
 LONG = 1000
 """Tables that are longer are worked out from others, or have tests of their own."""

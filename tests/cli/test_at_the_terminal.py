@@ -192,8 +192,8 @@ def test_help_imports_no_command() -> None:
     """Nor anything else that takes long: somebody waits for it."""
     program = (
         "import sys\nfrom aerokit.apps.cli import main\ntry:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print([name for name in sys.modules if name.startswith(('aerokit.sim', 'aerokit.vehicle', 'aerokit.connection',"
-        " 'aerokit.mavlink.messages', 'argcomplete', 'anyio', 'tqdm', 'serial'))])"
+        "print([name for name in sys.modules if name.startswith(('aerokit.sim', 'aerokit.vehicle',"
+        " 'aerokit.connection', 'aerokit.mavlink.messages', 'argcomplete', 'anyio', 'tqdm', 'serial'))])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("\n[]\n")
