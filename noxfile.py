@@ -12,7 +12,7 @@ import nox
 
 nox.options.sessions = ["tests", "lint", "types"]
 nox.options.error_on_missing_interpreters = False
-nox.options.default_venv_backend = "venv"
+nox.options.default_venv_backend = "uv|venv"
 
 PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
 
@@ -22,6 +22,13 @@ def tests(session: nox.Session) -> None:
     """Run the tests, on stock asyncio and on uvloop."""
     session.install("-e", ".[test]")
     session.run("pytest", *session.posargs)
+
+
+@nox.session
+def exhaustive(session: nox.Session) -> None:
+    """Run the rows of long tables, and the slow tests, that `pytest` leaves out; three minutes."""
+    session.install("-e", ".[test]")
+    session.run("pytest", "-q", "-m", "exhaustive", *session.posargs)
 
 
 MEETS_OTHERS = (
@@ -55,7 +62,8 @@ OF_EXTRAS = (
 @nox.session
 def lowest(session: nox.Session) -> None:
     """Run the tests that meet other packages with the lowest versions that pyproject.toml declares."""
-    _install_lowest(session)
+    session.install("uv>=0.5")
+    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test]")
     session.run("pytest", "-q", *(session.posargs or (*MEETS_OTHERS, *OF_EXTRAS)))
 
 
@@ -64,11 +72,6 @@ def beside_trio(session: nox.Session) -> None:
     """Run them with trio and sniffio installed: anyio does not take asyncio for granted then."""
     session.install("-e", ".[test]", "trio", "sniffio")
     session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
-
-
-def _install_lowest(session: nox.Session) -> None:
-    session.install("uv>=0.5")
-    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test]")
 
 
 @nox.session
@@ -165,7 +168,7 @@ def fuzz(session: nox.Session) -> None:
     With atheris, which follows what code an input reaches, where it installs.
     """
     session.install("-e", ".[test]")
-    session.run("python", "-m", "pip", "install", "-q", "atheris", success_codes=[0, 1])
+    session.install("-q", "atheris", success_codes=[0, 1, 2])
     session.run("python", "tests/fuzz/fuzz.py", *session.posargs)
 
 
@@ -182,7 +185,7 @@ def soak(session: nox.Session) -> None:
     session.install("-e", ".[test]")
     minutes = session.posargs[0] if session.posargs else "60"
     # pytest would keep what is logged, which grows
-    options = ("-q", "-n", "0", "-p", "no:logging")
+    options = ("-q", "-n", "0", "-p", "no:logging", "-m", "")
     session.run("pytest", *options, "tests/soak", env={"AEROKIT_SOAK_MINUTES": minutes})
 
 
@@ -198,14 +201,23 @@ def orders(session: nox.Session) -> None:
     """Fly the order table of docs/reliability.md with many seeds of each row (100): `nox -s orders -- 300`."""
     session.install("-e", ".[test]")
     seeds = session.posargs[0] if session.posargs else "100"
-    session.run("pytest", "-q", "tests/vehicle/commanding/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
+    session.run(
+        "pytest", "-q", "-m", "", "tests/vehicle/commanding/orders", env={"AEROKIT_ORDER_SEEDS": seeds}
+    )
 
 
 @nox.session
 def cancel(session: nox.Session) -> None:
     """Cancel every public coroutine at every await, not only at a few; a minute."""
     session.install("-e", ".[test]")
-    session.run("pytest", "-q", "tests/calls/test_cancellation.py", env={"AEROKIT_CANCEL_POINTS": "0"})
+    session.run(
+        "pytest",
+        "-q",
+        "-m",
+        "exhaustive",
+        "tests/calls/test_cancellation.py",
+        env={"AEROKIT_CANCEL_POINTS": "0"},
+    )
 
 
 @nox.session(name="dronekit")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -14,6 +15,9 @@ from hypothesis import given, settings, strategies
 from late_loop import LateLoop
 from recorded import headline
 
+if sys.dont_write_bytecode:  # each worker, and each program of a test, would compile everything anew
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 ):  # a background job of a script: some tests interrupt themselves

@@ -11,6 +11,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from exhaustive import exhaustive
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -49,7 +50,7 @@ def apply(step: re.Match[str], sources: Path) -> None:
     file.write_text(text, encoding="utf-8")
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("recipe", [*map(exhaustive, RECIPES[:-1]), RECIPES[-1]])
 def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
     shutil.copytree(
         ROOT / "src" / "aerokit", tmp_path / "aerokit", ignore=shutil.ignore_patterns("__pycache__")

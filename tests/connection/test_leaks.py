@@ -14,6 +14,7 @@ from typing import Any
 
 import anyio
 import pytest
+from exhaustive import exhaustive
 from leak_check import CountingLoop, run_and_do
 
 from aerokit import Vehicle, VelocitySetpoint, connect, open_connection
@@ -54,7 +55,9 @@ async def fly(vehicle: Vehicle) -> None:
     await vehicle.land()
 
 
-each_use = pytest.mark.parametrize("use", [nothing, read, arm, fly], ids=lambda use: use.__name__)
+each_use = pytest.mark.parametrize(
+    "use", [arm, *map(exhaustive, (nothing, read, fly))], ids=lambda use: use.__name__
+)
 
 
 class Session:
@@ -117,7 +120,7 @@ def test_cancelled_at_any_turn(use: Use) -> None:
         assert task.cancelled() is cancelled[0], turns
 
 
-@pytest.mark.parametrize("use", [nothing, fly], ids=lambda use: use.__name__)
+@pytest.mark.parametrize("use", [nothing, exhaustive(fly)], ids=lambda use: use.__name__)
 def test_cancelled_by_a_scope_at_any_turn(use: Use) -> None:
     """As asyncio.timeout and anyio.fail_after do it: afterwards the program goes on, with nothing pending."""
     scopes: list[anyio.CancelScope] = []
@@ -225,7 +228,7 @@ from aerokit.sim import SimulatedCopter, simulated_link
 
 async def main():
     copter = SimulatedCopter(boot_time_s=0)
-    async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+    async with simulated_link(copter, speedup=20.0) as link, aerokit.connect(link) as vehicle:
         copter.faults.silent = True
         pending = asyncio.ensure_future(vehicle.command(512, 1))
         try:
@@ -257,7 +260,7 @@ def test_a_program_with_an_unanswered_call_exits(tmp_path: Path, ending: str, co
         [sys.executable, "-X", "dev", str(file)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=200,
         env=environment,
         check=False,
     )

@@ -30,7 +30,7 @@ def found(path: str) -> Any:
 def told() -> Iterator[Stage]:
     """A vehicle that has told everything; tests only read it."""
     with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as stage:
-        stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=10)
+        stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=100)
         stage.settle()
         yield stage
 

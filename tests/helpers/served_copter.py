@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,11 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
 SPEEDUP = 20.0
+
+
+def complaints(stderr: str) -> str:
+    """What a program wrote to standard error, without the warning that this machine kept its event loop waiting."""
+    return re.sub(r"the event loop was blocked for .*\n", "", stderr)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
+from exhaustive import sampled
 from hub_stage import COPTER, STATION, Program, SlowLink, settle, until
 from test_hub import virtual
 from test_hub_sockets import ORDER, of, to
@@ -257,7 +258,7 @@ def test_a_sender_that_was_silent_makes_room_in_a_full_table() -> None:
 # ------------------------------------------------------------------------------------ the rule
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", sampled(range(6), 6))
 @virtual
 async def test_whatever_strangers_do_orders_reach_the_vehicle_and_no_stranger(seed: int) -> None:
     """Noise, made-up senders, the vehicle's own name, numbers that go on where it is, from any port and host."""

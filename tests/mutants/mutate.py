@@ -20,16 +20,15 @@ from mutations import Mutation, difference, mutations_of
 from reach import ROOT, SOURCE, Reach, measure
 from trial import NOTICED, SURVIVED, TOO_LONG, Trials
 
-PACKAGES = ("autopilots", "links", "mavlink", "protocols", "runtime", "vehicle")
+PACKAGES = ("autopilots", "transport", "mavlink", "protocols", "connection", "vehicle")
 TESTS = (
     *PACKAGES,
-    "orders",
     "golden",
     "calls",
     "parameters",
     "missions",
     "test_hostile_files.py",
-    "test_sync.py",
+    "sync",
 )
 GENERATED = ("mavlink/messages", "mavlink/enums")
 EQUIVALENT = Path(__file__).with_name("equivalent.json")

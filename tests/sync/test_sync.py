@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from ctrl_c import interrupt_soon
 from for_each import for_each
-from served_copter import served, served_copter
+from served_copter import complaints, served, served_copter
 
 import aerokit
 import aerokit.sync
@@ -51,7 +51,7 @@ def loop_threads() -> list[threading.Thread]:
 def _no_thread_is_left() -> Iterator[None]:
     yield
     for thread in loop_threads():
-        thread.join(10.0)  # closed by another thread a moment ago
+        thread.join(100)  # closed by another thread a moment ago
     assert not loop_threads()
 
 
@@ -153,7 +153,7 @@ def test_a_flight(vehicle: aerokit.sync.Vehicle) -> None:
     vehicle.go_to(target)
     assert vehicle.distance_to(target) < 3
     vehicle.land()
-    assert vehicle.armed.wait_until(lambda armed: not armed, timeout=30) is False
+    assert vehicle.armed.wait_until(lambda armed: not armed, timeout=100) is False
 
 
 def test_setpoints_stream_while_the_block_feeds_them(vehicle: aerokit.sync.Vehicle) -> None:
@@ -161,7 +161,7 @@ def test_setpoints_stream_while_the_block_feeds_them(vehicle: aerokit.sync.Vehic
     vehicle.arm()
     vehicle.take_off(5)
     start = vehicle.position.value
-    with vehicle.guided.velocity() as stream:
+    with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
         running = [stream.is_running]
         stream.fly(VelocitySetpoint(north_m_s=3), 0.2)
     assert [*running, stream.is_running] == [True, False]
@@ -198,7 +198,7 @@ def test_subscriptions_iterate(vehicle: aerokit.sync.Vehicle) -> None:
             assert isinstance(attitude, messages.Attitude)
             if number == 3:
                 break
-        assert isinstance(attitudes.get(timeout=10), messages.Attitude)
+        assert isinstance(attitudes.get(timeout=100), messages.Attitude)
         assert attitudes.missed == 0
         attitudes.close()
         while attitudes.get_nowait() is not None:
@@ -238,7 +238,7 @@ def test_a_rate_is_kept_for_the_time_of_a_block(vehicle: aerokit.sync.Vehicle) -
         vehicle.subscribe(messages.Vibration) as vibrations,
         vehicle.rate(messages.Vibration, 10),
     ):
-        assert vibrations.get(timeout=10)
+        assert vibrations.get(timeout=100)
 
 
 # ------------------------------------------------------------------------- ends of all kinds
@@ -281,8 +281,8 @@ def test_the_end_of_the_link_ends_a_call_that_waits() -> None:
 
         waiting = threading.Thread(target=wait)
         waiting.start()
-        assert started.wait(10)
-    waiting.join(10)
+        assert started.wait(100)
+    waiting.join(100)
     assert not waiting.is_alive()
     vehicle.close()
 
@@ -294,8 +294,8 @@ def test_a_link_that_comes_back(copter: SimulatedCopter) -> None:
             restored = stack.enter_context(vehicle.subscribe(events.LinkRestored))
             vehicle.wait_ready()
         with served([copter], address.replace("tcp:", "tcpin:")):
-            restored.get(timeout=20)
-            vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=20)
+            restored.get(timeout=100)
+            vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=100)
             vehicle.arm()
             assert vehicle.is_armed
             assert len(vehicle.parameters.download()) > 100
@@ -316,7 +316,7 @@ def test_close_on_the_loop_thread(copter: SimulatedCopter) -> None:
         thread = loop_threads()[0]
         with pytest.raises(errors.ConnectionClosed):
             vehicle.armed.wait_until(lambda armed: vehicle.close())
-        thread.join(10)
+        thread.join(100)
 
 
 def test_a_connect_that_fails_leaves_no_thread() -> None:
@@ -345,7 +345,7 @@ def test_ctrl_c_ends_a_call_and_the_vehicle_holds(vehicle: aerokit.sync.Vehicle)
     with pytest.raises(KeyboardInterrupt):
         vehicle.go_to(vehicle.position.value.offset(north_m=2000))
     timer.join()
-    vehicle.mode.wait_until(lambda mode: mode.name == "BRAKE", timeout=10)
+    vehicle.mode.wait_until(lambda mode: mode.name == "BRAKE", timeout=100)
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
@@ -357,12 +357,13 @@ def test_ctrl_c_ends_a_connect() -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+@pytest.mark.exhaustive
 def test_the_tests_interrupt_themselves_also_where_ctrl_c_is_ignored() -> None:
     test = f"{__file__}::{test_ctrl_c_ends_a_connect.__name__}"
     ignore = "import signal, sys, pytest; signal.signal(signal.SIGINT, signal.SIG_IGN)"
     code = f"{ignore}; sys.exit(pytest.main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "-n", "0", "-q", "-p", "no:cacheprovider", "--timeout", "50", test]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
 
 
@@ -373,17 +374,17 @@ def test_a_program_that_forgets_to_close_still_ends() -> None:
             [sys.executable, "-W", "error", "-c", code, address],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=200,
             check=False,
         )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "7\n", "")
+    assert (done.returncode, done.stdout, complaints(done.stderr)) == (0, "7\n", "")
 
 
 # --------------------------------------------------------------------------------- missions
 
 
 def test_missions_fences_and_rally_points(vehicle: aerokit.sync.Vehicle) -> None:
-    place = vehicle.home.wait_until(lambda _: True, timeout=30).position
+    place = vehicle.home.wait_until(lambda _: True, timeout=100).position
     mission = Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20)] * 3)
     vehicle.mission.upload(mission)
     assert mission.matches(vehicle.mission.download(method="items"))
@@ -404,7 +405,7 @@ def test_how_each_of_several_links_does_is_in_a_cell() -> None:
         with aerokit.sync.connect([address, "udpin:127.0.0.1:0"], rates={}) as vehicle:
             links = vehicle.connection.links
             assert isinstance(links, aerokit.sync.StateCell)
-            told = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=10)
+            told = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=100)
             assert [each.link.split(":")[0] for each in told] == ["tcp", "udpin"]
             assert links.value[0].used_for == (1,)
         with aerokit.sync.connect(address, rates={}) as vehicle:
@@ -428,7 +429,7 @@ def test_two_vehicles_on_one_connection_share_its_thread() -> None:
         first.set_mode("GUIDED")
         assert connection.counts(1)[0] > 0
         with connection.subscribe(messages.Heartbeat, capacity=10) as heartbeats:
-            assert heartbeats.get(timeout=10)
+            assert heartbeats.get(timeout=100)
 
 
 def test_vehicles_are_found_without_async() -> None:
@@ -480,7 +481,7 @@ def test_a_part_may_be_read_first_by_a_predicate(vehicle: aerokit.sync.Vehicle) 
 
     with ThreadPoolExecutor(1) as threads:
         waiting = threads.submit(vehicle.position.wait_until, looks, timeout=60)
-        assert entered.wait(60)
+        assert entered.wait(100)
         assert vehicle.mission is vehicle.mission
         waiting.result()
 

@@ -27,7 +27,7 @@ def test_a_camera_without_async() -> None:
             assert [each.index for each in captures] == [1, 2, 3]
             assert captures.missed == 0
         with vehicle.camera.video():
-            assert vehicle.camera.status.wait_until(lambda status: status.is_recording, timeout=5)
+            assert vehicle.camera.status.wait_until(lambda status: status.is_recording, timeout=100)
         assert not camera.captures.is_recording
         with pytest.raises(NotSupported):
             vehicle.camera.zoom_to(10)

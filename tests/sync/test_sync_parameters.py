@@ -109,5 +109,5 @@ def test_settings_of_a_camera() -> None:
             settings.set("CAM_ISO", 400)
         with vehicle.subscribe(SettingChanged, capacity=4) as changes:
             settings.set("CAM_OWNER", "me")
-            assert changes.get(timeout=5).after == "me"
+            assert changes.get(timeout=100).after == "me"
         assert vehicle.component(100).files.read("/camera_definition.xml").startswith(b"<?xml")

@@ -81,7 +81,7 @@ class Recorder:
     async def until(self, condition: Callable[[], bool]) -> None:
         """Waits until something that arrived has made the condition true; bounded for hung tests only."""
         virtual = isinstance(asyncio.get_running_loop(), VirtualClockLoop)
-        with anyio.fail_after(math.inf if virtual else 20.0):
+        with anyio.fail_after(math.inf if virtual else 100.0):
             while not condition():
                 self._changed.clear()
                 await self._changed.wait()
@@ -96,7 +96,7 @@ class Recorder:
 
 
 async def eventually(condition: Callable[[], bool]) -> None:
-    """Lets the loop turn until a condition holds that nobody signals; 20 s are for hung tests only."""
-    with anyio.fail_after(20.0):
+    """Lets the loop turn until a condition holds that nobody signals; 100 s are for hung tests only."""
+    with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0)

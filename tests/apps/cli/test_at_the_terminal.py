@@ -192,8 +192,8 @@ def test_help_imports_no_command() -> None:
     """Nor anything else that takes long: somebody waits for it."""
     program = (
         "import sys\nfrom aerokit.apps.cli import main\ntry:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print([name for name in sys.modules if name.startswith(('aerokit.sim', 'aerokit.vehicle', 'aerokit.connection',"
-        " 'aerokit.mavlink.messages', 'argcomplete', 'anyio', 'tqdm', 'serial'))])"
+        "print([name for name in sys.modules if name.startswith(('aerokit.sim', 'aerokit.vehicle',"
+        " 'aerokit.connection', 'aerokit.mavlink.messages', 'argcomplete', 'anyio', 'tqdm', 'serial'))])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("\n[]\n")
@@ -210,7 +210,7 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.Mon
         question = asyncio.create_task(asking.agrees("fly?"))
         await asyncio.sleep(0)
         os.write(ours, b"n\n")
-        return await asyncio.wait_for(question, 10)
+        return await asyncio.wait_for(question, 100)
 
     with open(theirs) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)

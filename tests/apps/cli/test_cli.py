@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from exhaustive import exhaustive
 from served_copter import served, served_copter
 
 import aerokit
@@ -51,7 +52,7 @@ def read_until(process: subprocess.Popen[str], text: str) -> str:
 def read_rest(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
     rest = process.stdout.read()
-    process.wait(30)
+    process.wait(200)
     assert "Traceback" not in rest
     return rest
 
@@ -125,7 +126,9 @@ def test_demo_that_cannot_connect_leaves_the_last_recording(
     assert last.read_bytes() == b"the last flight"
 
 
-@pytest.mark.parametrize(("vehicle", "firmware"), [("copter", "ArduCopter"), ("px4", "PX4")])
+@pytest.mark.parametrize(
+    ("vehicle", "firmware"), [("copter", "ArduCopter"), exhaustive(pytest.param("px4", "PX4"))]
+)
 def test_demo_on_its_own_vehicle(
     vehicle: str, firmware: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -201,7 +204,7 @@ def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
 
 
 @posix_only
-@pytest.mark.parametrize("mode", ["LOITER", "BRAKE"])
+@pytest.mark.parametrize("mode", ["LOITER", exhaustive("BRAKE")])
 def test_a_pilot_who_takes_over_keeps_the_vehicle(mode: str, tmp_path: Path) -> None:
     with (
         served([SimulatedCopter(boot_time_s=0.0)], "tcpin:127.0.0.1:0") as address,
@@ -236,7 +239,7 @@ def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
     with served([copter]) as address, in_the_air(address, tmp_path, side_m=3) as process:
         assert process.stdout is not None
         process.stdout.close()
-        process.wait(60)
+        process.wait(200)
         assert copter.is_landed
 
 

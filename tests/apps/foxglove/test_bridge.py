@@ -43,7 +43,7 @@ async def bridged(
 ) -> AsyncIterator[tuple[FoxgloveBridge, Connection]]:
     vehicles = vehicles or (SimulatedCopter(boot_time_s=0.0),)
     async with (
-        simulated_link(vehicles) as link,
+        simulated_link(vehicles, speedup=10.0) as link,
         open_connection(link) as connection,
         foxglove_bridge(connection, port=0, **options) as bridge,
     ):
@@ -64,7 +64,7 @@ class Viewer:
         def missing() -> list[str]:
             return [name for name in wanted if len(self.came.get(name, ())) < count]
 
-        with anyio.move_on_after(15):
+        with anyio.move_on_after(100):
             while missing():
                 await self._read()
         assert not missing()
@@ -192,7 +192,7 @@ async def test_nothing_is_listening_behind_the_block_and_the_port_can_be_used_ag
         async with viewing(bridge, "/mode") as viewer:
             await viewer.read_until("/vehicle/1/mode")
             begun = time.monotonic()
-    assert time.monotonic() - begun < 3
+    assert time.monotonic() - begun < 30
     with pytest.raises(OSError, match=r"111|refused|Connect"):
         await asyncio.open_connection("127.0.0.1", port)
     files, tasks = _files(), asyncio.all_tasks()

@@ -77,7 +77,7 @@ async def test_what_a_broker_sends_reaches_no_vehicle(says: bytes, caplog: pytes
     copter = SimulatedCopter(boot_time_s=0.0)
     async with (
         broker(says) as (port, heard),
-        simulated_link(copter) as link,
+        simulated_link(copter, speedup=10.0) as link,
         aerokit.connect(link) as vehicle,
         publisher_for(f"mqtt://127.0.0.1:{port}/north/alpha") as publisher,
         publishing(vehicle, publisher, rate_hz=50),

@@ -79,7 +79,7 @@ def has_ended(stream: Stream) -> bool:
 
 async def end_of(stream: Stream) -> bytes:
     """What comes until the server ends the connection."""
-    with anyio.fail_after(10), suppress(ConnectionResetError):
+    with anyio.fail_after(100), suppress(ConnectionResetError):
         return await stream[0].read()
     return b""
 
@@ -87,7 +87,7 @@ async def end_of(stream: Stream) -> bytes:
 async def ask(stream: Stream, request: bytes) -> int:
     reader, writer = stream
     writer.write(request)
-    with anyio.fail_after(10):
+    with anyio.fail_after(100):
         head = await reader.readuntil(b"\r\n\r\n")
         length = next(line for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:"))
         await reader.readexactly(int(length.partition(b":")[2]))
@@ -97,13 +97,13 @@ async def ask(stream: Stream, request: bytes) -> int:
 @asynccontextmanager
 async def open_server() -> AsyncIterator[Server]:
     async with (
-        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        simulated_link(SimulatedCopter(boot_time_s=0.0), speedup=10.0) as link,
         aerokit.connect(link) as vehicle,
         make_app(vehicle, token=TOKEN, open_reading=True) as app,
     ):
         server = uvicorn.Server(config_of(uvicorn, app, "127.0.0.1", 0))
         serving = asyncio.ensure_future(server._serve())
-        with anyio.fail_after(10):
+        with anyio.fail_after(100):
             while not server.started:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
         stage = Server(server)
@@ -161,7 +161,7 @@ async def test_bytes_that_trickle_in_win_no_time(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     async with open_server() as server:
         stream = await server.connect(first=HALF)
-        with anyio.fail_after(10):
+        with anyio.fail_after(100):
             while not has_ended(stream):
                 stream[1].write(b"x")
                 await asyncio.sleep(0.02)
@@ -188,7 +188,7 @@ def stream(server: Server, token: str | None = TOKEN, **options: Any) -> Any:
 )
 async def test_a_socket_that_speaks_is_ended_before_its_message_is_read(said: str | bytes) -> None:
     async with open_server() as server, stream(server) as socket:
-        with pytest.raises(websockets.ConnectionClosed), anyio.fail_after(10):
+        with pytest.raises(websockets.ConnectionClosed), anyio.fail_after(100):
             await socket.send(said)
             while True:
                 await socket.recv()
@@ -199,7 +199,7 @@ async def test_a_stream_lasts_longer_than_a_request_may_take(monkeypatch: pytest
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     async with open_server() as server, stream(server, None) as viewer:
         until = asyncio.get_running_loop().time() + 1.0
-        with anyio.fail_after(10):
+        with anyio.fail_after(100):
             while asyncio.get_running_loop().time() < until:
                 assert await viewer.recv()
         await server.flood(100)
@@ -224,12 +224,12 @@ async def test_streams_opened_and_dropped_leave_nothing() -> None:
                 first=b"GET /api/stream HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
                 b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
             )
-            with anyio.fail_after(10):
+            with anyio.fail_after(100):
                 assert b" 101 " in await reader.readuntil(b"\r\n")
             writer.transport.abort()
         async with stream(server) as owner:
             assert await owner.recv()
-        with anyio.fail_after(10):
+        with anyio.fail_after(100):
             while server.open_connections():  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
@@ -246,7 +246,7 @@ async def test_headers_that_nobody_asked_for_come_back_in_no_header() -> None:
             reader, writer = await server.connect(
                 first=b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
             )
-            with anyio.fail_after(10):
+            with anyio.fail_after(100):
                 assert b"set-cookie" not in (await reader.readuntil(b"\r\n\r\n")).lower()
             writer.close()
 

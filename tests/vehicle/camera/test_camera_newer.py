@@ -205,7 +205,7 @@ async def test_a_newer_order_that_is_refused_leaves_the_end_to_the_older_one() -
 async def test_two_objects_of_one_camera_know_of_each_others_orders() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
-        assert vehicle.camera_at(100)._line.subject("zoom") is vehicle.camera._line.subject("zoom")
+        assert vehicle.camera_at(100)._line.topic("zoom") == vehicle.camera._line.topic("zoom")
 
 
 # ----------------------------------------------------------------------------- blocks and their ends

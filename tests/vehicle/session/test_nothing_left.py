@@ -181,6 +181,7 @@ async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bo
     assert tasks() == alone
 
 
+@pytest.mark.exhaustive
 @given(steps=steps, airborne=st.booleans(), latency_s=st.sampled_from([0.0, 0.12]))
 @settings(max_examples=25)
 def test_any_sequence_with_any_cancellation(

@@ -9,6 +9,7 @@ from typing import Any
 
 import anyio
 import pytest
+from exhaustive import exhaustive
 from flight_harness import Flight, in_the_air, now, open_flight, open_px4
 
 from aerokit import connect
@@ -343,7 +344,9 @@ async def test_the_end_of_a_block_says_nothing_of_arming_that_was_answered(
     assert "order to arm" not in caplog.text
 
 
-@pytest.mark.parametrize(("order", "longest_s"), [("land", 300.0), ("return_to_launch", 600.0)])
+@pytest.mark.parametrize(
+    ("order", "longest_s"), [("land", 300.0), exhaustive(pytest.param("return_to_launch", 600.0))]
+)
 async def test_a_vehicle_that_stays_up_is_waited_for_five_or_ten_minutes(
     flying: Flight, order: str, longest_s: float
 ) -> None:

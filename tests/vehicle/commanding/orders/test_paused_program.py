@@ -11,11 +11,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from exhaustive import exhaustive
 from served_copter import served
 
 from aerokit.sim import SimulatedCopter
 
 PAUSE_S, RTL = 7.0, "RTL"
+CASES = [(scheme, what) for scheme in ("udpin", "tcpin") for what in ("go_to", "cancelled", "stream")]
 
 PROGRAM = """
 import asyncio, json, sys, aerokit
@@ -72,9 +74,9 @@ def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are stopped by signals")
-def test_stopped_program_leaves_the_failsafe_alone() -> None:
-    """All of them at once, since they wait for the failsafe most of the time: UDP and TCP, three kinds of orders."""
-    cases = [(scheme, what) for scheme in ("udpin", "tcpin") for what in ("go_to", "cancelled", "stream")]
+@pytest.mark.parametrize("cases", [CASES[:1], exhaustive(CASES[1:])], ids=["one", "others"])
+def test_stopped_program_leaves_the_failsafe_alone(cases: list[tuple[str, str]]) -> None:
+    """All of them at once, since they wait for the failsafe most of the time."""
     with ThreadPoolExecutor(len(cases)) as pool:
         flown = dict(zip(cases, pool.map(lambda case: fly(*case), cases), strict=True))
     for (scheme, what), (error, sent, oldest_s, told, mode) in flown.items():

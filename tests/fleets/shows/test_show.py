@@ -162,6 +162,7 @@ async def fly_many(networks: int, of_each: int, seconds: int) -> None:
             assert report.between_m < 0.5
 
 
+@pytest.mark.exhaustive
 async def test_a_hundred_fly_a_show() -> None:
     await fly_many(10, 10, int(os.environ.get("AEROKIT_SHOW_SECONDS", "6")))
 

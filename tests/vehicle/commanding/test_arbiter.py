@@ -14,8 +14,8 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.vehicle.commanding.arbiter import KNOWN_S, MODE_GRACE_S
-from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, QUESTIONS, Order, Sending
+from aerokit.vehicle.commanding.arbiter import KNOWN_S, MODE_GRACE_S, CommandArbiter
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, QUESTIONS, Order, SentCommand
 from aerokit.vehicle.state.telemetry import Telemetry
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
@@ -28,7 +28,7 @@ COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
 
 
 class Stage:
-    """A helm, and heartbeats at the test's word."""
+    """An arbiter, and heartbeats at the test's word."""
 
     def __init__(self, mode: Mode | None = LOITER, armed: bool | None = True) -> None:
         self.now, self.open = 0.0, ExitStack()
@@ -38,7 +38,7 @@ class Stage:
         cells = SimpleNamespace(
             mode=self.mode, armed=self.armed, system_status=self.state, autopilot=COPTER, is_vtol=False
         )
-        self.helm = Helm(lambda: self.now, cast("Telemetry", cells))
+        self.arbiter = CommandArbiter(lambda: self.now, cast("Telemetry", cells))
         if mode is not None and armed is not None:
             self.tell(mode, armed)
 
@@ -56,33 +56,33 @@ class Stage:
 
 def test_a_newer_order_ends_the_one_before_and_is_announced_first() -> None:
     stage, ends = Stage(), list[str]()
-    first = stage.helm.order(GUIDED)
-    stage.helm.on_new(lambda: ends.append(first.end))
-    second = stage.helm.order(RTL)
+    first = stage.arbiter.order(GUIDED)
+    stage.arbiter.on_steering(lambda: ends.append(first.end))
+    second = stage.arbiter.order(RTL)
     assert ends == [""]  # called before
     assert first.end == "another order was given"
     assert (first.taken_by, second.end) == ("", "")
-    assert stage.helm.newest is second
+    assert stage.arbiter.newest is second
 
 
 def test_what_does_not_steer_ends_with_the_order_that_steers_and_ends_none() -> None:
     stage = Stage()
-    steering = stage.helm.order(GUIDED)
-    with stage.helm.aside() as aside:
+    steering = stage.arbiter.order(GUIDED)
+    with stage.arbiter.aside() as aside:
         assert (steering.end, aside.end) == ("", "")
         assert aside.modes == steering.modes
-        stage.helm.order(RTL)
+        stage.arbiter.order(RTL)
         assert aside.end == "another order was given"
 
 
 def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
     stage = Stage()
-    with stage.helm.aside() as aside:
+    with stage.arbiter.aside() as aside:
         assert aside.modes == ()
         stage.tell(LOITER)
     stage.tell(RTL)
     assert aside.end == ""
-    with pytest.raises(KeyError), stage.helm.aside() as aside:
+    with pytest.raises(KeyError), stage.arbiter.aside() as aside:
         raise KeyError
     stage.tell(BRAKE)
     assert aside.end == ""
@@ -94,7 +94,7 @@ def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
 @pytest.mark.parametrize("told", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
 def test_the_mode_before_and_the_orders_own_are_nobody_elses(told: list[Mode]) -> None:
     stage = Stage()
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     for mode in told:
         stage.tell(mode)
     assert order.end == ""
@@ -104,7 +104,7 @@ def test_the_mode_before_and_the_orders_own_are_nobody_elses(told: list[Mode]) -
 def test_another_mode_ends_it_for_good(told: list[Mode]) -> None:
     """The mode before, too, once the vehicle was in the one that was ordered."""
     stage = Stage()
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     for mode in told:
         stage.tell(mode)
     assert (
@@ -116,28 +116,28 @@ def test_another_mode_ends_it_for_good(told: list[Mode]) -> None:
 
 def test_the_first_who_took_it_is_named() -> None:
     stage = Stage()
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(RTL)
     stage.tell(BRAKE, armed=False)
-    stage.helm.note_reboot()
+    stage.arbiter.note_reboot()
     assert order.end == "the mode changed to RTL"
 
 
 def test_disarming_and_rebooting_end_it() -> None:
     stage = Stage()
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(LOITER, armed=False)
     assert order.end == "the vehicle disarmed"
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(LOITER, armed=False)
     assert order.end == ""  # it was so before
-    stage.helm.note_reboot()
+    stage.arbiter.note_reboot()
     assert order.end == "the vehicle rebooted"
 
 
 def test_disarming_counts_from_when_it_was_armed() -> None:
     stage = Stage(armed=False)
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(LOITER, armed=True)
     assert order.end == ""
     stage.tell(LOITER, armed=False)
@@ -146,7 +146,7 @@ def test_disarming_counts_from_when_it_was_armed() -> None:
 
 def test_a_mode_that_was_not_known_before_is_the_one_before() -> None:
     stage = Stage(mode=None)
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(RTL)
     assert order.end == ""
     stage.tell(BRAKE)
@@ -158,9 +158,9 @@ def test_a_mode_that_was_not_known_before_is_the_one_before() -> None:
 
 def test_the_mode_of_the_order_before_may_still_come_while_that_is_under_way() -> None:
     stage = Stage()
-    stage.helm.order(GUIDED)
+    stage.arbiter.order(GUIDED)
     stage.tell(GUIDED)
-    order = stage.helm.order(BRAKE)
+    order = stage.arbiter.order(BRAKE)
     stage.tell(GUIDED)
     assert order.end == ""
     stage.tell(BRAKE)
@@ -171,9 +171,9 @@ def test_the_mode_of_the_order_before_may_still_come_while_that_is_under_way() -
 @pytest.mark.parametrize(("in_doubt", "end"), [(True, ""), (False, "the mode changed to GUIDED")])
 def test_a_mode_that_was_ordered_and_not_told_may_come_while_it_is_in_doubt(in_doubt: bool, end: str) -> None:
     stage = Stage()
-    stage.helm.order(GUIDED)
-    stage.helm.mode_is_in_doubt = in_doubt
-    order = stage.helm.order(BRAKE)
+    stage.arbiter.order(GUIDED)
+    stage.arbiter.mode_is_in_doubt = in_doubt
+    order = stage.arbiter.order(BRAKE)
     stage.tell(GUIDED)
     assert order.end == end
 
@@ -183,11 +183,11 @@ def test_a_mode_that_was_ordered_and_not_told_may_come_while_it_is_in_doubt(in_d
 )
 def test_a_mode_that_was_given_up_may_come_for_three_seconds(after_s: float, end: str) -> None:
     stage = Stage()
-    stage.helm.order(GUIDED)
-    stage.helm.doubt_mode()
-    stage.helm.mode_is_in_doubt = False
+    stage.arbiter.order(GUIDED)
+    stage.arbiter.doubt_mode()
+    stage.arbiter.mode_is_in_doubt = False
     stage.now += after_s
-    order = stage.helm.order(BRAKE)
+    order = stage.arbiter.order(BRAKE)
     stage.tell(GUIDED)
     assert order.end == end
 
@@ -197,8 +197,8 @@ def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
     after_s: float, end: str
 ) -> None:
     stage = Stage()
-    own = stage.helm.order_of_the_programs_own()
-    order = stage.helm.order(GUIDED)
+    own = stage.arbiter.order_of_the_programs_own()
+    order = stage.arbiter.order(GUIDED)
     assert own.end == "another order was given"
     stage.tell(RTL, after=after_s)
     assert order.end == end
@@ -206,17 +206,17 @@ def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
 
 def test_the_mode_that_an_order_of_the_programs_own_names_is_not_a_pilots_doing() -> None:
     stage = Stage()
-    own = stage.helm.order_of_the_programs_own(modes=[GUIDED])
+    own = stage.arbiter.order_of_the_programs_own(modes=[GUIDED])
     stage.tell(GUIDED)
-    assert (own.end, stage.helm.is_obeyed) == ("", True)
+    assert (own.end, stage.arbiter.is_obeyed) == ("", True)
     stage.tell(RTL)  # within three seconds: nothing is sent again after a pilot's mode
-    assert (own.end, stage.helm.is_obeyed) == ("the mode changed to RTL", False)
+    assert (own.end, stage.arbiter.is_obeyed) == ("the mode changed to RTL", False)
 
 
 def test_an_order_of_the_programs_own_ends_at_any_mode_so_that_it_is_not_sent_again_over_a_pilot() -> None:
     stage = Stage()
-    own = stage.helm.order_of_the_programs_own()
-    with stage.helm.sending(own) as sending:
+    own = stage.arbiter.order_of_the_programs_own()
+    with stage.arbiter.sending(own) as sending:
         stage.tell(RTL, after=0.5)
         assert sending.end == "the mode changed to RTL"
 
@@ -232,7 +232,7 @@ def test_an_order_of_the_programs_own_ends_at_any_mode_so_that_it_is_not_sent_ag
 def test_a_mode_is_in_doubt_until_the_answer_is_known(
     error: Exception | None, in_doubt: bool, settles_at: float
 ) -> None:
-    helm, seen = Stage().helm, list[bool]()
+    helm, seen = Stage().arbiter, list[bool]()
     with nullcontext() if error is None else pytest.raises(type(error)), helm.changing_mode():
         seen.append(helm.mode_is_in_doubt)
         if error is not None:
@@ -245,16 +245,16 @@ def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
     for later, known in ((KNOWN_S, True), (0.1, False)):
         stage.now += later
-        assert stage.helm.is_known is known
-    assert not Stage(mode=None).helm.is_known
+        assert stage.arbiter.is_known is known
+    assert not Stage(mode=None).arbiter.is_known
 
 
 # --------------------------------------------------------------------------------- sendings
 
 
-def sending(stage: Stage, **options: Any) -> Sending:
-    order = stage.helm.order(GUIDED)
-    return stage.open.enter_context(stage.helm.sending(order, **options))
+def sending(stage: Stage, **options: Any) -> SentCommand:
+    order = stage.arbiter.order(GUIDED)
+    return stage.open.enter_context(stage.arbiter.sending(order, **options))
 
 
 def test_a_sending_ends_when_its_mode_is_told_whatever_comes_then() -> None:
@@ -300,7 +300,7 @@ def test_a_sending_ends_with_its_order_and_by_its_own_sign() -> None:
 
 def test_a_sending_knows_when_the_vehicle_told_last_until_its_block_ends() -> None:
     stage = Stage()
-    with stage.helm.sending(stage.helm.order(GUIDED)) as each:
+    with stage.arbiter.sending(stage.arbiter.order(GUIDED)) as each:
         assert each.told_at == -math.inf
         stage.tell(LOITER)
         assert each.told_at == 2.0
@@ -321,15 +321,7 @@ def test_orders_know_what_moves_and_what_only_asks() -> None:
 
 
 def test_an_order_of_nothing_in_no_mode_stands() -> None:
-    order = Order(
-        0.0,
-        mode_before=None,
-        modes=[],
-        expected=[],
-        armed_before=None,
-        state_before=None,
-        is_newest=lambda _: True,
-    )
+    order = Order(0.0, 1, lambda _: True)
     assert order.end == ""
 
 
@@ -339,20 +331,20 @@ def test_an_order_of_nothing_in_no_mode_stands() -> None:
 @pytest.mark.parametrize("state", [MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION])
 def test_order_failsafe_becomes_active_ends_it_for_good(state: int) -> None:
     stage = Stage()
-    order = stage.helm.order(GUIDED)
-    with stage.helm.sending(order) as sending, stage.helm.aside() as aside:
+    order = stage.arbiter.order(GUIDED)
+    with stage.arbiter.sending(order) as sending, stage.arbiter.aside() as aside:
         stage.tell(GUIDED, state=state)
         assert "failsafe" in order.end
         assert sending.end == aside.end == order.end
         stage.tell(GUIDED)
         assert "failsafe" in order.end
-    assert not stage.helm.order(GUIDED).is_given
+    assert not stage.arbiter.order(GUIDED).is_given
 
 
 def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
     stage = Stage()
     stage.tell(LOITER, state=MavState.CRITICAL)
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(GUIDED, state=MavState.CRITICAL)
     assert not order.end
     stage.tell(GUIDED)
@@ -364,7 +356,7 @@ def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
 def test_order_worse_failsafe_than_the_known_one_ends_it() -> None:
     stage = Stage()
     stage.tell(LOITER, state=MavState.CRITICAL)
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(GUIDED, state=MavState.EMERGENCY)
     assert "MAV_STATE_EMERGENCY" in order.end
 
@@ -372,8 +364,11 @@ def test_order_worse_failsafe_than_the_known_one_ends_it() -> None:
 @pytest.mark.parametrize("mode", [RTL, Mode("LAND", 9)])
 def test_order_to_land_or_return_stands_under_a_failsafe(mode: Mode) -> None:
     stage = Stage()
-    order = stage.helm.order(mode)
-    with stage.helm.sending(order, modes=[mode]) as sending, stage.helm.aside(ends_flight=True) as disarm:
+    order = stage.arbiter.order(mode)
+    with (
+        stage.arbiter.sending(order, modes=[mode]) as sending,
+        stage.arbiter.aside(ends_flight=True) as disarm,
+    ):
         stage.tell(LOITER, state=MavState.CRITICAL)
         assert (order.end, sending.end, disarm.end) == ("", "", "")
         assert "failsafe" in order.failsafe
@@ -387,8 +382,8 @@ def arm(stage: Stage, *, is_refused: bool = False) -> None:
     error = CommandRejected("no", command=400, result=4)
     with (
         pytest.raises(CommandRejected) if is_refused else nullcontext(),
-        stage.helm.aside() as order,
-        stage.helm.sending(order, armed=True),
+        stage.arbiter.aside() as order,
+        stage.arbiter.sending(order, armed=True),
     ):
         if is_refused:
             raise error
@@ -398,63 +393,63 @@ def test_vehicle_that_the_program_armed_is_flown_by_it_until_a_pilot_takes_it() 
     stage = Stage(armed=False)
     arm(stage)
     stage.tell(LOITER, True, after=0.8)
-    assert stage.helm.is_flown_by_program
+    assert stage.arbiter.is_flown_by_program
     stage.tell(RTL)
-    assert not stage.helm.is_flown_by_program
+    assert not stage.arbiter.is_flown_by_program
 
 
 def test_vehicle_told_armed_long_after_the_answer_is_the_programs_if_nothing_was_told_between() -> None:
     stage = Stage(armed=False)
     arm(stage)
     stage.tell(LOITER, True, after=6.0)  # HEARTBEATs were lost
-    assert stage.helm.is_flown_by_program
+    assert stage.arbiter.is_flown_by_program
 
 
 def test_vehicle_that_a_pilot_armed_after_a_refusal_or_a_disarming_is_his() -> None:
     stage = Stage(armed=False)
     arm(stage, is_refused=True)
     stage.tell(LOITER, True, after=1.0)
-    assert not stage.helm.is_flown_by_program
+    assert not stage.arbiter.is_flown_by_program
     stage = Stage(armed=False)
     arm(stage)
     for _ in range(4):
         stage.tell(LOITER, False)  # he disarmed it at once
     stage.tell(LOITER, True)
-    assert not stage.helm.is_flown_by_program
+    assert not stage.arbiter.is_flown_by_program
 
 
 def flies(stage: Stage) -> bool:
-    return stage.helm.is_flown_by_program
+    return stage.arbiter.is_flown_by_program
 
 
 def test_refused_order_changes_nothing_about_who_flies() -> None:
     stage = Stage()
-    refused = stage.helm.order(GUIDED)
+    refused = stage.arbiter.order(GUIDED)
     refused.was_refused = True
     assert not flies(stage)
-    stage.helm.order(GUIDED)
+    stage.arbiter.order(GUIDED)
     assert flies(stage)
-    refused = stage.helm.order(BRAKE)
+    refused = stage.arbiter.order(BRAKE)
     refused.was_refused = True
     assert flies(stage)
 
 
 def test_failsafe_is_forgiven_when_the_program_takes_the_vehicle_back() -> None:
     stage = Stage()
-    stage.helm.order(GUIDED)
+    stage.arbiter.order(GUIDED)
     stage.tell(GUIDED)
     stage.tell(GUIDED, state=MavState.CRITICAL)
     stage.tell(GUIDED)
     assert not flies(stage)
-    stage.helm.forgive_failsafe()
+    stage.arbiter.forgive_failsafe()
     assert flies(stage)
 
 
 def test_posted_mode_after_an_order_is_the_programs_own() -> None:
     stage = Stage()
-    order = stage.helm.order(GUIDED)
+    order = stage.arbiter.order(GUIDED)
     stage.tell(GUIDED)
-    with stage.helm.posting(["mode"], modes=[RTL]):
+    with stage.arbiter.post(["mode"], modes=[RTL]):
         stage.tell(RTL)
     assert not order.has_lost_mode
     stage.tell(LOITER)
