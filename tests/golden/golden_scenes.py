@@ -487,8 +487,7 @@ def dronekit_script() -> str:
     """The orders that reach the vehicle, in their order."""
     from served_copter import served
 
-    from aerokit.dronekit import VehicleMode
-    from aerokit.dronekit import vehicle as connect
+    from aerokit.dronekit import VehicleMode, connect
 
     simulated = copter()
     journal = simulated.journal = Journal()
