@@ -72,6 +72,12 @@ async def _post_int(stage: Stage, frame: int = 0) -> None:
         await order.command_int(Cmd.DO_SET_HOME, 0, frame=frame, x=1, y=1, z=1)
 
 
+async def _post_overruled(stage: Stage, *, as_int: bool = False) -> None:
+    with stage.vehicle.posted("motion") as order:
+        stage.vehicle.send(messages.SetPositionTargetLocalNed(0, 1, 1, 1, 0x0DC7, *(0,) * 11))
+        await (order.command_int(Cmd.DO_SET_HOME, frame=0) if as_int else order.command(Cmd.DO_SET_ROI_NONE))
+
+
 async def _post_mode(stage: Stage, posted: str = "LOITER") -> None:
     mode = stage.vehicle.autopilot.find_mode("LOITER")
     with stage.vehicle.posted("mode", modes=(stage.vehicle.autopilot.find_mode(posted),)) as order:
@@ -166,6 +172,8 @@ def _actions() -> Table:
         ("PostedOrder.command", "CommandTimeout"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)
         ),
+        ("PostedOrder.command", "OperationRejected"): P(_post_overruled),
+        ("PostedOrder.command_int", "OperationRejected"): P(lambda s: _post_overruled(s, as_int=True)),
         ("PostedOrder.command_int", "InvalidArgument"): P(lambda s: _post_int(s, 999)),
         ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
         ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),

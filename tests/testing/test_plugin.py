@@ -329,6 +329,7 @@ def test_importing_it_is_cheap() -> None:
     own = {name for name in done.stdout.split() if name.startswith("aerokit")}
     assert own == {
         "aerokit",
+        "aerokit._internal",
         "aerokit._internal.imports",
         "aerokit.testing",
         "aerokit.testing.plugin",

@@ -1024,7 +1024,6 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
         Raises:
             CommandRejected: the vehicle took its acceptance back, as PX4 does.
-            HeartbeatTimeout: the vehicle was silent for 10 seconds.
             OperationTimeout: it was not told within ``timeout`` seconds.
         """
         self._loop.run(self.aio.until_told, timeout)

@@ -549,4 +549,4 @@ def test_mode_ordered_ten_seconds_ago_is_not_the_programs_any_more(waited_s: flo
     stage.now += waited_s
     motion = stage.post("motion")
     stage.tell(GUIDED)
-    assert motion.end == end
+    assert end_of(motion) == end

@@ -7,10 +7,9 @@ import math
 import re
 from argparse import ArgumentTypeError
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING
 
 from aerokit._internal import geo
-from aerokit._internal.wording import did_you_mean
 from aerokit.apps.cli.completers import kinds as kind_names
 from aerokit.apps.cli.completers import offer
 from aerokit.errors import AerokitError, InvalidArgument
@@ -19,11 +18,10 @@ from aerokit.parameters.encoding import parse_number
 from aerokit.transport import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
 __all__ = [
     "EACH_ITS_OWN",
-    "Parser",
     "add_baud",
     "add_vehicle_kind",
     "address",
@@ -42,50 +40,6 @@ __all__ = [
     "wind",
     "writable_file",
 ]
-
-_BELOW_ZERO = re.compile(r"-\.?\d")
-
-_CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")
-
-
-class Parser(argparse.ArgumentParser):
-    """Its subparsers are of this class, too, and each complains of its own arguments."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        # argparse takes "-35.36,149.16,584" for an option, and half of the world is south; a number alone it knows.
-        self._negative_number_matcher = _BELOW_ZERO
-
-    def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
-        self, args: Sequence[str] | None = None, namespace: Any = None
-    ) -> tuple[Any, list[str]]:
-        """Refuse what is left over here, where the known options and the right usage are known."""
-        if args is not None and self._subparsers is None:
-            self._refuse_unknown_options(args)
-        namespace, unknown = super().parse_known_args(args, namespace)
-        if unknown:
-            self._refuse(unknown)
-        return namespace, unknown
-
-    def _refuse_unknown_options(self, args: Sequence[str]) -> None:
-        """Before what stands behind one is taken for an address."""
-        options = list(args[: args.index("--")] if "--" in args else args)
-        names = [each.partition("=")[0] for each in options if each.startswith("--")]
-        for name in names:
-            if not any(known.startswith(name) for known in self._option_string_actions):
-                self._refuse([name])
-
-    def _refuse(self, unknown: Sequence[str]) -> NoReturn:
-        options = [each for each in unknown if each.startswith("-")]
-        meant = did_you_mean(options[0].partition("=")[0] if options else None, self._option_string_actions)
-        self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
-
-    def error(self, message: str) -> NoReturn:
-        """Exit code 2."""
-        if found := _CHOICE.search(message):
-            message += did_you_mean(found[1], re.findall(r"[\w.-]+", found[2]))
-        super().error(message)
-
 
 EACH_ITS_OWN = "tcpin:127.0.0.1:{5760+10n}"
 """As SITL numbers its instances: 5760, 5770, 5780 and so on."""

@@ -143,7 +143,6 @@ class PostedOrder:
 
         Raises:
             CommandRejected: the vehicle took its acceptance back, as PX4 does.
-            HeartbeatTimeout: the vehicle was silent for 10 seconds.
             OperationTimeout: it was not told within ``timeout`` seconds.
         """
         await self._sender.await_effect(
@@ -152,6 +151,7 @@ class PostedOrder:
             is_done=self._is_done,
             trouble=lambda: None,
             timeout=timeout,
+            max_silence_s=None,
         )
 
     def _is_done(self) -> bool:

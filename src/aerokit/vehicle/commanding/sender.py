@@ -12,7 +12,7 @@ from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, ATTEMPTS, rejection
 from aerokit.vehicle.commanding.arbiter import KNOWN_S, MODE_GRACE_S
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, QUESTIONS
-from aerokit.vehicle.commanding.progress import await_progress
+from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterator
@@ -158,6 +158,7 @@ class OrderSender:
         is_done: Callable[[], bool],
         trouble: Callable[[], str | None],
         timeout: float,
+        max_silence_s: float | None = LONGEST_SILENCE_S,
     ) -> None:
         """Wait until HEARTBEAT tells what was accepted.
 
@@ -166,6 +167,7 @@ class OrderSender:
         Raises:
             CommandRejected: the vehicle took its acceptance back.
             OperationRejected: ``trouble()`` gave a reason.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: it was not told within ``timeout`` seconds.
         """
         telemetry, started = self._talk.telemetry, self._talk.connection.now()
@@ -179,6 +181,7 @@ class OrderSender:
                     f"the vehicle is in {telemetry.mode_name}, {'' if telemetry.is_armed else 'not '}armed"
                 ),
                 timeout=timeout,
+                max_silence_s=max_silence_s,
             )
         except OperationRejected:
             if not refusals:
