@@ -160,7 +160,7 @@ def text_of(message: Message) -> str:
 def _texts_of_fields(message: Message) -> Iterator[str]:
     """By name; zeros and empty texts are left out."""
     for field in message.FIELDS:
-        value = getattr(message, field.name)
+        value: Any = getattr(message, field.name)
         is_empty = not (any(value) if isinstance(value, (bytes, tuple)) else value)
         if field.name in CLOCKS or field.name.startswith("target_"):
             continue
@@ -216,7 +216,7 @@ def _target_of(message: Message) -> str:
     return "all" if system is None else f"{system}/{getattr(message, 'target_component', 0)}"
 
 
-def _in_enum(name: str, value: int) -> str:
+def _in_enum(name: str, value: Any) -> str:
     kind: Any = getattr(enums, "".join(part.capitalize() for part in name.split("_")), None)
     members = {} if kind is None else {int(member): member.name for member in kind}
     return str(members.get(int(value), value))
