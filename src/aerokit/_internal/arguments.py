@@ -1,6 +1,6 @@
 """``checks_arguments``: public methods refuse an argument of a wrong type before they do anything.
 
-Only what leads to a vehicle, a network or a link is checked so: values come from keyboards, files and JSON, programs run
+Only what leads to a vehicle, a network or a link is checked: values come from keyboards, files and JSON, programs run
 without a type checker, and a wrong one must not stop an order half-way. Nor do type checkers see an empty time-out or
 a text where several names are meant. Reading logs, arithmetic with places and the like have Python's own errors.
 
