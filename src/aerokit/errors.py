@@ -216,19 +216,15 @@ class FleetError(OperationRejected):
         self.errors: dict[str, Exception] = dict(errors)
 
 
-class SetpointStreamStopped(OperationRejected):
-    """A set-point stream ended by itself: stale set-points, a blocked loop, a lost link or a changed mode."""
-
-
-# ------------------------------------------------------------------------------- protocol, state
+# ---------------------------------------------------------------------- arguments, protocol, state
 
 
 class InvalidArgument(AerokitError, ValueError):
     """An argument cannot be right: the text says which, its value, and what is allowed. Nothing was sent."""
 
 
-class FileFormatError(InvalidArgument):
-    """A file on this computer is damaged or of another kind; the text names file, place and what was expected."""
+class FileFormatError(AerokitError, ValueError):
+    """A file is damaged or of another kind; the text names file, place and what was expected."""
 
 
 class RemoteProtocolError(AerokitError):
@@ -245,6 +241,10 @@ class StaleValueError(ValueUnknownError):
 
 class SubscriptionOverflow(AerokitError):
     """A subscription with the policy ``error`` was not read fast enough."""
+
+
+class SetpointStreamStopped(AerokitError):
+    """A stream ended by itself: stale set-points, a blocked loop, a lost link or a changed mode; the text says why."""
 
 
 class BusyError(AerokitError):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.arguments import check_range
 from aerokit._internal.async_block import async_block
 from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, LinkLost, LinkOpenError, NotSupported
@@ -97,7 +97,6 @@ async def open_video(
             await thread.ended.wait()
 
 
-@checks_arguments
 class VideoStream:
     """Frames as they come, for one reader; made by :func:`open_video`.
 

@@ -13,10 +13,10 @@ from order_airs import Airs, TwoLinks, joined, unused_airs
 from stream_splitter import Splitter
 
 import aerokit
+from aerokit.connection.routes import MOVES_AFTER_S
 from aerokit.errors import LinkLost
 from aerokit.hub import Endpoint, Hub
 from aerokit.hub.attachment import Attachment
-from aerokit.hub.senders import MOVES_AFTER_S
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedVehicle, SimulatorServer
 from aerokit.transport import Link, memory_link_pair

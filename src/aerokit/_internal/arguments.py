@@ -1,5 +1,9 @@
 """``checks_arguments``: public methods refuse an argument of a wrong type before they do anything.
 
+Only what leads to a vehicle, a network or a link is checked: values come from keyboards, files and JSON, programs run
+without a type checker, and a wrong one must not stop an order half-way. Nor do type checkers see an empty time-out or
+a text where several names are meant. Reading logs, arithmetic with places and the like have Python's own errors.
+
 What is allowed is what the annotations say; they are read as text, so that nothing is imported for it. A class of ours
 is known by its name, callables, mappings and iterables by what they can do. What is called a time by its name is above
 zero. Other ranges, and whatever else a method knows better, are its own business.

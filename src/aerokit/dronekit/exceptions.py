@@ -6,7 +6,7 @@ import builtins
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
+from aerokit.errors import AerokitError, FileFormatError, InvalidArgument, OperationTimeout
 
 __all__ = ["APIException", "TimeoutError", "classic_errors"]
 
@@ -21,10 +21,10 @@ class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the nam
 
 @contextmanager
 def classic_errors() -> Iterator[None]:
-    """What aerokit raises in the block becomes one of these; what is wrong with an argument stays a ValueError."""
+    """What aerokit raises in the block becomes one of these; an argument or a file that is wrong stays a ValueError."""
     try:
         yield
-    except InvalidArgument:
+    except (InvalidArgument, FileFormatError):
         raise
     except OperationTimeout as error:
         raise TimeoutError(str(error)) from error

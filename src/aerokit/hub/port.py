@@ -67,7 +67,9 @@ class Port:
     ) -> None:
         self.link, self.peer = link, peer
         self.totals = totals
-        self.endpoint, self.period, self.report = endpoint, period, report
+        self.endpoint: str = endpoint
+        self.period: Callable[[int], float | None] = period
+        self.report: Callable[[HubEventKind, str], object] = report
         self.tells_bursts: bool = link.tells_bursts
         """Whether its link says when nothing more comes for now."""
         self.border: Border | None = border

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from aerokit.connection.routes import LIVE_FOR_S, SWEEP_AFTER_S
+from aerokit.connection.routes import LIVE_FOR_S, MOST_ROUTES, SWEEP_AFTER_S
 from aerokit.hub.senders import (
     DUPLICATE_WINDOW_S,
     LOOP_MEMORY_S,
@@ -27,13 +27,10 @@ if TYPE_CHECKING:
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
-__all__ = ["MOST_PLANS", "MOST_SENDERS", "Node", "Plan", "Router"]
+__all__ = ["MOST_PLANS", "Node", "Plan", "Router"]
 
 PortT = TypeVar("PortT")
 
-MOST_SENDERS = 1024
-"""So many (system id, component id) are remembered. One more takes the place of one that has sent no heartbeat, or that
-was not heard for `LIVE_FOR_S`; if there is none, what is for it goes nowhere."""
 MOST_PLANS = 4096
 """So many plans are kept for each port."""
 
@@ -105,6 +102,9 @@ class Router(Generic[PortT]):
     - nothing goes back to where it came from, and nothing is passed on twice: copies that come by another way, within
       two seconds, end here, and teach nothing; nor does what comes back later, once it is clear that it goes round;
     - SETUP_SIGNING, which holds a key, goes nowhere; a telemetry radio's word on its own link does not go to vehicles.
+
+    As many senders are remembered as a connection has routes (`MOST_ROUTES`). One more takes the place of one that has
+    sent no heartbeat, or that was not heard for `LIVE_FOR_S`; if there is none, what is for it goes nowhere.
 
     ``gate(port, message_id)`` says whether a port wants a message: None: no; 0: all of them; else one in so many
     seconds of each sender, unless it has a target.
@@ -211,7 +211,7 @@ class Router(Generic[PortT]):
 
     def _add_sender(self, source: int, node: Node[PortT], now: float) -> Sender:
         sender = Sender(source, node.number, now)
-        if len(self._senders) < MOST_SENDERS or self._make_room(now):
+        if len(self._senders) < MOST_ROUTES or self._make_room(now):
             self._senders[source] = sender
             self._unproven[source] = None
             self.forget_plans()
@@ -225,7 +225,7 @@ class Router(Generic[PortT]):
             self._swept_at = now
             for source in [key for key, each in self._senders.items() if now - each.heard_at > LIVE_FOR_S]:
                 del self._senders[source]
-        return len(self._senders) < MOST_SENDERS
+        return len(self._senders) < MOST_ROUTES
 
     def _hear_elsewhere(self, sender: Sender, node: Node[PortT], now: float) -> None:
         before = sender.number

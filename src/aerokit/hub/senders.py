@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.connection.routes import MOVES_AFTER_S
 from aerokit.mavlink.enums import MavAutopilot, MavType
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ __all__ = [
     "LOOP_MEMORY_S",
     "LOOP_RUN",
     "MOST_RECENT",
-    "MOVES_AFTER_S",
     "REPEATED_WITHIN_S",
     "Recent",
     "Sender",
@@ -34,9 +34,6 @@ LOOP_RUN = 8
 chance, where a vehicle is heard over two radios."""
 MOST_RECENT = 1 << 15
 """Of more frames than that the memory is shorter."""
-
-MOVES_AFTER_S = 3.5
-"""A vehicle that is heard at several ports is reached by another one when so long nothing came from the present one."""
 
 _TYPE = 9 + 4  # of a HEARTBEAT, in `Frame.body`
 _AUTOPILOT = 9 + 5

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit._internal.files import read_bounded
-from aerokit.errors import InvalidArgument
+from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.frame import x25
 from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
 
@@ -222,7 +222,7 @@ def read_xml(path: Path) -> DialectDefinition:
         )
     except FileNotFoundError:
         raise InvalidArgument(f"no dialect file {path}") from None
-    except InvalidArgument:
+    except (InvalidArgument, FileFormatError):
         raise
     except (ParseError, LookupError, ValueError) as error:
         raise InvalidArgument(f"{path} is not a MAVLink dialect: {error!r}") from error

@@ -4,7 +4,7 @@
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint
 
 mission = Mission([
-    take_off(altitude_relative_m=20),
+    take_off(20),
     waypoint(47.3977, 8.5456, altitude_relative_m=20, hold_s=5),
     return_to_launch(),
 ])

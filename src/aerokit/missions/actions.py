@@ -9,7 +9,7 @@ https://mavlink.io/en/messages/common.html#mav_commands
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, overload
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavMountMode
@@ -17,6 +17,7 @@ from aerokit.missions.item import action, in_range, place, whole
 
 if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
+    from aerokit.position import Position
 
 __all__ = [
     "change_speed",
@@ -267,9 +268,27 @@ def trigger_camera() -> MissionItem:
     return action(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)
 
 
+@overload
+def region_of_interest(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+) -> MissionItem: ...
+@overload
 def region_of_interest(
     latitude_deg: float,
     longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+) -> MissionItem: ...
+def region_of_interest(
+    latitude_deg: Position | float,
+    longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
     altitude_amsl_m: float | None = None,
@@ -284,6 +303,7 @@ def region_of_interest(
         latitude_deg,
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        is_needed=True,
     )
 
 

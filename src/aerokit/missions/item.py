@@ -24,6 +24,7 @@ __all__ = [
     "NUMBERS",
     "PLACES",
     "RALLY_COMMANDS",
+    "Altitudes",
     "MissionItem",
     "action",
     "altitude_and_frame",
@@ -268,25 +269,43 @@ Altitudes = tuple["float | None", "float | None", "float | None"]
 
 def place(
     command: int,
-    latitude_deg: float | None,
+    latitude_deg: Position | float | None,
     longitude_deg: float | None,
     altitudes: Altitudes,
     *parameters: float,
+    is_needed: bool = False,
 ) -> MissionItem:
     """An item at a place; ``altitudes`` are those relative to home, above the sea, above the terrain: one is given.
 
-    Without latitude and longitude it is 0°, 0°, by which ArduPilot means where the vehicle is then.
+    A Position stands for latitude and longitude, and for the altitude when none is given.
+    Without a place it is 0°, 0°, by which ArduPilot means where the vehicle is then, unless it ``is_needed``.
     """
+    if isinstance(latitude_deg, Position):
+        if longitude_deg is not None:
+            raise InvalidArgument(f"longitude_deg = {longitude_deg!r} is not allowed beside a Position")
+        position = latitude_deg
+        latitude_deg, longitude_deg = position.latitude_deg, position.longitude_deg
+        altitudes = _altitudes_of(position) if altitudes == (None, None, None) else altitudes
     z, frame = altitude_and_frame(*altitudes)
-    if latitude_deg is None and longitude_deg is None:
+    if latitude_deg is None and longitude_deg is None and not is_needed:
         return MissionItem(command, frame, *_four(parameters), z=z)
     if latitude_deg is None or longitude_deg is None:
-        raise InvalidArgument("latitude_deg and longitude_deg: give both or none of them")
+        none = "" if is_needed else " or none of them"
+        raise InvalidArgument(
+            f"latitude_deg and longitude_deg: give both{none}, or a Position in their place"
+        )
     in_range("latitude_deg", latitude_deg, -90, 90)
     in_range("longitude_deg", longitude_deg, -180, 180)
     check_place(latitude_deg, longitude_deg)
     x, y = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
     return MissionItem(command, frame, *_four(parameters), x, y, z)
+
+
+def _altitudes_of(position: Position) -> Altitudes:
+    """Of the two that it may have, the one above home, as ``go_to`` takes it."""
+    if position.altitude_relative_m is not None:
+        return position.altitude_relative_m, None, None
+    return None, position.altitude_amsl_m, None
 
 
 def altitude_and_frame(

@@ -23,7 +23,7 @@ __all__ = ["Mission", "Plan"]
 
 
 class Mission(Snapshot):
-    """``Mission([take_off(altitude_relative_m=20), waypoint(47.3, 8.5, altitude_relative_m=20), land()])``.
+    """``Mission([take_off(20), waypoint(47.3, 8.5, altitude_relative_m=20), land()])``.
 
     ``items`` are counted from 0 and never contain home, whatever the autopilot: jumps, progress and errors count the
     same way. ``home`` is where the planner thought it to be, for files; a vehicle uses its own. Like a tuple of its

@@ -1,21 +1,25 @@
 """Builders for items at a place: waypoints, take-off and landing, loitering, rally points.
 
-Latitudes and longitudes are degrees (WGS 84). Each place has exactly one altitude, in metres: ``altitude_relative_m``
-above home, ``altitude_amsl_m`` above mean sea level, ``altitude_terrain_m`` above the ground below (ArduPilot with
-terrain data; PX4 refuses it). ``yaw_deg`` is a heading in degrees from north, None: as the vehicle likes.
+A place is a :class:`~aerokit.Position`, or a latitude and a longitude in degrees (WGS 84). It has exactly one altitude
+in metres: ``altitude_relative_m`` above home, ``altitude_amsl_m`` above mean sea level, ``altitude_terrain_m`` above
+the ground below (ArduPilot with terrain data; PX4 refuses it). Without one of these the altitude of the Position
+counts, the one above home if it has both; except for landings, whose altitude is that of the ground. ``take_off``,
+``vtol_take_off`` and ``loiter_to_altitude`` take a number alone, too: the altitude above home, ``take_off(10)``.
+``yaw_deg`` is a heading in degrees from north, None: as the vehicle likes.
 What cannot be right raises :class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions.item import action, heading, in_range, place
 
 if TYPE_CHECKING:
-    from aerokit.missions.item import MissionItem
+    from aerokit.missions.item import Altitudes, MissionItem
+    from aerokit.position import Position
 
 __all__ = [
     "land",
@@ -36,9 +40,35 @@ _LONGEST_S = 65_535.0  # ArduPilot has 16 bits for seconds
 _WIDEST_M = 65_535.0  # and for metres
 
 
+@overload
+def waypoint(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    hold_s: float = 0.0,
+    acceptance_radius_m: float = 0.0,
+    pass_by_m: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
 def waypoint(
     latitude_deg: float,
     longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    hold_s: float = 0.0,
+    acceptance_radius_m: float = 0.0,
+    pass_by_m: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+def waypoint(
+    latitude_deg: Position | float,
+    longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
     altitude_amsl_m: float | None = None,
@@ -63,12 +93,33 @@ def waypoint(
         in_range("acceptance_radius_m", acceptance_radius_m, 0, _WIDEST_M),
         in_range("pass_by_m", pass_by_m, -_WIDEST_M, _WIDEST_M),
         heading("yaw_deg", yaw_deg),
+        is_needed=True,
     )
 
 
+@overload
+def spline_waypoint(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    hold_s: float = 0.0,
+) -> MissionItem: ...
+@overload
 def spline_waypoint(
     latitude_deg: float,
     longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    hold_s: float = 0.0,
+) -> MissionItem: ...
+def spline_waypoint(
+    latitude_deg: Position | float,
+    longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
     altitude_amsl_m: float | None = None,
@@ -85,11 +136,42 @@ def spline_waypoint(
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("hold_s", hold_s, 0, _LONGEST_S),
+        is_needed=True,
     )
 
 
+@overload
+def take_off(
+    altitude_relative_m: float,
+    /,
+    *,
+    pitch_deg: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
+def take_off(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    pitch_deg: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
 def take_off(
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    pitch_deg: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+def take_off(
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -105,9 +187,7 @@ def take_off(
     """
     return place(
         MavCmd.NAV_TAKEOFF,
-        latitude_deg,
-        longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         in_range("pitch_deg", pitch_deg, 0, 90),
         0.0,
         0.0,
@@ -115,8 +195,35 @@ def take_off(
     )
 
 
+@overload
+def vtol_take_off(
+    altitude_relative_m: float,
+    /,
+    *,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
+def vtol_take_off(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
 def vtol_take_off(
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+def vtol_take_off(
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -130,9 +237,7 @@ def vtol_take_off(
     """
     return place(
         MavCmd.NAV_VTOL_TAKEOFF,
-        latitude_deg,
-        longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         0.0,
         0.0,
         0.0,
@@ -140,8 +245,32 @@ def vtol_take_off(
     )
 
 
+@overload
+def land(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    abort_altitude_m: float = 0.0,
+    precision: int = 0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
 def land(
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    abort_altitude_m: float = 0.0,
+    precision: int = 0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+def land(
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -153,9 +282,10 @@ def land(
 ) -> MissionItem:
     """Land at a place, or where the vehicle is (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground there, home's when none is given. ``abort_altitude_m`` is where to climb when a
-    plane's landing is given up (0 to 65,535 m, 0: its own); ``precision`` 0, 1 (opportunistic) or 2 (required) asks
-    PX4 for a precision landing. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
+    The altitude is that of the ground there, home's when none is given (a Position's does not count).
+    ``abort_altitude_m`` is where to climb when a plane's landing is given up (0 to 65,535 m, 0: its own); ``precision``
+    0, 1 (opportunistic) or 2 (required) asks PX4 for a precision landing.
+    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
     """
     return place(
         MavCmd.NAV_LAND,
@@ -169,8 +299,28 @@ def land(
     )
 
 
+@overload
+def vtol_land(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
 def vtol_land(
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+def vtol_land(
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -180,7 +330,7 @@ def vtol_land(
 ) -> MissionItem:
     """Land like a multicopter at a place, or where the vehicle is (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground there, home's when none is given.
+    The altitude is that of the ground there, home's when none is given (a Position's does not count).
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_LAND
     """
     return place(
@@ -195,8 +345,30 @@ def vtol_land(
     )
 
 
+@overload
+def loiter_unlimited(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+@overload
 def loiter_unlimited(
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    yaw_deg: float | None = None,
+) -> MissionItem: ...
+def loiter_unlimited(
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -221,9 +393,33 @@ def loiter_unlimited(
     )
 
 
+@overload
+def loiter_time(
+    duration_s: float,
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+@overload
 def loiter_time(
     duration_s: float,
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+def loiter_time(
+    duration_s: float,
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -249,9 +445,33 @@ def loiter_time(
     )
 
 
+@overload
+def loiter_turns(
+    turns: float,
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+@overload
 def loiter_turns(
     turns: float,
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+def loiter_turns(
+    turns: float,
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -277,8 +497,38 @@ def loiter_turns(
     )
 
 
+@overload
+def loiter_to_altitude(
+    altitude_relative_m: float,
+    /,
+    *,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+@overload
+def loiter_to_altitude(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+@overload
 def loiter_to_altitude(
     latitude_deg: float | None = None,
+    longitude_deg: float | None = None,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+    radius_m: float = 0.0,
+    leave_tangentially: bool = False,
+) -> MissionItem: ...
+def loiter_to_altitude(
+    latitude_deg: Position | float | None = None,
     longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
@@ -293,9 +543,7 @@ def loiter_to_altitude(
     """
     return place(
         MavCmd.NAV_LOITER_TO_ALT,
-        latitude_deg,
-        longitude_deg,
-        (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
+        *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         0.0,
         in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
         0.0,
@@ -311,9 +559,27 @@ def return_to_launch() -> MissionItem:
     return action(MavCmd.NAV_RETURN_TO_LAUNCH)
 
 
+@overload
+def rally_point(
+    position: Position,
+    /,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+) -> MissionItem: ...
+@overload
 def rally_point(
     latitude_deg: float,
     longitude_deg: float,
+    *,
+    altitude_relative_m: float | None = None,
+    altitude_amsl_m: float | None = None,
+    altitude_terrain_m: float | None = None,
+) -> MissionItem: ...
+def rally_point(
+    latitude_deg: Position | float,
+    longitude_deg: float | None = None,
     *,
     altitude_relative_m: float | None = None,
     altitude_amsl_m: float | None = None,
@@ -324,11 +590,20 @@ def rally_point(
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_RALLY_POINT
     """
     altitudes = (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)
-    item = place(MavCmd.NAV_RALLY_POINT, latitude_deg, longitude_deg, altitudes)
+    item = place(MavCmd.NAV_RALLY_POINT, latitude_deg, longitude_deg, altitudes, is_needed=True)
     in_range("altitude", item.z, -32_768, 32_767)
     return item
 
 
-def _ground(*altitudes: float | None) -> tuple[float | None, float | None, float | None]:
+def _up(
+    latitude_deg: Position | float | None, longitude_deg: float | None, altitudes: Altitudes
+) -> tuple[Position | float | None, float | None, Altitudes]:
+    """A place and its altitudes, as they are given or by an altitude alone."""
+    if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
+        return None, None, (latitude_deg, None, None)
+    return latitude_deg, longitude_deg, altitudes
+
+
+def _ground(*altitudes: float | None) -> Altitudes:
     relative, amsl, terrain = altitudes
     return (0.0, None, None) if altitudes == (None, None, None) else (relative, amsl, terrain)

@@ -77,6 +77,8 @@ def format_plan(plan: Plan) -> str:
         raise InvalidArgument("the plan was read from a file that is nested too deep to be written") from None
     except InvalidArgument:
         raise
+    except FileFormatError as error:  # of the file that it was read from: what else stood there is kept
+        raise InvalidArgument(f"the plan cannot be written again: {error}") from error
     except ValueError as error:
         raise InvalidArgument("a number of the plan is not finite: a .plan file cannot keep it") from error
 

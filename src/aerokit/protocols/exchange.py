@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypedDict, TypeVar
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -20,6 +20,7 @@ __all__ = [
     "Progress",
     "RoundTrip",
     "Transfer",
+    "TransferOptions",
     "ranges",
 ]
 
@@ -185,6 +186,14 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 OnProgress = Callable[[Progress], None]
+
+
+class TransferOptions(TypedDict, total=False):
+    """What transfers hand on to their base."""
+
+    round_trip: RoundTrip | None
+    patience_s: float
+    on_progress: OnProgress | None
 
 
 class Transfer(Exchange[ResultT]):

@@ -5,7 +5,6 @@ https://mavlink.io/en/services/parameter_ext.html
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -20,33 +19,33 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.parameters.parameter import MOST_PARAMETERS
 from aerokit.parameters.setting import Setting, setting_bytes, setting_value, settings_equal
-from aerokit.protocols.exchange import PATIENCE_S, EarlyAnswers, OnProgress, Transfer, ranges
-from aerokit.protocols.request_window import RequestWindow
+from aerokit.protocols.exchange import PATIENCE_S, EarlyAnswers, Transfer
+from aerokit.protocols.named_values import (
+    BY_NAME,
+    PAUSES,
+    PROBE,
+    PROBE_INDEX,
+    SHORTEST_START_S,
+    NamedReads,
+    OtherAnswers,
+    ValueList,
+)
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from aerokit.mavlink.message import Message
     from aerokit.parameters.setting import SettingValue
-    from aerokit.protocols.exchange import RoundTrip
+    from aerokit.protocols.exchange import RoundTrip, TransferOptions
 
 __all__ = ["SettingAnswer", "SettingList", "SettingReads", "SettingWrite", "setting_of"]
 
 SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """What came of one request: what the component says the setting is, or why there is nothing to say."""
 
-BY_NAME, UNKNOWN_INDEX = -1, 0xFFFF
-PAUSES = 4
-"""The list has stopped when nothing comes for so many of its longest pauses."""
-SHORTEST_QUIET_S, LONGEST_QUIET_S = 0.3, 1.1
-ROUNDS = 3
-"""How often indices are asked for again that were told under another count."""
+UNKNOWN_INDEX = 0xFFFF
+LONGEST_QUIET_S = 1.1
 READS_AT_ONCE = 10
-PROBE, PROBE_INDEX = "", 0
-"""The request for a setting that every component with settings has."""
-DOUBT = 1e-4
-"""How probable it may be that a setting exists although the component, which answers otherwise, says nothing of it."""
-VERDICT, VERDICT_OF_NO_CHANGE = 2, 8
-"""So many answers with another value than asked for are a verdict; more when it is the value from before, which may
-also stand in a message that was under way, while PARAM_EXT_SET was lost."""
 PROGRESS_S = 5.0
 """How long PARAM_ACK_IN_PROGRESS is worth waiting without a word before the component is asked what it has."""
 REFUSALS = {
@@ -62,7 +61,7 @@ def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
     return Setting(message.param_id, value, message.param_type, None if index == UNKNOWN_INDEX else index)
 
 
-class SettingList(Transfer[dict[str, Setting]]):
+class SettingList(ValueList[dict[str, Setting], Setting]):
     """Ask for the whole list once; a hole in the stream of answers is asked for by its index at once, in a window.
 
     When the component says that there is another number of settings than before, what came before that is asked for
@@ -73,33 +72,9 @@ class SettingList(Transfer[dict[str, Setting]]):
     """
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)
-
-    def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        *,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
-    ) -> None:
-        super().__init__(
-            target_system,
-            target_component,
-            round_trip=round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
-        )
-        self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=READS_AT_ONCE)
-        self._told: dict[int, tuple[Setting, int]] = {}
-        """Index → what was told last under it, and how many there were then."""
-        self._count: int | None = None
-        self._next = 0
-        """The index that the stream brings next."""
-        self._is_streaming = True
-        self._quiet_at: float | None = None
-        self._last_at = self._pause_s = 0.0
-        self._attempts = self._rounds = 0
+    asked_by = "PARAM_EXT_REQUEST_LIST"
+    noun = "settings"
+    window_size = READS_AT_ONCE
 
     def start(self, now: float) -> None:
         """Ask for the list."""
@@ -117,24 +92,17 @@ class SettingList(Transfer[dict[str, Setting]]):
             self._take(setting_of(message), index, count, now)
         self._step(now)
 
-    def expire(self, now: float) -> None:
-        """Something is overdue: the beginning of the list, the rest of it, or an answer."""
-        if self.deadline is None or now < self.deadline:
-            return
-        if self._is_out_of_patience(now):
-            self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
-            return
-        if self._quiet_at is not None and now >= self._quiet_at:
-            if self._count is None:
-                self._ask_for_list(now)
-            else:
-                self._end_stream()
-        self._step(now)
+    def _list_request(self) -> Message:
+        return ParamExtRequestList(self.target_system, self.target_component)
 
-    def _ask_for_list(self, now: float) -> None:
-        self._attempts += 1
-        self._outbox.append(ParamExtRequestList(self.target_system, self.target_component))
-        self._quiet_at = now + max(self.round_trip.timeout_s(self._attempts), SHORTEST_QUIET_S)
+    def _read_request(self, index: int) -> Message:
+        return ParamExtRequestRead(self.target_system, self.target_component, "", index)
+
+    def _on_quiet(self, now: float) -> None:
+        if self._count is None:
+            self._ask_for_list(now)
+        else:
+            self._end_stream()
 
     def _take(self, setting: Setting, index: int, count: int, now: float) -> None:
         if self._is_streaming and index >= self._next:
@@ -143,15 +111,12 @@ class SettingList(Transfer[dict[str, Setting]]):
             if self._next:
                 self._pause_s = max(self._pause_s, now - self._last_at)
             self._next, self._last_at = index + 1, now
-            quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, SHORTEST_QUIET_S)
+            quiet_s = max(self.round_trip.timeout_s(), PAUSES * self._pause_s, SHORTEST_START_S)
             self._quiet_at = now + min(quiet_s, LONGEST_QUIET_S)
             self._window.forget(index)
         else:
             self._window.answered(index, now)
-        is_new = index not in self._told
-        self._told[index] = setting, count
-        if is_new:
-            self._move(now, min(len(self._told), count), count)
+        self._keep(index, setting, count, now)
         if self._next >= count:
             self._end_stream()
 
@@ -160,45 +125,21 @@ class SettingList(Transfer[dict[str, Setting]]):
         for index in self._missing():
             self._window.ask(index)
 
-    def _step(self, now: float) -> None:
-        """End when all is there, else send what is due."""
-        if not self._is_streaming and self._count is not None:
-            if len(self._told) >= self._count and not self._missing():
-                self._finish_or_ask_again(self._count)
-            elif not len(self._window):  # there are more than there were
-                self._end_stream()
-        if self.done:
+    def _conclude(self) -> None:
+        if self._is_streaming or self._count is None:
             return
-        for index in self._window.take_due(now):
-            self._outbox.append(ParamExtRequestRead(self.target_system, self.target_component, "", index))
-        times = (self._window.deadline, self._quiet_at, self._moved_at + self._patience_s)
-        self.deadline: float | None = min(at for at in times if at is not None)
-
-    def _finish_or_ask_again(self, count: int) -> None:
-        held = [self._told[index] for index in range(count)]
-        stale = [index for index, (_, then) in enumerate(held) if then != count]
-        if not stale or self._rounds >= ROUNDS:
-            self._finish({setting.name: setting for setting, _ in held})
-            return
-        self._rounds += 1
-        for index in stale:
-            del self._told[index]
-            self._window.ask(index)
-
-    def _missing(self) -> tuple[int, ...]:
-        return tuple(index for index in range(self._count or 0) if index not in self._told)
-
-    def _timeout_text(self) -> str:
-        if self._count is None:
-            return f"PARAM_EXT_REQUEST_LIST was not answered, sent {self._attempts} times"
-        missing = self._missing()
-        return (
-            f"{len(missing)} of {self._count} settings did not come: nothing new for {self._patience_s:g} s,"
-            f" missing {ranges(missing)}"
-        )
+        if len(self._told) >= self._count and not self._missing():
+            stale = self._drop_stale(self._count)
+            for index in stale:
+                self._window.ask(index)
+            if not stale:
+                settings = (self._told[index][0] for index in range(self._count))
+                self._finish({setting.name: setting for setting in settings})
+        elif not len(self._window):  # there are more than there were
+            self._end_stream()
 
 
-class SettingReads(Transfer[dict[str, SettingAnswer]]):
+class SettingReads(NamedReads[Setting]):
     """Read some settings by name; ends with one answer for each, in the order given.
 
     A component meets an unknown name with silence. So the setting of index 0 is asked for beside what is overdue, and
@@ -207,94 +148,42 @@ class SettingReads(Transfer[dict[str, SettingAnswer]]):
     """
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)
+    whose = "the component has no setting"
 
     def __init__(
         self,
         target_system: int,
         target_component: int,
         names: Iterable[str],
-        *,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
+        **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(target_system, target_component, round_trip=round_trip, patience_s=patience_s)
-        self._names = tuple(dict.fromkeys(names))
-        self._window: RequestWindow[str] = RequestWindow(
-            self.round_trip, size=READS_AT_ONCE, doubles_last=False
+        super().__init__(
+            target_system,
+            target_component,
+            names,
+            window=READS_AT_ONCE,
+            doubles_last=False,
+            **options,
         )
-        self._answers: dict[str, SettingAnswer] = {}
-        self._probes_sent = self._probes_answered = 0
-        self._is_probe_wanted = False
 
-    def start(self, now: float) -> None:
-        """Ask for the first of them."""
-        self._begin(now)
-        for name in self._names:
-            self._window.ask(name)
-        self._step(now)
+    def _read_request(self, name: str, index: int) -> Message:
+        return ParamExtRequestRead(self.target_system, self.target_component, name, index)
 
-    def receive(self, message: Message, now: float) -> None:
-        """Take one value; what was not asked for is ignored, as are other components."""
-        if self.done or not isinstance(message, ParamExtValue) or not self._is_from_target(message):
+    def _before_sending(self, now: float) -> None:
+        self._is_probe_wanted = bool(self._overdue(now))
+
+    def _hear(self, message: Message, now: float) -> None:
+        if not isinstance(message, ParamExtValue):
             return
-        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
-            self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
-            self._window.answered(PROBE, now)
-            waiting = [name for name in self._names if name not in self._answers]
-            self._give_up_unknown([name for name in waiting if name != message.param_id], now)
         name = message.param_id
+        if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
+            self._count_probe()
+            self._window.answered(PROBE, now)
+            waiting = [each for each in self._names if each not in self._answers]
+            self._give_up_unknown([each for each in waiting if each != name], now)
         if name and name in self._window:
             self._window.answered(name, now)
             self._settle(name, setting_of(message), now)
-        self._step(now)
-
-    def expire(self, now: float) -> None:
-        """An answer is overdue."""
-        if self.deadline is None or now < self.deadline:
-            return
-        if self._is_out_of_patience(now):
-            for name in self._names:
-                if name not in self._answers:
-                    text = f"{name} was not answered, asked for {self._window.attempts(name)} times"
-                    self._answers[name] = ParameterTimeout(text, missing=(name,))
-        self._is_probe_wanted = bool([name for name in self._window.overdue(now) if name != PROBE])
-        self._step(now)
-
-    def _give_up_unknown(self, names: list[str], now: float) -> None:
-        """Silence is an answer once it can hardly be loss."""
-        for name in names:
-            if self._probability_of_silence(self._window.attempts(name)) < DOUBT:
-                text = f"the component has no setting {name}: it answers others, and not this one"
-                self._settle(name, ParameterRejected(text, name=name), now)
-
-    def _probability_of_silence(self, attempts: int) -> float:
-        """How probable it is to lose all answers to so many requests, after what became of the probes (Laplace)."""
-        lost = self._probes_sent - self._probes_answered
-        chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
-        return math.prod(chances) if self._probes_answered else 1.0
-
-    def _settle(self, name: str, answer: SettingAnswer, now: float) -> None:
-        self._window.forget(name)
-        self._answers[name] = answer
-        self._move(now, len(self._answers), len(self._names))
-
-    def _step(self, now: float) -> None:
-        if len(self._answers) == len(self._names):
-            self._finish({name: self._answers[name] for name in self._names})
-            return
-        for name in self._window.take_due(now):
-            self._ask(name)
-        if self._is_probe_wanted and PROBE not in self._window:
-            self._window.send(PROBE, now)
-            self._ask(PROBE)
-        self._is_probe_wanted = False
-        times = (self._window.deadline, self._moved_at + self._patience_s)
-        self.deadline: float | None = min(at for at in times if at is not None)
-
-    def _ask(self, name: str) -> None:
-        self._probes_sent += name == PROBE
-        index = PROBE_INDEX if name == PROBE else BY_NAME
-        self._outbox.append(ParamExtRequestRead(self.target_system, self.target_component, name, index))
 
 
 class SettingWrite(Transfer[Setting]):
@@ -326,8 +215,7 @@ class SettingWrite(Transfer[Setting]):
     ) -> None:
         super().__init__(target_system, target_component, round_trip=round_trip, patience_s=patience_s)
         self._name, self._value, self._type, self._before = name, value, type, before
-        self._told: list[Setting] = []
-        """Answers with another value than asked for, all of one value."""
+        self._others: OtherAnswers[Setting] = OtherAnswers(_is_same)
         self._early = EarlyAnswers(self.round_trip)
         self._is_writing = False
         self._sent_at = 0.0
@@ -383,11 +271,9 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _take_other(self, told: Setting, now: float) -> None:
-        if self._told and not settings_equal(self._told[-1].value, told.value):
-            self._told.clear()
-        self._told.append(told)
+        self._others.add(told)
         is_no_change = self._before is not None and settings_equal(told.value, self._before)
-        if len(self._told) < (VERDICT_OF_NO_CHANGE if is_no_change else VERDICT):
+        if not self._others.are_verdict(is_no_change=is_no_change):
             if is_no_change:
                 self._write(now)
             else:
@@ -426,3 +312,7 @@ class SettingWrite(Transfer[Setting]):
     def _is_too_early(self, now: float) -> bool:
         """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
         return self._early.is_one(self._name, self._sent_at, now, attempts=self._attempts)
+
+
+def _is_same(one: Setting, other: Setting) -> bool:
+    return settings_equal(one.value, other.value)

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from aerokit.errors import ParameterTimeout
 from aerokit.mavlink.enums import MavParamError
 from aerokit.mavlink.messages import ParamError, ParamRequestList, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, parameter_of
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import MOST_PARAMETERS, same_value
-from aerokit.protocols.exchange import PATIENCE_S, OnProgress, Transfer, ranges
-from aerokit.protocols.request_window import RequestWindow
+from aerokit.protocols.named_values import PAUSES, SHORTEST_START_S, ValueList
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.exchange import RoundTrip
+    from aerokit.protocols.exchange import TransferOptions
 
 __all__ = ["ParameterList", "updated"]
 
@@ -40,9 +40,6 @@ def updated(known: Parameter, told: Parameter, bytewise: bool) -> Parameter:
     return Parameter(known.name, value, type_, known.default, index)
 
 
-PAUSES = 4
-"""The stream has stopped when nothing comes for so many of its longest pauses."""
-
 LONGEST_TICK_S = 1.1
 """ArduPilot sends some of the list ten times a second, or as rarely as once (MAV1_PARAMS)."""
 
@@ -52,23 +49,10 @@ NEAR_END = 20
 BEGUN = 2
 """With so many values the stream has begun: it is not asked for afresh any more."""
 
-SHORTEST_START_S = 0.3
-"""A list may take that long to begin; asking again would make it begin anew."""
-
-ROUNDS = 3
-"""How often indices are asked for again that have shifted since."""
-
 REFUSALS = 2
 
 
-class _Slot:
-    __slots__ = ("count", "parameter")
-
-    def __init__(self, parameter: Parameter, count: int) -> None:
-        self.parameter, self.count = parameter, count
-
-
-class ParameterList(Transfer[ParameterTable]):
+class ParameterList(ValueList[ParameterTable, Parameter]):
     """Ask for the whole list once; a hole in the stream of answers is asked for by its index at once, in a window.
 
     The vehicle says how many there are. That number may change meanwhile (ArduPilot shows a group when it is enabled,
@@ -80,40 +64,19 @@ class ParameterList(Transfer[ParameterTable]):
     """
 
     expects: tuple[type[Message], ...] = (ParamValue, ParamError)
+    asked_by = "PARAM_REQUEST_LIST"
+    noun = "parameters"
 
     def __init__(
-        self,
-        target_system: int,
-        target_component: int,
-        *,
-        bytewise: bool,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
+        self, target_system: int, target_component: int, *, bytewise: bool, **options: Unpack[TransferOptions]
     ) -> None:
-        super().__init__(
-            target_system,
-            target_component,
-            round_trip=round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
-        )
+        super().__init__(target_system, target_component, **options)
         self._bytewise = bytewise
-        self._window: RequestWindow[int] = RequestWindow(self.round_trip)
-        self._slots: dict[int, _Slot] = {}
         self._names: dict[str, Parameter] = {}
         self._refusals: dict[int, int] = {}
-        self._count: int | None = None
         self._streamed_count: int | None = None
         self._is_to_be_checked = False
-        self._next = 0  # the index that the stream brings next
         self._streamed = 0
-        self._is_streaming = False
-        self._last_at = 0.0
-        self._pause_s = 0.0
-        self._quiet_at: float | None = None
-        self._list_attempts = 0
-        self._rounds = 0
 
     # ---------------------------------------------------------------------------- as an exchange
 
@@ -137,17 +100,6 @@ class ParameterList(Transfer[ParameterTable]):
             return
         self._step(now)
 
-    def expire(self, now: float) -> None:
-        """Something is overdue: the beginning of the list, the rest of it, or an answer."""
-        if self.deadline is None or now < self.deadline:
-            return
-        if self._is_out_of_patience(now):
-            self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
-            return
-        if self._quiet_at is not None and now >= self._quiet_at:
-            self._on_quiet(now)
-        self._step(now)
-
     # ------------------------------------------------------------------------------- what comes
 
     def _take(self, message: ParamValue, now: float) -> None:
@@ -163,15 +115,11 @@ class ParameterList(Transfer[ParameterTable]):
             self._window.answered(index, now)
         if self._is_streaming and (is_streamed or not self._is_near_end):
             self._quiet_at = now + self._quiet_s()
-        is_new = index not in self._slots
         parameter = parameter_of(message, self._bytewise)
         if parameter.name not in self._names and len(self._names) >= MOST_PARAMETERS:
             return
-        self._slots[index] = _Slot(parameter, message.param_count)
         self._names[parameter.name] = parameter
-        if is_new:
-            count = self._count or 0
-            self._move(now, min(len(self._slots), count), count)
+        self._keep(index, parameter, message.param_count, now)
 
     def _take_uncounted(self, message: ParamValue, now: float) -> None:
         """Somebody has set it, or it is the hash: the list is about to begin."""
@@ -186,7 +134,7 @@ class ParameterList(Transfer[ParameterTable]):
     def _take_refusal(self, message: ParamError) -> None:
         """An index that the vehicle has no more: the list has become shorter. Only the index counts, see PX4."""
         index = message.param_index
-        if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._slots:
+        if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._told:
             return
         self._refusals[index] = self._refusals.get(index, 0) + 1
         if self._refusals[index] >= REFUSALS and self._count is not None:
@@ -220,11 +168,11 @@ class ParameterList(Transfer[ParameterTable]):
 
     # -------------------------------------------------------------------------------- what is sent
 
-    def _ask_for_list(self, now: float) -> None:
-        self._list_attempts += 1
-        self._is_streaming = True
-        self._outbox.append(ParamRequestList(self.target_system, self.target_component))
-        self._quiet_at = now + max(self.round_trip.timeout_s(self._list_attempts), SHORTEST_START_S)
+    def _list_request(self) -> Message:
+        return ParamRequestList(self.target_system, self.target_component)
+
+    def _read_request(self, index: int) -> Message:
+        return ParamRequestRead(self.target_system, self.target_component, "", index)
 
     def _on_quiet(self, now: float) -> None:
         """The stream has not begun, or has stopped before its end: the rest is asked for by index."""
@@ -247,47 +195,34 @@ class ParameterList(Transfer[ParameterTable]):
     def _is_near_end(self) -> bool:
         return self._count is not None and self._count - self._next <= NEAR_END
 
-    def _step(self, now: float) -> None:
-        """End when all is there, else send what is due."""
-        if not self._is_streaming:
-            self._finish_when_complete()
-        if self.done:
+    def _conclude(self) -> None:
+        if self._is_streaming:
             return
-        if self._is_to_be_checked and not self._is_streaming:
+        self._finish_when_complete()
+        if self._is_to_be_checked and not self.done:
             self._is_to_be_checked = False
             for index in self._missing():
                 self._window.ask(index)
-        for index in self._window.take_due(now):
-            self._outbox.append(ParamRequestRead(self.target_system, self.target_component, "", index))
-        times = (self._window.deadline, self._quiet_at, self._moved_at + self._patience_s)
-        self.deadline: float | None = min(at for at in times if at is not None)
 
     # -------------------------------------------------------------------------------- the end
 
     def _finish_when_complete(self) -> None:
         count = self._count
-        if count is None or len(self._slots) < count:
+        if count is None or len(self._told) < count:
             return
-        held = [self._slots[index] for index in range(count) if index in self._slots]
-        names = {slot.parameter.name for slot in held}
+        held = [self._told[index][0] for index in range(count) if index in self._told]
+        names = {parameter.name for parameter in held}
         adds_up = len(names) == count == len(self._names)
-        if len(held) == count and (adds_up or not self._drop_shifted(count)):
+        if len(held) != count:
+            return
+        if not adds_up and self._drop_stale(count):
+            self._is_to_be_checked = True
+        else:
             self._finish(ParameterTable(self._in_order(held, names)))
 
-    def _drop_shifted(self, count: int) -> bool:
-        """Forget what came under another count, a few times at most; whether there was any."""
-        shifted = [index for index in range(count) if self._slots[index].count != count]
-        if not shifted or self._rounds >= ROUNDS:
-            return False
-        self._rounds += 1
-        self._is_to_be_checked = True
-        for index in shifted:
-            del self._slots[index]
-        return True
-
-    def _in_order(self, held: list[_Slot], names: set[str]) -> list[Parameter]:
+    def _in_order(self, held: list[Parameter], names: set[str]) -> list[Parameter]:
         """By index, each name once and with the value that came last; names that have no index any more at the end."""
-        ordered = dict.fromkeys(slot.parameter.name for slot in held)
+        ordered = dict.fromkeys(parameter.name for parameter in held)
         if self._rounds == 0:
             ordered.update(dict.fromkeys(name for name in self._names if name not in names))
         table = []
@@ -295,15 +230,3 @@ class ParameterList(Transfer[ParameterTable]):
             latest = self._names[name]
             table.append(Parameter(name, latest.value, latest.type, None, index))
         return table
-
-    def _missing(self) -> tuple[int, ...]:
-        return tuple(index for index in range(self._count or 0) if index not in self._slots)
-
-    def _timeout_text(self) -> str:
-        if self._count is None:
-            return f"PARAM_REQUEST_LIST was not answered, sent {self._list_attempts} times"
-        missing = self._missing()
-        return (
-            f"{len(missing)} of {self._count} parameters did not come: nothing new for {self._patience_s:g} s,"
-            f" missing {ranges(missing)}"
-        )

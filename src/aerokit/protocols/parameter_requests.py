@@ -9,7 +9,6 @@ https://mavlink.io/en/services/parameter.html#write
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -21,12 +20,21 @@ from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
-from aerokit.protocols.exchange import PATIENCE_S, EarlyAnswers, OnProgress, Transfer
-from aerokit.protocols.request_window import RequestWindow
+from aerokit.protocols.exchange import EarlyAnswers
+from aerokit.protocols.named_values import (
+    BY_NAME,
+    PROBE,
+    PROBE_INDEX,
+    NamedReads,
+    NamedRequests,
+    OtherAnswers,
+)
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.exchange import RoundTrip
+    from aerokit.protocols.exchange import TransferOptions
 
 __all__ = ["Answer", "ParameterReads", "ParameterRequests", "ParameterWrites", "rejection"]
 
@@ -45,11 +53,8 @@ ERRORS = {
 }
 
 
-class ParameterRequests(Transfer[dict[str, Answer]]):
-    """Ask for some names, a window of them at a time; ends with one answer for each, in the order given.
-
-    Where nothing new comes for ``patience_s`` seconds, what is missing becomes a ParameterTimeout.
-    """
+class ParameterRequests(NamedRequests[Parameter]):
+    """Requests of PARAM; see the base."""
 
     expects: tuple[type[Message], ...] = (ParamValue, ParamError)
 
@@ -63,101 +68,28 @@ class ParameterRequests(Transfer[dict[str, Answer]]):
         window: int,
         doubles_last: bool = True,
         own_system: int = 0,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
+        **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(
-            target_system,
-            target_component,
-            round_trip=round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
+            target_system, target_component, names, window=window, doubles_last=doubles_last, **options
         )
-        self._names = tuple(dict.fromkeys(names))
         self._bytewise, self._own_system = bytewise, own_system
-        self._window: RequestWindow[str] = RequestWindow(
-            self.round_trip, size=window, doubles_last=doubles_last
-        )
-        self._answers: dict[str, Answer] = {}
-        self._sent_at: dict[str, float] = {}
-        self._early = EarlyAnswers(self.round_trip)
 
-    def start(self, now: float) -> None:
-        """Ask for the first of them."""
-        self._begin(now)
-        for name in self._names:
-            self._window.ask(name)
-        self._step(now)
-
-    def receive(self, message: Message, now: float) -> None:
-        """Take one value or error; what was not asked for is ignored, as are other components."""
-        if self.done or not self._is_from_target(message):
-            return
+    def _hear(self, message: Message, now: float) -> None:
         if isinstance(message, ParamValue):
             self._take(message, now)
         elif isinstance(message, ParamError) and message.target_system in (0, self._own_system):
-            self._take_error(
-                message, now
-            )  # PX4 fills what it does not use with anything: only the name counts
-        self._step(now)
-
-    def expire(self, now: float) -> None:
-        """An answer is overdue."""
-        if self.deadline is None or now < self.deadline:
-            return
-        if self._is_out_of_patience(now):
-            for name in self._names:
-                if name not in self._answers:
-                    self._answers[name] = ParameterTimeout(self._timeout_text(name), missing=(name,))
-        self._step(now)
-
-    @abstractmethod
-    def _request(self, name: str) -> list[Message]:
-        """What is to be sent for this name now."""
+            self._take_error(message, now)
 
     @abstractmethod
     def _take(self, message: ParamValue, now: float) -> None:
         """A value has come."""
 
-    @abstractmethod
-    def _timeout_text(self, name: str) -> str:
-        """What was waited for."""
-
-    def _before_sending(self, now: float) -> None:
-        """The overdue ones are about to be sent again."""
-
-    def _after_sending(self, now: float) -> None:
-        """What was due has been sent."""
-
     def _take_error(self, message: ParamError, now: float) -> None:
-        name = message.param_id
+        name = message.param_id  # PX4 fills what it does not use with anything: only the name counts
         if name in self._names and name in self._window:
             self._window.answered(name, now)
             self._settle(name, rejection(name, message.error), now)
-
-    def _is_too_early(self, name: str, now: float) -> bool:
-        """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
-        sent_at = self._sent_at.get(name, now)
-        return self._early.is_one(name, sent_at, now, attempts=self._window.attempts(name))
-
-    def _settle(self, name: str, answer: Answer, now: float) -> None:
-        self._window.forget(name)
-        self._answers[name] = answer
-        self._move(now, len(self._answers), len(self._names))
-
-    def _step(self, now: float) -> None:
-        if len(self._answers) < len(self._names):
-            self._before_sending(now)
-        if len(self._answers) == len(self._names):
-            self._finish({name: self._answers[name] for name in self._names})
-            return
-        for name in self._window.take_due(now):
-            self._outbox += self._request(name)
-            self._sent_at[name] = now
-        self._after_sending(now)
-        times = (self._window.deadline, self._moved_at + self._patience_s)
-        self.deadline: float | None = min(at for at in times if at is not None)
 
 
 def rejection(name: str, code: int) -> ParameterRejected:
@@ -168,16 +100,8 @@ def rejection(name: str, code: int) -> ParameterRejected:
 
 READS_AT_ONCE = 20
 
-BY_NAME = -1
 
-PROBE, PROBE_INDEX = "", 0
-"""The request for a parameter that every vehicle has."""
-
-DOUBT = 1e-4
-"""How probable it may be that a parameter exists although the vehicle, which answers otherwise, says nothing of it."""
-
-
-class ParameterReads(ParameterRequests):
+class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name; ends with one answer for each.
 
     ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So names that ``are_doubtful`` are asked for
@@ -187,6 +111,8 @@ class ParameterReads(ParameterRequests):
     Of a name and its ``rivals`` the vehicle has one at most: the others are rejected when that one has come.
     An answer that tells a ``distrusted`` value may have been under way for long: it is believed the second time.
     """
+
+    whose = "the vehicle has no parameter"
 
     def __init__(
         self,
@@ -199,9 +125,7 @@ class ParameterReads(ParameterRequests):
         distrusted: Mapping[str, float] = MappingProxyType({}),
         rivals: Mapping[str, Iterable[str]] = MappingProxyType({}),
         own_system: int = 0,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
+        **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(
             target_system,
@@ -211,40 +135,24 @@ class ParameterReads(ParameterRequests):
             window=READS_AT_ONCE,
             doubles_last=not are_doubtful,
             own_system=own_system,
-            round_trip=round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
+            **options,
         )
         self._are_doubtful = self._is_probe_wanted = are_doubtful
         self._distrusted = dict(distrusted)
         self._refused: set[str] = set()
         self._rivals = {name: tuple(others) for name, others in rivals.items()}
-        self._probes_sent = self._probes_answered = 0
 
-    def _request(self, name: str) -> list[Message]:
-        target = self.target_system, self.target_component
-        if name == PROBE:
-            self._probes_sent += 1
-            return [ParamRequestRead(*target, "", PROBE_INDEX)]
-        return [ParamRequestRead(*target, name, BY_NAME)]
+    def _read_request(self, name: str, index: int) -> Message:
+        return ParamRequestRead(self.target_system, self.target_component, name, index)
 
     def _before_sending(self, now: float) -> None:
-        overdue = [name for name in self._window.overdue(now) if name != PROBE]
-        if self._are_doubtful and overdue:
+        if self._are_doubtful and (overdue := self._overdue(now)):
             self._give_up_unknown(overdue, now)
             self._is_probe_wanted = True
 
-    def _after_sending(self, now: float) -> None:
-        if self._is_probe_wanted and PROBE not in self._window:
-            self._window.send(PROBE, now)
-            self._outbox += self._request(PROBE)
-        self._is_probe_wanted = False
-
     def _take(self, message: ParamValue, now: float) -> None:
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
-            self._probes_answered = min(
-                self._probes_answered + 1, self._probes_sent
-            )  # repeated ones count once
+            self._count_probe()
             passed_over = self._window.answered(PROBE, now, overtaken=1)
             self._give_up_unknown(passed_over, now)
             self._is_probe_wanted |= bool(passed_over)
@@ -276,29 +184,9 @@ class ParameterReads(ParameterRequests):
         else:
             super()._take_error(message, now)
 
-    def _give_up_unknown(self, names: list[str], now: float) -> None:
-        """Silence is an answer once it can hardly be loss."""
-        for name in names:
-            if self._probability_of_silence(self._window.attempts(name)) < DOUBT:
-                text = f"the vehicle has no parameter {name}: it answers others, and not this one"
-                self._settle(name, ParameterRejected(text, name=name), now)
-
-    def _probability_of_silence(self, attempts: int) -> float:
-        """How probable it is to lose all answers to so many requests, after what became of the probes (Laplace)."""
-        lost = self._probes_sent - self._probes_answered
-        chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
-        return math.prod(chances) if self._probes_answered else 1.0
-
-    def _timeout_text(self, name: str) -> str:
-        return f"{name} was not answered, asked for {self._window.attempts(name)} times"
-
 
 WRITES_AT_ONCE = 10
 """ArduPilot saves through a queue of 30, which it must not overflow while it is armed."""
-
-VERDICT, VERDICT_OF_NO_CHANGE = 2, 8
-"""So many answers with another value than asked for are a verdict; more when it is the value from before, which may
-also stand in a message that was under way, while PARAM_SET was lost."""
 
 
 class ParameterWrites(ParameterRequests):
@@ -323,9 +211,7 @@ class ParameterWrites(ParameterRequests):
         before: Mapping[str, float] = MappingProxyType({}),
         recent: Iterable[str] = (),
         own_system: int = 0,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
+        **options: Unpack[TransferOptions],
     ) -> None:
         self._wanted = {each.name: each for each in wanted}
         super().__init__(
@@ -335,15 +221,14 @@ class ParameterWrites(ParameterRequests):
             bytewise=bytewise,
             window=WRITES_AT_ONCE,
             own_system=own_system,
-            round_trip=round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
+            **options,
         )
         self._before = dict(before)
         self._recent = set(recent)
         self._to_set = set(self._wanted)
         """Those that may be set with the next request."""
-        self._others: dict[str, list[Parameter]] = {}
+        self._others: dict[str, OtherAnswers[Parameter]] = {}
+        self._early = EarlyAnswers(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
         wanted, others = self._wanted[name], self._others.get(name)
@@ -362,31 +247,34 @@ class ParameterWrites(ParameterRequests):
             return  # it has not been sent yet
         wanted = self._wanted[name]
         told = self._typed(parameter_of(message, self._bytewise), wanted.type)
-        others = self._others.setdefault(name, [])
+        others = self._others.setdefault(name, OtherAnswers(_is_same))
         is_as_asked = same_value(told.value, wanted.value)
         if is_as_asked and name in self._recent:
             self._recent.remove(name)
-            others.append(told)
+            others.add(told)
             self._window.answered(name, now)
             self._window.ask(name)
             return
-        if is_as_asked and (told.type == wanted.type or (others and _is_same(others[-1], told))):
+        if is_as_asked and (told.type == wanted.type or others.ends_with(told)):
             self._window.answered(name, now)
             self._settle(name, told, now)
             return
         if self._is_too_early(name, now):
             return
-        if others and not _is_same(others[-1], told):
-            others.clear()
-        others.append(told)
+        others.add(told)
         self._window.answered(name, now)
         is_no_change = same_value(told.value, self._before.get(name, told.value))
         if is_no_change and not is_as_asked:
             self._to_set.add(name)
-        if len(others) >= (VERDICT_OF_NO_CHANGE if is_no_change else VERDICT):
+        if others.are_verdict(is_no_change=is_no_change):
             self._settle(name, told, now)
         else:
             self._window.ask(name)
+
+    def _is_too_early(self, name: str, now: float) -> bool:
+        """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
+        sent_at = self._sent_at.get(name, now)
+        return self._early.is_one(name, sent_at, now, attempts=self._window.attempts(name))
 
     def _typed(self, told: Parameter, type_: ParameterType) -> Parameter:
         """ArduPilot calls an integer that holds its default a float, in answers to PARAM_SET alone."""

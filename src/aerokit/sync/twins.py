@@ -1372,6 +1372,10 @@ class Parameters(TwinOf["AsyncParameters"]):
     method here takes the old and the new name with either firmware, and converts; an old name that the vehicle does
     not have any more is answered with a :class:`aerokit.errors.ParameterRenamedWarning`, which names the new one.
 
+    ArduPilot sees to parameters a few times a second. While more than five are read, or when it has not answered for
+    half a second whether it has some, it is asked to do so more often, by SET_MESSAGE_INTERVAL of PARAM_VALUE, and at
+    the end to go on as before.
+
     All methods take ``patience_s`` (give up after so many seconds without anything new) and ``timeout`` (for all of it;
     then OperationTimeout). Each can be cancelled at any moment.
     """

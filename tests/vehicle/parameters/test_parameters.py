@@ -24,7 +24,7 @@ from aerokit.errors import (
     ParameterTimeout,
 )
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavFtpErr
+from aerokit.mavlink.enums import MavCmd, MavFtpErr
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterType
 from aerokit.protocols.exchange import Progress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
@@ -576,6 +576,28 @@ async def test_old_and_new_names_read_and_written_with_a_warning() -> None:
         assert (result.name, result.requested, result.value) == ("WP_SPD", 7.5, 7.5)
         assert "WPNAV_SPEED" in result.note
         assert simulated.parameters["WPNAV_SPEED"] == 750
+
+
+async def test_renamed_parameter_is_set_without_any_command() -> None:
+    async with open_flight(copter()) as flight:
+        with pytest.warns(ParameterRenamedWarning):
+            await flight.vehicle.parameters.set("WP_SPD", 7.5)
+        await asyncio.sleep(1)
+        asked = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
+        assert messages.ParamValue.ID not in asked
+
+
+async def test_parameter_that_is_long_in_doubt_has_the_vehicle_asked_to_answer_more_often() -> None:
+    async with open_flight(copter(), latency_s=0.2) as flight:
+        with pytest.raises(ParameterRejected):
+            await flight.vehicle.parameters.get("NO_SUCH_ONE")
+        await asyncio.sleep(1)
+        asked = [
+            each
+            for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
+            if each.param1 == messages.ParamValue.ID
+        ]
+        assert {each.param2 for each in asked} == {20_000, 0}
 
 
 async def test_renamed_names_in_files_and_blocks() -> None:

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from aerokit._internal.arguments import checked
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.logs.convert.mcap import McapFile
@@ -75,7 +74,6 @@ class Conversion(Snapshot):
     """What was wrong with the log, and what is missing therefore."""
 
 
-@checked
 def convert(
     log: str | os.PathLike[str],
     target: str | os.PathLike[str],

@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import checked
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.failsafes import signs_of_texts
 from aerokit.logs.flights.flight import Flight
@@ -41,7 +40,6 @@ def check_log_name(path: Path) -> None:
         raise FileFormatError(f"{path} is no flight log by its name: {', '.join(LOGS)}")
 
 
-@checked
 def read_flight(
     log: str | os.PathLike[str],
     *,

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit._internal.arguments import checked
 from aerokit._internal.files import write_whole
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -38,7 +37,6 @@ class Report(Snapshot):
     """Of each flight."""
 
 
-@checked
 def write_report(
     log: str | os.PathLike[str],
     target: str | os.PathLike[str],

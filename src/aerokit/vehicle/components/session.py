@@ -15,7 +15,7 @@ from aerokit._internal.files import LARGEST_FILE, too_large
 from aerokit._internal.wording import shown
 from aerokit.autopilots import Autopilot, AutopilotVersion
 from aerokit.connection.cells import Source, StateCell
-from aerokit.errors import FileTimeout, InvalidArgument, OperationRejected
+from aerokit.errors import FileFormatError, FileTimeout, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
 from aerokit.vehicle.session.rates import Hearing, MessageRates
 from aerokit.vehicle.session.transfers import Transfers
@@ -219,7 +219,7 @@ class _Web:
                 if answer.length:  # of a server that says how much there is
                     raise OSError(f"{answer.length} bytes did not come")
                 return bytes(content)
-        except InvalidArgument:
+        except (InvalidArgument, FileFormatError):
             raise
         except (OSError, HTTPException, ValueError) as error:
             if isinstance(getattr(error, "reason", error), TimeoutError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Literal
@@ -47,6 +48,8 @@ ECHOES_S = 3.0
 """How long after a write late and repeated answers to it may still come."""
 FEW_READS = 5
 """More are not answered at once."""
+SLOW_S = 0.5
+"""After this long it is doubtful whether the vehicle has a parameter: to find out takes several rounds of requests."""
 LEAST_TO_PACK = 10
 """Fewer changes than that are set one by one: it takes no longer, and each is confirmed by the vehicle itself."""
 MOST_TO_READ_BACK = 100
@@ -230,27 +233,40 @@ class ParameterAccess:
             round_trip=self._answer_time,
             patience_s=patience_s,
         )
-        with self._attended() if are_doubtful or len(names) > FEW_READS else nullcontext():
+        with self._attended(after_s=0.0 if len(names) > FEW_READS else SLOW_S if are_doubtful else math.inf):
             return await transfers.run(exchange)
 
     @contextmanager
-    def _attended(self) -> Iterator[None]:
-        """Have the vehicle see to parameters more often for a while, where that can be had."""
+    def _attended(self, *, after_s: float = 0.0) -> Iterator[None]:
+        """Have the vehicle see to parameters more often until the block ends, where that can be had.
+
+        It is asked by SET_MESSAGE_INTERVAL once the block has lasted ``after_s`` seconds, and again at its end.
+        """
         interval_s = self._transfers.autopilot.parameter_interval_s
-        if interval_s is None:
+        if interval_s is None or after_s == math.inf:
             yield
             return
-        self._attending += 1
-        if self._attending == 1:
-            self._transfers.command_in_background(
-                MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, interval_s * 1e6
-            )
+        has_begun = False
+
+        def begin() -> None:
+            nonlocal has_begun
+            has_begun = True
+            self._attending += 1
+            if self._attending == 1:
+                self._set_interval(interval_s * 1e6)
+
+        timer = asyncio.get_running_loop().call_later(after_s, begin)
         try:
             yield
         finally:
-            self._attending -= 1
-            if not self._attending:
-                self._transfers.command_in_background(MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, AS_BEFORE)
+            timer.cancel()
+            if has_begun:
+                self._attending -= 1
+                if not self._attending:
+                    self._set_interval(AS_BEFORE)
+
+    def _set_interval(self, interval_us: float) -> None:
+        self._transfers.command_in_background(MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, interval_us)
 
     async def write(
         self,
@@ -285,7 +301,7 @@ class ParameterAccess:
                 patience_s=patience_s,
                 on_progress=on_progress,
             )
-            with self._attended() if len(recent) > FEW_READS else nullcontext():
+            with self._attended(after_s=0.0 if len(recent) > FEW_READS else math.inf):
                 answers = await transfers.run(exchange)
             for name, answer in answers.items():
                 self._written_at[name] = transfers.connection.now()
