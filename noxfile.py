@@ -12,7 +12,7 @@ import nox
 
 nox.options.sessions = ["tests", "lint", "types"]
 nox.options.error_on_missing_interpreters = False
-nox.options.default_venv_backend = "venv"
+nox.options.default_venv_backend = "uv|venv"
 
 PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
 
@@ -24,29 +24,46 @@ def tests(session: nox.Session) -> None:
     session.run("pytest", *session.posargs)
 
 
+@nox.session
+def exhaustive(session: nox.Session) -> None:
+    """Run the rows of long tables, and the slow tests, that `pytest` leaves out; three minutes."""
+    session.install("-e", ".[test]")
+    session.run("pytest", "-q", "-m", "exhaustive", *session.posargs)
+
+
 MEETS_OTHERS = (
-    "tests/test_sync.py", "tests/test_sync_loop.py", "tests/test_sync_parameters.py", "tests/test_beside_sniffio.py",
-    "tests/test_package.py", "tests/links/test_serial.py", "tests/runtime/test_ends.py", "tests/runtime/test_leaks.py",
-    "tests/dronekit/test_dronekit_life.py", "tests/dronekit/test_dronekit_orders.py", "tests/vehicle/test_guided.py",
-    "tests/parameters", "tests/testing/test_clock.py",
-)  # fmt: skip
+    "tests/sync/test_sync.py",
+    "tests/sync/test_sync_loop.py",
+    "tests/sync/test_sync_parameters.py",
+    "tests/test_beside_sniffio.py",
+    "tests/test_package.py",
+    "tests/transport/test_serial.py",
+    "tests/connection/test_ends.py",
+    "tests/connection/test_leaks.py",
+    "tests/dronekit/test_dronekit_life.py",
+    "tests/dronekit/test_dronekit_orders.py",
+    "tests/vehicle/commanding/test_guided.py",
+    "tests/parameters",
+    "tests/testing/test_clock.py",
+)
 """The tests of what uses other packages: anyio and its threads, serial ports, geodesy, dialects of pymavlink."""
 OF_EXTRAS = (
-    "tests/convert",
-    "tests/flights",
-    "tests/links/test_zenoh.py",
-    "tests/monitor",
-    "tests/network",
-    "tests/report",
-    "tests/serve",
-    "tests/viewers",
+    "tests/logs/convert",
+    "tests/logs/flights",
+    "tests/transport/test_zenoh.py",
+    "tests/apps/monitor",
+    "tests/apps/network",
+    "tests/logs/report",
+    "tests/apps/serve",
+    "tests/apps/foxglove",
 )
 
 
 @nox.session
 def lowest(session: nox.Session) -> None:
     """Run the tests that meet other packages with the lowest versions that pyproject.toml declares."""
-    _install_lowest(session)
+    session.install("uv>=0.5")
+    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test]")
     session.run("pytest", "-q", *(session.posargs or (*MEETS_OTHERS, *OF_EXTRAS)))
 
 
@@ -55,11 +72,6 @@ def beside_trio(session: nox.Session) -> None:
     """Run them with trio and sniffio installed: anyio does not take asyncio for granted then."""
     session.install("-e", ".[test]", "trio", "sniffio")
     session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
-
-
-def _install_lowest(session: nox.Session) -> None:
-    session.install("uv>=0.5")
-    session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test]")
 
 
 @nox.session
@@ -156,7 +168,7 @@ def fuzz(session: nox.Session) -> None:
     With atheris, which follows what code an input reaches, where it installs.
     """
     session.install("-e", ".[test]")
-    session.run("python", "-m", "pip", "install", "-q", "atheris", success_codes=[0, 1])
+    session.install("-q", "atheris", success_codes=[0, 1, 2])
     session.run("python", "tests/fuzz/fuzz.py", *session.posargs)
 
 
@@ -164,7 +176,7 @@ def fuzz(session: nox.Session) -> None:
 def badlinks(session: nox.Session) -> None:
     """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
     session.install("-e", ".[test]")
-    session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests"})
+    session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests/helpers"})
 
 
 @nox.session
@@ -173,15 +185,8 @@ def soak(session: nox.Session) -> None:
     session.install("-e", ".[test]")
     minutes = session.posargs[0] if session.posargs else "60"
     # pytest would keep what is logged, which grows
-    options = ("-q", "-n", "0", "-p", "no:logging")
+    options = ("-q", "-n", "0", "-p", "no:logging", "-m", "")
     session.run("pytest", *options, "tests/soak", env={"AEROKIT_SOAK_MINUTES": minutes})
-
-
-@nox.session
-def diaries(session: nox.Session) -> None:
-    """Keep what goes over the wire in each test (tests/wire_diary.py), after a change that is meant (`-- PATH …`)."""
-    session.install("-e", ".[test]")
-    session.run("python", "tests/keep_diaries.py", *session.posargs)
 
 
 @nox.session
@@ -196,14 +201,23 @@ def orders(session: nox.Session) -> None:
     """Fly the order table of docs/reliability.md with many seeds of each row (100): `nox -s orders -- 300`."""
     session.install("-e", ".[test]")
     seeds = session.posargs[0] if session.posargs else "100"
-    session.run("pytest", "-q", "tests/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
+    session.run(
+        "pytest", "-q", "-m", "", "tests/vehicle/commanding/orders", env={"AEROKIT_ORDER_SEEDS": seeds}
+    )
 
 
 @nox.session
 def cancel(session: nox.Session) -> None:
     """Cancel every public coroutine at every await, not only at a few; a minute."""
     session.install("-e", ".[test]")
-    session.run("pytest", "-q", "tests/calls/test_cancellation.py", env={"AEROKIT_CANCEL_POINTS": "0"})
+    session.run(
+        "pytest",
+        "-q",
+        "-m",
+        "exhaustive",
+        "tests/calls/test_cancellation.py",
+        env={"AEROKIT_CANCEL_POINTS": "0"},
+    )
 
 
 @nox.session(name="dronekit")
@@ -226,7 +240,9 @@ def clients(session: nox.Session) -> None:
 def browser(session: nox.Session) -> None:
     """Fly by the page of `aerokit serve`, and open a report, in headless Chromium (or AEROKIT_CHROMIUM)."""
     session.install("-e", ".[test]", "playwright>=1.45")
-    session.run("pytest", "-q", "-n", "0", "tests/browser", "tests/report/test_report.py", *session.posargs)
+    session.run(
+        "pytest", "-q", "-n", "0", "tests/browser", "tests/logs/report/test_report.py", *session.posargs
+    )
 
 
 @nox.session

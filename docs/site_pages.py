@@ -37,7 +37,8 @@ NAVIGATION: dict[str, list[str]] = {
     "Troubleshooting": ["troubleshooting.md"],
     "Gallery": ["gallery.md", "examples/*.md"],
     "About": [
-        "design.md", "reliability.md", "firmware.md", "benchmarks.md", "features.md", "states.md", "addresses.md",
+        "design.md", "design-rooms.md", "reliability.md", "firmware.md", "benchmarks.md", "features.md", "states.md",
+        "addresses.md",
         "signing.md", "simulator.md", "testing.md", "about/*.md",
     ],
 }  # fmt: skip

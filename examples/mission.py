@@ -20,9 +20,9 @@ async def main(address: str) -> None:
         start = vehicle.position.value
         corners = [start.offset(north_m=20), start.offset(north_m=20, east_m=20)]
         mission = Mission([
-            take_off(start.latitude_deg, start.longitude_deg, altitude_relative_m=10),
+            take_off(start, altitude_relative_m=10),
             change_speed(4),
-            *(waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=10) for place in corners),
+            *(waypoint(place, altitude_relative_m=10) for place in corners),
             return_to_launch(),
         ])  # fmt: skip
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -13,20 +14,10 @@ from flight_harness import Flight, in_the_air, open_flight
 from hypothesis import given, settings, strategies
 from late_loop import LateLoop
 from recorded import headline
-from wire_diary import (
-    pytest_addoption,
-    pytest_collection_modifyitems,
-    pytest_pyfunc_call,
-    pytest_runtest_protocol,
-)
 
-__all__ = [
-    "pytest_addoption",
-    "pytest_collection_modifyitems",
-    "pytest_pyfunc_call",
-    "pytest_runtest_protocol",
-]
-
+if sys.dont_write_bytecode:  # each worker, and each program of a test, would compile everything anew
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 ):  # a background job of a script: some tests interrupt themselves

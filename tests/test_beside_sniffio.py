@@ -14,15 +14,15 @@ from pathlib import Path
 import pytest
 
 STAND_IN = Path(__file__).parent / "beside_sniffio"
-LIMIT_S = 60.0
+LIMIT_S = 200.0
 
 BLOCKING = """
 import aerokit.sync
 import sniffio
 from aerokit.testing import serve_flight
 with serve_flight() as flight:
-    with aerokit.sync.connect(flight.address, timeout=20) as vehicle:
-        vehicle.mode.wait_until(lambda mode: mode.name == "STABILIZE", timeout=20)
+    with aerokit.sync.connect(flight.address, timeout=100) as vehicle:
+        vehicle.mode.wait_until(lambda mode: mode.name == "STABILIZE", timeout=100)
         print(vehicle.parameters.get("RTL_ALT"))
 """
 CLASSIC = """
@@ -30,7 +30,7 @@ import aerokit.dronekit as dronekit
 import sniffio
 from aerokit.testing import serve_flight
 with serve_flight() as flight:
-    vehicle = dronekit.connect(flight.address, wait_ready=True, timeout=60, heartbeat_timeout=20)
+    vehicle = dronekit.connect(flight.address, wait_ready=True, timeout=60, heartbeat_timeout=100)
     print(vehicle.parameters["RTL_ALT"])
     vehicle.close()
 """

@@ -11,6 +11,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from exhaustive import exhaustive
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -49,18 +50,21 @@ def apply(step: re.Match[str], sources: Path) -> None:
     file.write_text(text, encoding="utf-8")
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("recipe", [*map(exhaustive, RECIPES[:-1]), RECIPES[-1]])
 def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
     shutil.copytree(
         ROOT / "src" / "aerokit", tmp_path / "aerokit", ignore=shutil.ignore_patterns("__pycache__")
     )
+    shutil.copytree(ROOT / "tests" / "helpers", tmp_path / "tests" / "helpers")
     steps = steps_until(recipe)
     for step in steps:
         if not step["then"]:
             apply(step, tmp_path)
     check = textwrap.dedent(steps[-1]["code"])
     assert steps[-1]["then"]
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, tmp_path / "tests" / "helpers")))
+    }
     done = subprocess.run(
         [sys.executable, "-c", check],
         env=environment,
@@ -74,4 +78,4 @@ def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
 
 def test_there_are_four_recipes_of_several_steps() -> None:
     assert len(RECIPES) == 4
-    assert [len(steps_until(recipe)) for recipe in RECIPES] == [3, 5, 9, 11]
+    assert [len(steps_until(recipe)) for recipe in RECIPES] == [3, 6, 10, 12]

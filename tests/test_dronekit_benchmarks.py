@@ -23,6 +23,7 @@ def rows_of(path: Path, *arguments: str) -> list[dict[str, Any]]:
     return rows
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("part", "case"), [("connect", "mavftp_0ms"), ("latency", "v2_500"), ("cpu", "usual_udp_v2_100")]
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from for_each import for_each
 
 import aerokit
 from aerokit.sim import SimulatedCamera, SimulatedCopter, simulated_link
@@ -87,7 +88,7 @@ def has(roots: dict[str, Any], name: str) -> bool:
     return True
 
 
-@pytest.mark.parametrize(("plugin", "call", "answer"), rows(), ids=lambda each: str(each)[:40])
+@for_each("plugin, call, answer", rows())
 def test_what_is_named_exists_or_a_reason_is_given(
     plugin: str, call: str, answer: str, missing: set[str]
 ) -> None:

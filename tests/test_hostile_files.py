@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import lzma
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from for_each import for_each
 
 from aerokit._internal.files import LARGEST_FILE
 from aerokit.errors import FileFormatError, InvalidArgument
@@ -214,8 +216,11 @@ def test_a_dialect_that_is_wrong(text: str, complaint: str, tmp_path: Path) -> N
         Dialect.from_xml(path)
 
 
-@pytest.mark.parametrize("name", ["NONE", "TRUE", "FALSE", "STRUCT", "MESSAGE", "FRAME"])
-@pytest.mark.parametrize("field", ["tuple", "bytes", "values", "body", "frame", "None", "struct"])
+MESSAGE_NAMES = ("NONE", "TRUE", "FALSE", "STRUCT", "MESSAGE", "FRAME")
+FIELD_NAMES = ("tuple", "bytes", "values", "body", "frame", "None", "struct")
+
+
+@for_each("name, field", list(itertools.product(MESSAGE_NAMES, FIELD_NAMES)))
 def test_names_that_python_has_use_for(name: str, field: str, tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
     path.write_text(

@@ -23,6 +23,7 @@ def run(*arguments: str, peer: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.exhaustive
 def test_aerokit_alone_passes_everything_on(tmp_path: Path) -> None:
     """It has nobody to be compared with, so there are no rows; that no frame was lost is what counts."""
     path = tmp_path / "bench.json"

@@ -7,11 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from for_each import for_each
 
 import aerokit
 
 
-@pytest.mark.parametrize("name", aerokit.__all__)
+@for_each("name", aerokit.__all__)
 def test_every_public_name_is_there(name: str) -> None:
     assert getattr(aerokit, name) is getattr(aerokit, name)
     assert name in dir(aerokit)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pages
 import pytest
+from for_each import for_each
 
 LANGUAGES = {"python", "sh", "text", "json", "json5", "yaml", "toml", "ini", "xml", "powershell", "mermaid"}
 CHAINS = [
@@ -22,7 +23,7 @@ def test_block_runs(chain: pages.Chain, tmp_path: Path, monkeypatch: pytest.Monk
     pages.run(chain, tmp_path)
 
 
-@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: str(page.relative_to(pages.ROOT)))
+@for_each("page", WITH_CODE)
 def test_page_keeps_the_rules(page: Path) -> None:
     given = {"vehicle"} if pages.tells_the_rule(page) else set()
     before = None

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from for_each import for_each
 from served_copter import served_copter
 
 ROOT = Path(__file__).parent.parent
@@ -48,14 +49,14 @@ def test_ci_runs_the_readmes_test_command() -> None:
 DOCUMENTS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+@for_each("path", DOCUMENTS)
 def test_links_lead_somewhere(path: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (path.parent / target).exists(), f"{path.name} links to {target}"
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+@for_each("path", DOCUMENTS)
 def test_pictures_are_there(path: Path) -> None:
     for source in re.findall(r'<img src="([^"]+)"', path.read_text(encoding="utf-8")):
         assert (path.parent / source).exists(), f"{path.name} shows {source}"

@@ -92,12 +92,12 @@ def test_pymavlinks_mavutil_is_heard_with_the_key_and_not_without(
     link.mav.robust_parsing = True
     link.WIRE_PROTOCOL_VERSION = "2.0"
     try:
-        link.wait_heartbeat(timeout=20)
+        link.wait_heartbeat(timeout=100)
         link.mav.param_set_send(1, 1, b"RTL_ALT", 1234.0, 9)
         link.setup_signing(KEY.secret, link_id=3)
         link.mav.heartbeat_send(6, 8, 0, 0, 4)  # the vehicle's time stamps follow those that it hears
         link.mav.param_set_send(1, 1, b"RTL_SPEED", 700.0, 9)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 100
         value = None
         while value is None and time.monotonic() < deadline:
             value = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=0.1)

@@ -14,6 +14,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+from for_each import for_each
 
 import aerokit
 from aerokit import enums, errors
@@ -93,7 +94,7 @@ def test_the_page_has_headings_and_blocks() -> None:
     assert len(BLOCKS) == len(provoked())
 
 
-@pytest.mark.parametrize("text", quoted())
+@for_each("text", quoted())
 def test_a_quoted_text_is_in_the_sources(text: str) -> None:
     pieces = [piece.strip(" ") for part in text.split("…") for piece in pieces_of(part)]
     missing = [piece for piece in pieces if piece and not is_said(piece)]
@@ -112,7 +113,7 @@ def error_classes() -> list[str]:
     return [*errors.__all__, NotInstalled.__name__]
 
 
-@pytest.mark.parametrize("name", error_classes())
+@for_each("name", error_classes())
 def test_each_class_of_errors_is_on_the_page(name: str) -> None:
     assert re.search(rf"\b{name}\b", PAGE)
 

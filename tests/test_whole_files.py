@@ -10,23 +10,22 @@ WRITES = re.compile(
     r"""open\([^)\n]*["'](?:w|x|a|r\+)[bt+]*["']|(?:write_text|write_bytes)\(|\.open\(["'](?:w|x|a)[bt+]*["']"""
 )
 KNOWN = {
-    "cli/camera.py": "beside what is there: nothing is replaced",
-    "cli/demo_lines.py": "os.devnull",
-    "cli/main.py": "os.devnull",
-    "cli/new_file.py": "a new file",
-    "convert/mcap.py": "converting.py moves it when it is whole",
-    "convert/tables.py": "converting.py moves it when it is whole",
-    "convert/tracks.py": "converting.py moves it when it is whole",
-    "cli/monitor.py": "os.devnull",
+    "apps/cli/camera.py": "beside what is there: nothing is replaced",
+    "apps/cli/own_flight.py": "os.devnull",
+    "apps/cli/main.py": "os.devnull",
+    "apps/cli/output.py": "a new file",
+    "logs/convert/mcap.py": "converting.py moves it when it is whole",
+    "logs/convert/tables.py": "converting.py moves it when it is whole",
+    "logs/convert/tracks.py": "converting.py moves it when it is whole",
+    "apps/cli/monitor.py": "os.devnull",
     "mavlink/generator.py": "our own sources",
-    "mavlink/tlog.py": "recordings: runtime/recording.py replaces a file when the first frame is received",
-    "runtime/recording.py": "only to see whether it can be written",
+    "mavlink/tlog.py": "recordings: connection/frame_observers.py replaces a file when the first frame is received",
+    "connection/frame_observers.py": "only to see whether it can be written",
     "sync/generator.py": "our own sources",
     "testing/failure.py": "of a failed test, under a name of its own",
-    "vehicle/camera/geotag.py": "moved when it is whole",
-    "vehicle/files/part_file.py": "a .part, which finish() moves",
-    "vehicle/parameters/cache.py": "moved when it is whole",
-    "whole_file.py": "write_whole",
+    "vehicle/camera/capture.py": "moved when it is whole",
+    "_internal/files.py": "write_whole; a .part, which finish() moves",
+    "vehicle/parameters/store.py": "moved when it is whole",
 }
 
 

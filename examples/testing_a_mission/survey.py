@@ -37,8 +37,8 @@ def corners(home: Position) -> list[Position]:
 def plan(home: Position) -> Mission:
     """Take off, visit each corner, return."""
     return Mission([
-        take_off(home.latitude_deg, home.longitude_deg, altitude_relative_m=ALTITUDE_M),
-        *(waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=ALTITUDE_M) for place in corners(home)),
+        take_off(home, altitude_relative_m=ALTITUDE_M),
+        *(waypoint(place, altitude_relative_m=ALTITUDE_M) for place in corners(home)),
         return_to_launch(),
     ])  # fmt: skip
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import get_args
 
 import pytest
+from for_each import for_each
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink import mavutil
@@ -61,7 +62,7 @@ def test_names_beyond_pymavlinks_are_the_firmwares(kind: str) -> None:
     assert {n: name for n, name in ours.items() if n not in theirs} == NEWER.get(kind, {})
 
 
-@pytest.mark.parametrize("name", mavutil.px4_map)
+@for_each("name", mavutil.px4_map)
 def test_px4_names_and_numbers_are_those_of_pymavlink(name: str) -> None:
     _, main, sub = mavutil.px4_map[name]
     assert px4.find_mode(name).custom_mode == px4_custom_mode(main, sub)
@@ -73,7 +74,7 @@ def test_px4_modes_as_the_firmware_was_seen_to_send_them() -> None:
     assert px4.mode(px4_custom_mode(6), 157).name == "OFFBOARD"
 
 
-@pytest.mark.parametrize("autopilot", EVERY_AUTOPILOT, ids=repr)
+@for_each("autopilot", EVERY_AUTOPILOT)
 def test_every_name_is_found_again(autopilot: Autopilot) -> None:
     for number, name in autopilot.modes.numbers.items():
         for spelling in (name, name.lower(), name.replace("_", " ").title(), f" {name} "):
@@ -81,7 +82,7 @@ def test_every_name_is_found_again(autopilot: Autopilot) -> None:
         assert autopilot.find_mode(number).name == autopilot.mode(number, 1).name == name
 
 
-@pytest.mark.parametrize("autopilot", EVERY_AUTOPILOT, ids=repr)
+@for_each("autopilot", EVERY_AUTOPILOT)
 def test_every_purpose_names_a_mode_that_exists(autopilot: Autopilot) -> None:
     for purpose in get_args(Purpose):
         for is_vtol in (False, True):

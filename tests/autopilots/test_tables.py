@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import pytest
+from for_each import for_each
 
 from aerokit.autopilots import Autopilot, Mode, ModeTable, Reposition, SetpointRules, autopilot_for
 from aerokit.autopilots import ardupilot as ardupilot_modes
@@ -235,8 +236,8 @@ PX4 = UNKNOWN | {
 PX4_DOWN = PX4 | {"lands_after_return": False}
 
 
-@pytest.mark.parametrize(
-    ("autopilot", "vehicle_type", "firmware", "habits"),
+@for_each(
+    "autopilot, vehicle_type, firmware, habits",
     [
         (0, 2, "unknown", UNKNOWN),
         (3, 200, "ArduPilot", ARDUPILOT),

@@ -1,6 +1,6 @@
 """Every transfer over bad radios, many seeds of each: ``nox -s badlinks``, or
 
-    PYTHONPATH=tests python tests/badlink/survey.py --seeds 200 --sizes real "parameter list" file
+    PYTHONPATH=tests/helpers python tests/badlink/survey.py --seeds 200 --sizes real "parameter list" file
 
 prints a table for each kind of radio. In it: how many of the transfers were exact, how many ended in an error that says
 what is missing, the median of time / ideal (see `ideals.py`) and the most messages that were sent. The exit code is 1

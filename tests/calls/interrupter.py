@@ -16,7 +16,7 @@ __all__ = ["AT_ITS_END", "Interrupter"]
 
 AT_ITS_END = 1 << 30
 """Interrupted when the work on the loop is done and the caller has not heard of it."""
-PATIENCE_S = 30.0
+PATIENCE_S = 200.0
 """For tests that hang."""
 
 

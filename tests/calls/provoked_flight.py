@@ -72,6 +72,12 @@ async def _post_int(stage: Stage, frame: int = 0) -> None:
         await order.command_int(Cmd.DO_SET_HOME, 0, frame=frame, x=1, y=1, z=1)
 
 
+async def _post_overruled(stage: Stage, *, as_int: bool = False) -> None:
+    with stage.vehicle.posted("motion") as order:
+        stage.vehicle.send(messages.SetPositionTargetLocalNed(0, 1, 1, 1, 0x0DC7, *(0,) * 11))
+        await (order.command_int(Cmd.DO_SET_HOME, frame=0) if as_int else order.command(Cmd.DO_SET_ROI_NONE))
+
+
 async def _post_mode(stage: Stage, posted: str = "LOITER") -> None:
     mode = stage.vehicle.autopilot.find_mode("LOITER")
     with stage.vehicle.posted("mode", modes=(stage.vehicle.autopilot.find_mode(posted),)) as order:
@@ -115,9 +121,6 @@ def _actions() -> Table:
         ("Vehicle.command_int", "InvalidArgument"): P(_method("command_int", 1, frame=999)),
         ("Vehicle.command_int", "CommandRejected"): P(command_int, before=refused(Cmd.DO_SET_HOME)),
         ("Vehicle.command_int", "CommandTimeout"): P(command_int, before=ignored(Cmd.DO_SET_HOME)),
-        ("Vehicle.arm", "InvalidArgument"): P(_method("arm", mode="NONE")),
-        ("Vehicle.arm", "CommandRejected"): P(_method("arm"), grounded, refused(arm)),
-        ("Vehicle.arm", "CommandTimeout"): P(_method("arm"), grounded, ignored(arm)),
         ("Vehicle.arm", "OperationRejected"): later(
             _method("arm"), pilot, 0.1, grounded, before=ignored(arm)
         ),
@@ -129,19 +132,12 @@ def _actions() -> Table:
             _method("disarm", timeout=30), falls_silent, 1.0, armed, before=accepted(arm)
         ),
         ("Vehicle.disarm", "CommandRejected"): P(_method("disarm"), airborne),
-        ("Vehicle.disarm", "CommandTimeout"): P(_method("disarm"), armed, ignored(arm)),
         ("Vehicle.disarm", "OperationTimeout"): P(_method("disarm", timeout=1.5), armed, accepted(arm)),
         ("Vehicle.reboot", "OperationRejected"): P(_method("reboot"), armed),
-        ("Vehicle.reboot", "CommandRejected"): P(_method("reboot"), grounded, refused(reboot)),
-        ("Vehicle.reboot", "CommandTimeout"): P(_method("reboot"), grounded, ignored(reboot)),
         ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, accepted(reboot)),
         ("Vehicle.reboot", "LinkLost"): later(_method("reboot"), lost, 0.05, grounded, alone=True),
         ("Vehicle.wait_ready", "OperationTimeout"): P(
             _method("wait_ready", timeout=1), before=_forget("home")
-        ),
-        ("Vehicle.set_speed", "InvalidArgument"): P(_method("set_speed", -1)),
-        ("Vehicle.set_speed", "CommandRejected"): P(
-            _method("set_speed", 3), airborne, refused(Cmd.DO_CHANGE_SPEED)
         ),
         ("Vehicle.send", "InvalidArgument"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
@@ -157,27 +153,16 @@ def _actions() -> Table:
         ("Vehicle.setup_signing", "BusyError"): P(_sign_twice, grounded, falls_silent),
         ("Vehicle.set_mode", "InvalidArgument"): P(_method("set_mode", "NONE")),
         ("Vehicle.set_heading", "InvalidArgument"): P(_method("set_heading", 999), airborne),
-        ("Vehicle.set_home", "InvalidArgument"): P(_method("set_home", Position(1, 1))),
-        ("Vehicle.set_home", "CommandRejected"): P(_method("set_home"), before=refused(Cmd.DO_SET_HOME)),
-        ("Vehicle.set_home", "CommandTimeout"): P(_method("set_home"), before=ignored(Cmd.DO_SET_HOME)),
         ("Vehicle.set_home", "OperationTimeout"): P(
             _method("set_home", timeout=1),
             before=lambda s: [accepted(each)(s) for each in (Cmd.DO_SET_HOME, Cmd.REQUEST_MESSAGE)],
         ),
         ("Vehicle.look_at", "ValueUnknownError"): P(_look_north, airborne, _forget("home"), on="px4"),
-        ("Vehicle.look_at", "CommandRejected"): P(_look_north, before=refused(Cmd.DO_SET_ROI_LOCATION)),
-        ("Vehicle.look_at", "CommandTimeout"): P(_look_north, grounded, ignored(Cmd.DO_SET_ROI_LOCATION)),
         ("Vehicle.look_at", "OperationRejected"): later(
             _look_north, pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_LOCATION)
         ),
         ("Vehicle.stop_looking", "OperationRejected"): later(
             _method("stop_looking"), pilot, 0.3, before=ignored(Cmd.DO_SET_ROI_NONE)
-        ),
-        ("Vehicle.stop_looking", "CommandRejected"): P(
-            _method("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)
-        ),
-        ("Vehicle.stop_looking", "CommandTimeout"): P(
-            _method("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
         ),
         ("Vehicle.posted", "InvalidArgument"): P(lambda s: _post(s, [])),
         ("PostedOrder.command", "InvalidArgument"): P(lambda s: _post(s, ["arm"], -1, armed=True)),
@@ -187,6 +172,8 @@ def _actions() -> Table:
         ("PostedOrder.command", "CommandTimeout"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)
         ),
+        ("PostedOrder.command", "OperationRejected"): P(_post_overruled),
+        ("PostedOrder.command_int", "OperationRejected"): P(lambda s: _post_overruled(s, as_int=True)),
         ("PostedOrder.command_int", "InvalidArgument"): P(lambda s: _post_int(s, 999)),
         ("PostedOrder.command_int", "CommandRejected"): P(_post_int, before=refused(Cmd.DO_SET_HOME)),
         ("PostedOrder.command_int", "CommandTimeout"): P(_post_int, grounded, ignored(Cmd.DO_SET_HOME)),
@@ -230,10 +217,8 @@ def _actions() -> Table:
         rows[name, "CommandRejected"] = P(do, airborne, refused(repeated))
         rows[name, "OperationRejected"] = later(do, pilot, 0.3, before=ignored(repeated))
         rows[name, "OperationTimeout"] = P(do, airborne, ignored(repeated))
-    for name, do in (("land", _method("land")), ("return_to_launch", _method("return_to_launch"))):
-        rows[f"Vehicle.{name}", "CommandTimeout"] = P(do, airborne, ignored(mode))
-        rows[f"Vehicle.{name}", "NotSupported"] = P(do, airborne, no_modes, alone=True)
-    rows["Vehicle.hold", "NotSupported"] = P(_method("hold"), airborne, no_modes, alone=True)
+    for name in ("land", "return_to_launch", "hold"):
+        rows[f"Vehicle.{name}", "NotSupported"] = P(_method(name), airborne, no_modes, alone=True)
     rows["Vehicle.go_to", "CommandTimeout"] = P(_go, airborne, ignored(Cmd.DO_REPOSITION))
     rows["Vehicle.set_heading", "OperationTimeout"] = P(
         _method("set_heading", 90, relative=True, timeout=0.2), airborne

@@ -59,7 +59,7 @@ def _all(stage: Stage) -> Iterator[str]:
     )
     yield from _times("command that waits", vehicle._talk.commands._runs)
     yield from _times("order", vehicle._arbiter._orders[1:])
-    yield from _times("sending", vehicle._arbiter._sendings)
+    yield from _times("sending", vehicle._arbiter._sent)
     yield from _times("held parameter", vehicle.parameters._holds._blocks)
     closing = vehicle.files._channel._closing.values()
     yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])

@@ -9,11 +9,13 @@ import asyncio
 import os
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
 from call_stage import AUTOPILOTS, Stage, open_stage
 from call_table import CALLS
+from exhaustive import exhaustive
 from public_surface import CLASSES, awaited, own_classes_in
 from remains import look, what_is_left
 from suspensions import Cancelled, Point, cancel_at, points_of
@@ -21,8 +23,15 @@ from suspensions import Cancelled, Point, cancel_at, points_of
 from aerokit.testing import run_virtual
 
 POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "4"))
-"""At so many awaits of each call; 0: at all."""
+"""At so many awaits of each call; 0: at all. The default run has one, and few of them on PX4."""
 ENDS_S = 2.0
+BY_DEFAULT = {
+    *(
+        (owner, "ardupilot")
+        for owner in ("Vehicle", "Parameters", "MissionControl", "StateCell", "functions")
+    ),
+    *((owner, "px4") for owner in ("Guided", "Camera")),
+}
 
 
 def test_each_public_coroutine_is_in_the_table() -> None:
@@ -44,18 +53,26 @@ def groups() -> Iterator[tuple[str, list[str]]]:
         yield owner or "functions", [name for name in CALLS if name.rpartition(".")[0] == owner]
 
 
-@pytest.mark.parametrize("autopilot", AUTOPILOTS)
-@pytest.mark.parametrize("names", [pytest.param(names, id=owner) for owner, names in groups()])
-def test_cancelled_at_any_await(names: list[str], autopilot: str, tmp_path: Path) -> None:
+def rows() -> Iterator[Any]:
+    """Each group on each autopilot; a few of them by default."""
+    for owner, names in groups():
+        for autopilot in AUTOPILOTS:
+            row = pytest.param(names, autopilot, id=f"{owner}-{autopilot}")
+            yield row if (owner, autopilot) in BY_DEFAULT else exhaustive(row)
+
+
+@pytest.mark.parametrize("points", [2, exhaustive(POINTS)])
+@pytest.mark.parametrize(("names", "autopilot"), list(rows()))
+def test_cancelled_at_any_await(names: list[str], autopilot: str, points: int, tmp_path: Path) -> None:
     async def all_of_them() -> list[str]:
         async with open_stage(autopilot, tmp_path) as stage:
-            return [fault for name in names async for fault in faults_of(stage, name, autopilot)]
+            return [fault for name in names async for fault in faults_of(stage, name, autopilot, points)]
 
     faults = run_virtual(all_of_them())
     assert not faults, "\n".join(faults)
 
 
-async def faults_of(stage: Stage, name: str, autopilot: str) -> AsyncIterator[str]:
+async def faults_of(stage: Stage, name: str, autopilot: str, points: int) -> AsyncIterator[str]:
     if autopilot not in CALLS[name].on:
         return
     rehearsed = await run(stage, name, None)
@@ -64,7 +81,7 @@ async def faults_of(stage: Stage, name: str, autopilot: str) -> AsyncIterator[st
         return
     await what_is_left(stage, look(stage))
     await anyio.sleep(2.0)
-    for point in points_of(rehearsed.counted.waits, POINTS or None):
+    for point in points_of(rehearsed.counted.waits, points or None):
         fault = await fault_at(stage, name, point)
         if fault:
             yield f"{name} at {point} of {rehearsed.counted.count}: {fault}"

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
 from call_stage import Stage, open_stage
+from call_table import provocations
 from camera_calls import CAMERA
 from component_calls import COMPONENTS
 from documented_errors import NAMES, documented
+from exhaustive import exhaustive
 from provoked import Provocation
 from provoked_flight import FLIGHT
 from provoked_gimbals import GIMBALS
@@ -22,9 +25,10 @@ from aerokit import errors
 from aerokit.sim.faults import Faults
 from aerokit.testing import run_virtual
 
-PROVOCATIONS = FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
+PROVOCATIONS = provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
 PROMISED = documented()
 LONGEST_S = 200.0
+BY_DEFAULT = ("Vehicle", "Guided", "Parameters", "MissionControl", "Files", "Gimbal")
 
 
 def test_each_documented_error_is_provoked() -> None:
@@ -40,7 +44,13 @@ def groups() -> Iterator[tuple[str, list[tuple[str, str]]]]:
         )
 
 
-@pytest.mark.parametrize("pairs", [pytest.param(pairs, id=owner) for owner, pairs in groups()])
+def rows() -> Iterator[Any]:
+    for owner, pairs in groups():
+        row = pytest.param(pairs, id=owner)
+        yield row if owner in BY_DEFAULT else exhaustive(row)
+
+
+@pytest.mark.parametrize("pairs", list(rows()))
 def test_it_is_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
     faults = run_virtual(faults_of(pairs, tmp_path))
     assert not faults, "\n".join(faults)

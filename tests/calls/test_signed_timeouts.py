@@ -10,6 +10,7 @@ import anyio
 import pytest
 from call_stage import AUTOPILOTS, Stage, open_stage
 from call_table import CALLS
+from exhaustive import sampled
 from test_cancellation import groups
 
 from aerokit.connection.cells import StateCell
@@ -23,8 +24,17 @@ LONGEST_S = 400.0
 WHY = "frames are signed and no key was given"
 
 
-@pytest.mark.parametrize("autopilot", AUTOPILOTS)
-@pytest.mark.parametrize("names", [pytest.param(names, id=owner) for owner, names in groups()])
+@pytest.mark.parametrize(
+    ("names", "autopilot"),
+    sampled(
+        [
+            pytest.param(names, autopilot, id=f"{owner}-{autopilot}")
+            for owner, names in groups()
+            for autopilot in AUTOPILOTS
+        ],
+        7,
+    ),
+)
 def test_timeout_of_a_vehicle_that_signs_says_so(names: list[str], autopilot: str, tmp_path: Path) -> None:
     async def all_of_them() -> dict[str, str]:
         texts: dict[str, str] = {}

@@ -277,7 +277,7 @@ EXAMPLES = {
         print("Armed: %s" % vehicle.armed)
         vehicle.armed = False
         vehicle.armed = True
-        vehicle.wait_for(lambda: vehicle.armed, timeout=10)
+        vehicle.wait_for(lambda: vehicle.armed, timeout=100)
         print("Armed: %s" % vehicle.armed)
     """,
     "channels": """
@@ -307,7 +307,7 @@ EXAMPLES = {
         vehicle.mode = VehicleMode('LOITER')
         vehicle.mode = 'LOITER'
         vehicle.mode = 5
-        vehicle.wait_for(lambda: vehicle.mode == 'LOITER', timeout=10)
+        vehicle.wait_for(lambda: vehicle.mode == 'LOITER', timeout=100)
         print(vehicle.mode.name)
     """,
     "mode listener": """
@@ -315,12 +315,12 @@ EXAMPLES = {
             print("Vehicle Mode", self.mode)
         vehicle.add_attribute_listener('mode', mode_callback)
         vehicle.mode = VehicleMode("AUTO")
-        vehicle.wait_for(lambda: vehicle.mode.name == 'AUTO', timeout=10)
+        vehicle.wait_for(lambda: vehicle.mode.name == 'AUTO', timeout=100)
         settle()
     """,
     "goto": """
         vehicle.mode = VehicleMode("GUIDED")
-        vehicle.wait_for(lambda: vehicle.mode.name == 'GUIDED', timeout=10)
+        vehicle.wait_for(lambda: vehicle.mode.name == 'GUIDED', timeout=100)
         a_location = LocationGlobal(-34.364114, 149.166022, 30)
         vehicle.simple_goto(a_location)
     """,

@@ -149,7 +149,7 @@ def parameters_lost_on_the_way(stage: Stage) -> Any:
 
 @scenario(True)
 def parameters_are_told_when_complete(stage: Stage) -> Any:
-    return stage.vehicle.wait_ready("parameters", timeout=10) and len(stage.vehicle.parameters) == 3
+    return stage.vehicle.wait_ready("parameters", timeout=100) and len(stage.vehicle.parameters) == 3
 
 
 # ------------------------------------------------------------------------------------- missions

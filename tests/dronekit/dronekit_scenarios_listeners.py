@@ -208,7 +208,7 @@ def last_heartbeat(stage: Stage) -> Any:
             enough.set()
 
     stage.vehicle.add_attribute_listener("last_heartbeat", listener)
-    assert enough.wait(10)
+    assert enough.wait(100)
     return all(isinstance(age, float) and 0 <= age < 10 for age in [*ages, stage.vehicle.last_heartbeat])
 
 

@@ -62,7 +62,7 @@ def row_09_wait_for_mode(stage: Stage) -> Any:
     return (
         text[:39],
         sent,
-        caught(lambda: stage.vehicle.wait_for_mode("AUTO", timeout=5)),
+        caught(lambda: stage.vehicle.wait_for_mode("AUTO", timeout=50)),
         stage.vehicle.mode.name,
     )
 
@@ -95,8 +95,8 @@ def row_08_arm_refused(stage: Stage) -> Any:
 @scenario(("None", True, "None", False))
 def arm_and_disarm(stage: Stage) -> Any:
     vehicle = stage.vehicle
-    armed = caught(lambda: vehicle.arm(timeout=5)), vehicle.armed
-    return *armed, caught(lambda: vehicle.disarm(timeout=5)), vehicle.armed
+    armed = caught(lambda: vehicle.arm(timeout=50)), vehicle.armed
+    return *armed, caught(lambda: vehicle.disarm(timeout=50)), vehicle.armed
 
 
 # --------------------------------------------------------------------------------------- flying
@@ -219,9 +219,9 @@ def waiting(stage: Stage) -> Any:
     stage.tell("GLOBAL_POSITION_INT", lat=1, lon=1, alt=5000, relative_alt=3000)
     low = caught(lambda: vehicle.wait_for_alt(10, timeout=0.3))
     at_altitude = [
-        caught(lambda: vehicle.wait_for_alt(3, timeout=5)),
-        caught(lambda: vehicle.wait_for_alt(3.4, epsilon=0.5, timeout=5)),
-        caught(lambda: vehicle.wait_for_alt(5, rel=False, timeout=5)),
+        caught(lambda: vehicle.wait_for_alt(3, timeout=50)),
+        caught(lambda: vehicle.wait_for_alt(3.4, epsilon=0.5, timeout=50)),
+        caught(lambda: vehicle.wait_for_alt(5, rel=False, timeout=50)),
     ]
     return late, done, low, at_altitude
 
@@ -231,7 +231,7 @@ def wait_for_armable(stage: Stage) -> Any:
     text = caught(lambda: stage.vehicle.wait_for_armable(timeout=0.3))
     stage.fc.tell("GPS_RAW_INT", fix_type=3)
     stage.tell("EKF_STATUS_REPORT", flags=831)
-    stage.vehicle.wait_for_armable(timeout=5)
+    stage.vehicle.wait_for_armable(timeout=50)
     return text.split(":")[0]
 
 

@@ -31,7 +31,7 @@ __all__ = [
     "until",
 ]
 
-PATIENCE_S = 10.0
+PATIENCE_S = 100.0
 ALWAYS = ("PING", "HEARTBEAT", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ")
 """Goes on by itself, whatever the program does."""
 QUIET = 3
@@ -216,7 +216,7 @@ def plain(value: Any) -> str:
 
 def until(condition: Callable[[], object]) -> None:
     """Wait until something holds that nothing tells of."""
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 100
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -28,7 +28,7 @@ DO_SET_MODE, ARM_DISARM, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME = 176, 400, 
 SET_HOME = 179
 HOUSEKEEPING = (511, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME)
 """Commands that ask for information and change nothing: no scenario is about them, unless it says so."""
-PATIENCE_S = 10.0
+PATIENCE_S = 100.0
 UNHEARD_S = 0.005
 """Seconds between heartbeats until somebody answers: tests do not wait for a connection."""
 

@@ -27,7 +27,7 @@ __all__ = [
 
 HOME = Item(16, -35.363261, 149.16523, 584.0, 0)
 FIRST, SECOND, THIRD = (Item(16, -35.5 - n / 8, 149.25, 20.0 + n) for n in range(3))
-LIMIT_S = 10.0
+LIMIT_S = 100.0
 
 Pair = tuple[FlightController, CommandSequence]
 

@@ -249,7 +249,7 @@ def silence() -> dict[str, Any]:
             stage.assign("mode", "LOITER"),
             stage.assign("armed", True),
             lambda: vehicle.simple_takeoff(10),
-            lambda: vehicle.wait_for_armable(timeout=20),
+            lambda: vehicle.wait_for_armable(timeout=100),
             lambda: vehicle.parameters.set("FOO", 3),
             vehicle.reboot,
         )

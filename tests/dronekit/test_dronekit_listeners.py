@@ -15,7 +15,7 @@ from aerokit.dronekit import listener_thread
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.dronekit.observers import HasObservers
 
-LIMIT_S = 10.0
+LIMIT_S = 100.0
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ v20: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
 storm32: Any = import_module("pymavlink.dialects.v20.storm32")
 
 SYSTEM, COMPONENT = 255, 190
-LIMIT_S = 10.0
+LIMIT_S = 100.0
 
 
 class Sent(list[Any]):

@@ -1,4 +1,4 @@
-"""Orders given without waiting: the order on the wire, replacement, failures, the end."""
+"""BackgroundCalls given without waiting: the order on the wire, replacement, failures, the end."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from aerokit.dronekit.line import Orders
+from aerokit.dronekit.line import BackgroundCalls
 from aerokit.errors import ConnectionClosed
 from aerokit.sync.loop_thread import LoopThread
 
-LIMIT_S = 10.0
+LIMIT_S = 100.0
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def loop() -> Iterator[LoopThread]:
 
 
 def test_what_is_sent_keeps_the_order_of_the_calls(loop: LoopThread) -> None:
-    orders, sent = Orders(loop), []
+    orders, sent = BackgroundCalls(loop), []
 
     async def send_and_wait(name: str) -> None:
         sent.append(name)
@@ -42,7 +42,7 @@ def test_what_is_sent_keeps_the_order_of_the_calls(loop: LoopThread) -> None:
 
 
 def test_a_newer_order_of_a_kind_replaces_the_older_one(loop: LoopThread) -> None:
-    orders, ended = Orders(loop), []
+    orders, ended = BackgroundCalls(loop), []
 
     async def for_ever(name: str) -> None:
         try:
@@ -69,7 +69,7 @@ def test_a_failure_is_one_warning_and_in_the_future(
     async def fail() -> None:
         raise ValueError("the vehicle said no")
 
-    future = Orders(loop).give("arm", fail)
+    future = BackgroundCalls(loop).give("arm", fail)
     with pytest.raises(ValueError, match="said no"):
         future.result(LIMIT_S)
     assert [(each.name, each.levelname, each.message) for each in caplog.records] == [
@@ -81,7 +81,7 @@ def test_orders_end_with_the_loop(loop: LoopThread) -> None:
     async def for_ever() -> None:
         await asyncio.sleep(1000)
 
-    orders = Orders(loop)
+    orders = BackgroundCalls(loop)
     future = orders.give("mode", for_ever)
     loop.close()
     done, _ = concurrent.futures.wait([future], LIMIT_S)
@@ -98,7 +98,7 @@ def test_waiting_for_the_end_is_bounded(loop: LoopThread) -> None:
     async def for_ever() -> None:
         await asyncio.sleep(1000)
 
-    orders = Orders(loop)
+    orders = BackgroundCalls(loop)
     future = orders.give("mode", for_ever)
     orders.wait(0.01)
     assert not future.done()

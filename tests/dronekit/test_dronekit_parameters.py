@@ -21,7 +21,7 @@ from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
 from aerokit.vehicle.parameters.parameters import Parameters as AsyncParameters
 
-LIMIT_S = 10.0
+LIMIT_S = 100.0
 INT8, INT16 = 2, 4
 
 

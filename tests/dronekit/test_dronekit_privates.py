@@ -55,8 +55,8 @@ def test_the_link_is_watched(stage: Stage) -> None:
     assert vehicle._heartbeat_timeout is False
     assert vehicle._heartbeat_started is True
     assert vehicle._heartbeat_system == 1
-    assert 0 <= dronekit.time.monotonic() - vehicle._heartbeat_lastreceived < 5
-    assert 0 <= vehicle._last_heartbeat < 5
+    assert 0 <= dronekit.time.monotonic() - vehicle._heartbeat_lastreceived < 60
+    assert 0 <= vehicle._last_heartbeat < 60
 
 
 def test_transfers(stage: Stage) -> None:

@@ -14,6 +14,7 @@ from dronekit_reference import ATTRIBUTES, MODULE_NAMES, OTHER_NAMES, SIGNATURES
 from dronekit_scenarios_state import POSITION
 from dronekit_stage import Stage, caught, on_stage
 from dronekit_streams import READY, answer_streams
+from for_each import for_each
 
 import aerokit.dronekit as dronekit
 
@@ -29,7 +30,7 @@ def found(path: str) -> Any:
 def told() -> Iterator[Stage]:
     """A vehicle that has told everything; tests only read it."""
     with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as stage:
-        stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=10)
+        stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=100)
         stage.settle()
         yield stage
 
@@ -44,14 +45,12 @@ def stage() -> Iterator[Stage]:
 # ---------------------------------------------------------------------------------------- names
 
 
-@pytest.mark.parametrize("name", MODULE_NAMES)
+@for_each("name", MODULE_NAMES)
 def test_module_has(name: str) -> None:
     assert getattr(dronekit, name) is not None
 
 
-@pytest.mark.parametrize(
-    ("module", "name"), [(module, name) for module in OTHER_NAMES for name in OTHER_NAMES[module]]
-)
+@for_each("module, name", [(module, name) for module in OTHER_NAMES for name in OTHER_NAMES[module]])
 def test_other_modules_have(module: str, name: str) -> None:
     assert found(f"{module}.{name}") is not None
 
@@ -64,7 +63,7 @@ def test_star_import_gives_the_public_names() -> None:
         assert missing == []
 
 
-@pytest.mark.parametrize(("name", "base"), SUBCLASSES)
+@for_each("name, base", SUBCLASSES)
 def test_subclasses(name: str, base: str) -> None:
     assert issubclass(found(name), found(base))
 
@@ -89,7 +88,7 @@ def test_pymavlink_is_reexported() -> None:
 # ----------------------------------------------------------------------------------- signatures
 
 
-@pytest.mark.parametrize("path", SIGNATURES)
+@for_each("path", SIGNATURES)
 def test_signature(path: str) -> None:
     """Everybody's calls work: the same arguments in the same order, with the same defaults."""
     wanted = SIGNATURES[path]
@@ -129,9 +128,7 @@ def test_signature_of_wait_ready() -> None:
     inspect.signature(dronekit.CommandSequence.wait_ready).bind(None, **options)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name"), [(owner, name) for owner in ATTRIBUTES for name in ATTRIBUTES[owner].split()]
-)
+@for_each("owner, name", [(owner, name) for owner in ATTRIBUTES for name in ATTRIBUTES[owner].split()])
 def test_attribute(told: Stage, owner: str, name: str) -> None:
     vehicle = told.vehicle
     objects = {

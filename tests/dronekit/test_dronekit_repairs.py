@@ -129,7 +129,7 @@ def test_play_tune_of_a_vehicle_that_has_no_such_message() -> None:
 
 def test_old_firmware_is_told_its_mode_by_the_old_message(copter: Stage) -> None:
     copter.fc.results[176] = 3
-    copter.vehicle.wait_for_mode("LOITER", timeout=20)
+    copter.vehicle.wait_for_mode("LOITER", timeout=100)
     old = copter.fc.wait_for("SET_MODE")
     assert (old.target[0], old.base_mode & 1, old.custom_mode) == (1, 1, 5)
     assert copter.vehicle.mode == "LOITER"
@@ -249,7 +249,7 @@ def test_initializing_later() -> None:
         fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
         vehicle = dronekit.connect(fc.address, _initialize=False)
         assert (vehicle.armed, vehicle.is_armable, vehicle.system_status) == (False, False, None)
-        vehicle.initialize(rate=7, heartbeat_timeout=10)
+        vehicle.initialize(rate=7, heartbeat_timeout=100)
         assert vehicle.mode.name == "LOITER"
         assert fc.wait_for("REQUEST_DATA_STREAM").req_message_rate == 7
         vehicle.close()
@@ -290,7 +290,7 @@ def test_closing_from_a_listener() -> None:
 
         stage.vehicle.add_attribute_listener("heading", close)
         stage.fc.tell("VFR_HUD", heading=271)
-        assert closed.wait(10)
+        assert closed.wait(100)
         with pytest.raises(dronekit.APIException):
             stage.vehicle.mode = "RTL"
 
@@ -303,11 +303,11 @@ def test_a_listener_that_blocks_stops_neither_reception_nor_heartbeat(copter: St
 
     def block(*_: Any) -> None:
         blocks.set()
-        assert go_on.wait(20)
+        assert go_on.wait(100)
 
     copter.vehicle.add_attribute_listener("heading", block)
     copter.fc.tell("VFR_HUD", heading=271)
-    assert blocks.wait(10)
+    assert blocks.wait(100)
     since = copter.fc.mark()
     copter.fc.tell("VFR_HUD", heading=5)
     until(lambda: copter.vehicle.heading == 5)
@@ -322,10 +322,10 @@ def test_listeners_may_call_whatever_blocks(copter: Stage) -> None:
     def use(vehicle: Any, name: str, value: Any) -> None:
         seen.append(vehicle.parameters["FOO"])
         seen.append(vehicle.parameters.set("FOO", 5))
-        vehicle.wait_for_mode("LOITER", timeout=10)
+        vehicle.wait_for_mode("LOITER", timeout=100)
         seen.append(vehicle.mode.name)
-        seen.append(vehicle.wait_ready("mode", timeout=10))
-        vehicle.arm(timeout=10)
+        seen.append(vehicle.wait_ready("mode", timeout=100))
+        vehicle.arm(timeout=100)
         seen.append(vehicle.armed)
 
     copter.vehicle.add_attribute_listener("heading", use)

@@ -48,7 +48,7 @@ def fuzz_waypoints(data: bytes) -> None:
     try:
         mission = parse_waypoints(data.decode(errors="surrogateescape"))
         text = format_waypoints(mission)
-    except InvalidArgument:
+    except (FileFormatError, InvalidArgument):
         return
     again = parse_waypoints(text)
     assert len(again.items) == len(mission.items)

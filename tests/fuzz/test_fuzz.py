@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from exhaustive import exhaustive
+from for_each import for_each
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from targets import TARGETS
@@ -14,7 +16,6 @@ from targets import TARGETS
 HERE = Path(__file__).parent
 CORPUS = HERE / "corpus"
 KNOWN = {name: [path.read_bytes() for path in sorted((CORPUS / name).iterdir())] for name in TARGETS}
-EXAMPLES = 40
 
 edits = st.tuples(st.floats(0, 1), st.integers(0, 4), st.binary(max_size=4))
 """Where, how many bytes are cut out there, and what is put in."""
@@ -27,20 +28,19 @@ def edited(data: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
     return data
 
 
-@pytest.mark.parametrize(
-    "path", sorted(CORPUS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}"
-)
+@for_each("path", sorted(CORPUS.glob("*/*")))
 def test_known_inputs(path: Path) -> None:
     TARGETS[path.parent.name](path.read_bytes())
 
 
+@pytest.mark.parametrize("examples", [8, exhaustive(40)])
 @pytest.mark.parametrize("name", TARGETS)
-def test_other_inputs(name: str) -> None:
+def test_other_inputs(name: str, examples: int) -> None:
     inputs = st.builds(edited, st.sampled_from(KNOWN[name]), st.lists(edits, max_size=6)) | st.binary(
         max_size=300
     )
 
-    @settings(max_examples=EXAMPLES, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
     @given(inputs)
     def fuzz(data: bytes) -> None:
         TARGETS[name](data)
@@ -52,6 +52,7 @@ def test_each_folder_of_the_corpus_is_of_a_target() -> None:
     assert {path.name for path in CORPUS.iterdir()} == set(TARGETS)
 
 
+@pytest.mark.exhaustive
 def test_the_command_line_finds_what_is_wrong(tmp_path: Path) -> None:
     command = [sys.executable, str(HERE / "fuzz.py"), "--plain", "--runs", "20", "address", "waypoints"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)

@@ -122,6 +122,6 @@ async def settle() -> None:
 
 async def until(condition: Callable[[], object]) -> None:
     """Let the loop turn, on real sockets, until it holds."""
-    with anyio.fail_after(10.0):
+    with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await anyio.sleep(0.005)

@@ -173,7 +173,7 @@ async def test_a_reader_hears_whole_frames() -> None:
                 if number % 50 == 0:  # a socket of this machine keeps some hundred datagrams at most
                     await until(lambda: of(hub, "in").frames_in == number)  # noqa: B023
             frames = 0
-            with anyio.fail_after(10):
+            with anyio.fail_after(100):
                 while frames < 300:
                     frames += len(framer.receive(await reader.read(100)))
         assert framer.statistics.bad_bytes == 0

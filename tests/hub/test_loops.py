@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from exhaustive import sampled
 from hub_stage import STATION, Program
 from hypothesis import given, settings
 from test_routing import COPTER, Network, Stage, networks, order
@@ -18,7 +19,7 @@ from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
 from aerokit.transport import memory_link_pair
 
-SLOW_S = [0.05, 0.9, 1.2, 1.6, 5.0, 20.0]
+SLOW_S = sampled([0.05, 0.9, 1.2, 1.6, 5.0, 20.0], 3)
 
 
 def circle(latency_s: float, near: Endpoint, far: Endpoint) -> tuple[Hub, Hub]:

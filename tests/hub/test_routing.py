@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.hub.routing import MOST_PLANS, MOST_SENDERS, Node, Router
-from aerokit.hub.senders import DUPLICATE_WINDOW_S, MOST_RECENT, MOVES_AFTER_S
+from aerokit.connection.routes import MOST_ROUTES, MOVES_AFTER_S
+from aerokit.hub.routing import MOST_PLANS, Node, Router
+from aerokit.hub.senders import DUPLICATE_WINDOW_S, MOST_RECENT
 from aerokit.hub.targets import Targets
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
@@ -215,12 +216,12 @@ def test_a_vehicle_is_told_once_for_each_port(stage: Stage) -> None:
 
 def test_who_floods_the_tables_harms_nobody(stage: Stage) -> None:
     stage.hear("a", COPTER)
-    for number in range(3 * MOST_SENDERS):
+    for number in range(3 * MOST_ROUTES):
         stage.now += 0.001
         stage.hear("b", Statustext(6, "x"), 2 + number % 250, number // 250)
         if number % 100 == 0:
             stage.hear("a", COPTER)
-    assert len(stage.router._senders) <= MOST_SENDERS
+    assert len(stage.router._senders) <= MOST_ROUTES
     assert stage.hear("c", order(1), 255, 190) == {"a"}
     for target in range(1, 256):
         for component in range(40):

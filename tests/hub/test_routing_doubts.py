@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from test_routing import CAMERA, COPTER, STATION, Stage, order
 
-from aerokit.hub.routing import MOST_SENDERS
-from aerokit.hub.senders import MOVES_AFTER_S, REPEATED_WITHIN_S
+from aerokit.connection.routes import MOST_ROUTES, MOVES_AFTER_S
+from aerokit.hub.senders import REPEATED_WITHIN_S
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
 
@@ -85,7 +85,7 @@ def test_names_that_are_made_up_do_not_push_out_a_gimbal() -> None:
     stage.hear("a", Heartbeat(26, 8, 0, 0, 3), 77, 154)
     stage.hear("c", STATION, 255, 190)
     stage.now += 0.1
-    for number in range(MOST_SENDERS + 100):
+    for number in range(MOST_ROUTES + 100):
         stage.hear("b", Attitude(0, 0, 0, 0, 0, 0, 0), 2 + number % 240, 1 + number // 240)
     assert stage.hear("c", order(77, 154), 255, 190) == {"a"}
 

@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
+from exhaustive import exhaustive
 from hub_stage import COPTER, STATION, Program, settle
 from served_copter import served_copter
 
@@ -100,7 +101,7 @@ def lossy(link: Link) -> FaultyLink:
 
 
 @pytest.mark.parametrize("way", [through_a_hub, through_a_program], ids=["hub", "share"])
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@pytest.mark.parametrize("kind", ["ardupilot", exhaustive("px4")])
 def test_transfers_pass_in_both_directions_at_once(way: Any, kind: str) -> None:
     vehicle, path = make(kind)
 

@@ -7,16 +7,20 @@ from typing import Any
 
 import pytest
 from any_vehicle import Choice
+from exhaustive import exhaustive
 from vehicle_kinds import KINDS
 
+DEFAULT_KINDS = ("copter", "px4")
+"""The other simulated ones are exhaustive, unless one of them is asked for."""
 LOOPS = [
     pytest.param(("asyncio", {}), id="asyncio"),
     pytest.param(
         ("asyncio", {"use_uvloop": True}),
         id="uvloop",
-        marks=pytest.mark.skipif(
-            importlib.util.find_spec("uvloop") is None, reason="uvloop is not installed"
-        ),
+        marks=[
+            pytest.mark.exhaustive,  # tests/links has every kind of link on uvloop
+            pytest.mark.skipif(importlib.util.find_spec("uvloop") is None, reason="uvloop is not installed"),
+        ],
     ),
 ]
 
@@ -42,7 +46,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "choice" in metafunc.fixturenames:
         choices = Choice.from_options(metafunc.config)
-        metafunc.parametrize("choice", choices, ids=[choice.kind.name for choice in choices])
+        rows = [pytest.param(choice, id=choice.kind.name) for choice in choices]
+        few = len(rows) == 1
+        metafunc.parametrize(
+            "choice", [row if few or row.id in DEFAULT_KINDS else exhaustive(row) for row in rows]
+        )
 
 
 @pytest.fixture(params=LOOPS)

@@ -1,6 +1,6 @@
 """What copters do on a bad day: lost answers, an outage with a failsafe, another station, a reboot in flight.
 
-The same as `tests/orders` holds simulated vehicles to, on any vehicle; see `test_any_vehicle`.
+The same as `tests/vehicle/commanding/orders` holds simulated vehicles to, on any vehicle; see `test_any_vehicle`.
 """
 
 from __future__ import annotations
@@ -146,7 +146,9 @@ async def test_a_failsafe_during_an_outage_keeps_the_vehicle(choice: Choice) -> 
 async def test_blocked_program_leaves_the_failsafe_alone(choice: Choice) -> None:
     """For 14 s, of which the vehicle's HEARTBEATs wait in the socket; the call is cancelled when it goes on."""
     if not choice.is_binary:
-        pytest.skip("a simulated vehicle would be blocked, too: tests/orders/test_paused_program.py")
+        pytest.skip(
+            "a simulated vehicle would be blocked, too: tests/vehicle/commanding/orders/test_paused_program.py"
+        )
     async with flying(choice, through_air=False) as (vehicle, _):
         orders: list[int] = []
         vehicle.connection.tap_sent(lambda raw: orders.append(command_in(raw)))

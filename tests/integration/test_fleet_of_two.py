@@ -93,13 +93,14 @@ async def two_vehicles() -> AsyncIterator[list[str]]:
         yield addresses
 
 
+@pytest.mark.exhaustive
 async def test_they_take_off_together_go_and_land_together() -> None:
     port = free_port()
     place = f"tcp/127.0.0.1:{port}"
     async with two_vehicles() as addresses:
         hub = [sys.executable, "-m", "aerokit", "hub", *addresses, f"zenohin://field/two?listen={place}"]
         with running(*hub, env={**os.environ}):
-            with anyio.fail_after(60):
+            with anyio.fail_after(100):
                 while not is_listening(port):  # noqa: ASYNC110
                     await anyio.sleep(0.05)
             await fly(f"zenoh://field/two?connect={place}&client=program&timeout=60")
@@ -122,6 +123,6 @@ async def fly(address: str) -> None:
         for name, vehicle in fleet.vehicles.items():
             assert vehicle.distance_to(starts[name]) > 25
         (await fleet.land(timeout=180)).raise_for_errors()
-        with anyio.fail_after(60):
+        with anyio.fail_after(100):
             while any(vehicle.is_armed for vehicle in fleet.vehicles.values()):  # noqa: ASYNC110
                 await anyio.sleep(0.2)

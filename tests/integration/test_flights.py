@@ -67,16 +67,16 @@ async def served(kind: str) -> AsyncIterator[str]:
 
 @pytest.mark.parametrize("kind", ["udp", "udp6", "tcp", "tcp6", "serial"])
 async def test_a_flight(kind: str) -> None:
-    async with served(kind) as address, connect(address, timeout=10) as vehicle:
-        await vehicle.wait_ready(timeout=20)
+    async with served(kind) as address, connect(address, timeout=100) as vehicle:
+        await vehicle.wait_ready(timeout=100)
         await vehicle.arm()
-        await vehicle.take_off(5, timeout=20)
+        await vehicle.take_off(5, timeout=100)
         here = vehicle.position.value
-        await vehicle.go_to(here.offset(north_m=10).replace(altitude_amsl_m=None), timeout=20)
-        async with vehicle.guided.velocity() as stream:
+        await vehicle.go_to(here.offset(north_m=10).replace(altitude_amsl_m=None), timeout=100)
+        async with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
             await stream.fly(VelocitySetpoint(east_m_s=1), 0.3)
         assert vehicle.mode_name == "BRAKE"
-        await vehicle.land(timeout=20)
+        await vehicle.land(timeout=100)
         assert here.distance_to(vehicle.position.fresh(within=5)) > 8
 
 
@@ -88,8 +88,8 @@ async def test_a_vehicle_that_calls_us() -> None:
     copter = SimulatedCopter(boot_time_s=0)
     async with (
         open_simulator(copter, f"udpout:127.0.0.1:{port}", speedup=SPEEDUP),
-        connect(f"127.0.0.1:{port}", timeout=10) as vehicle,
+        connect(f"127.0.0.1:{port}", timeout=100) as vehicle,
     ):
-        await vehicle.wait_ready(timeout=10)
+        await vehicle.wait_ready(timeout=100)
         await vehicle.arm()
         assert vehicle.is_armed

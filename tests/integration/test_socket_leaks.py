@@ -64,7 +64,7 @@ async def open_pseudo_terminal(copter: SimulatedCopter) -> AsyncIterator[str]:
 
 def session(kind: str) -> Callable[[], Awaitable[None]]:
     async def run() -> None:
-        async with served(kind) as address, connect(address, timeout=20, rates={}) as vehicle:
+        async with served(kind) as address, connect(address, timeout=100, rates={}) as vehicle:
             await vehicle.mode.wait_until(lambda _: True)
 
     return run

@@ -7,6 +7,7 @@ from enum import IntFlag
 from typing import Any
 
 import pytest
+from for_each import for_each
 
 from aerokit import enums
 from aerokit.mavlink import enumeration
@@ -15,7 +16,7 @@ from aerokit.mavlink.enumeration import make_enum
 NAMES = [name for name in dir(enums) if isinstance(getattr(enums, name), type)]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@for_each("name", NAMES)
 def test_both_ways_make_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     quick: Any = getattr(enums, name)
     members = [(each, int(value)) for each, value in quick.__members__.items()]

@@ -7,6 +7,7 @@ import math
 import pickle
 
 import pytest
+from for_each import for_each
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_samples import samples
@@ -15,7 +16,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink import STANDARD, Field, FrameEncoder, Framer, Message, messages
 from aerokit.mavlink.message import INTEGER_RANGES
 
-EVERY = [pytest.param(message_class, id=message_class.NAME) for message_class in STANDARD]
+EVERY = list(STANDARD)
 ATTITUDE = messages.Attitude(1000, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75)
 
 
@@ -24,7 +25,7 @@ def received(message: Message) -> Message:
     return STANDARD.decode(frame)
 
 
-@pytest.mark.parametrize("message_class", EVERY)
+@for_each("message_class", EVERY)
 def test_what_every_class_says(message_class: type[Message]) -> None:
     names = tuple(field.name for field in message_class.FIELDS)
     assert vars(message_class)["__match_args__"] == names
@@ -42,7 +43,7 @@ def test_what_every_class_says(message_class: type[Message]) -> None:
     )
 
 
-@pytest.mark.parametrize("message_class", EVERY)
+@for_each("message_class", EVERY)
 def test_copies_are_equal(message_class: type[Message]) -> None:
     *_, message = samples(message_class, 3)
     for again in (copy.copy(message), copy.deepcopy(message), pickle.loads(pickle.dumps(message))):

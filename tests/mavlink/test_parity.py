@@ -6,15 +6,14 @@ from typing import Any
 
 import pytest
 from added_peer import NAMED
+from for_each import for_each
 from wire_samples import PEERS, dialect_module, peer_class, peer_fields, peer_message, same, samples
 
 from aerokit.mavlink import STANDARD, FrameEncoder, Framer, Message
 from aerokit.mavlink.frame import MAGIC_V1
 
-EVERY = [pytest.param(message_class, id=message_class.NAME) for message_class in STANDARD]
-SMALL = [
-    pytest.param(message_class, id=message_class.NAME) for message_class in STANDARD if message_class.ID < 256
-]
+EVERY = list(STANDARD)
+SMALL = [message_class for message_class in STANDARD if message_class.ID < 256]
 SYSTEM, COMPONENT = 7, 42
 
 
@@ -57,17 +56,17 @@ def check(message_class: type[Message], version: int) -> None:
             assert decoded == message
 
 
-@pytest.mark.parametrize("message_class", EVERY)
+@for_each("message_class", EVERY)
 def test_version_2(message_class: type[Message]) -> None:
     check(message_class, 2)
 
 
-@pytest.mark.parametrize("message_class", SMALL)
+@for_each("message_class", SMALL)
 def test_version_1(message_class: type[Message]) -> None:
     check(message_class, 1)
 
 
-@pytest.mark.parametrize("message_class", SMALL)
+@for_each("message_class", SMALL)
 def test_version_1_has_no_extensions(message_class: type[Message]) -> None:
     for message in samples(message_class, 3):
         raw = our_bytes(message, 1, 0)

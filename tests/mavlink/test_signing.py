@@ -238,3 +238,12 @@ def test_a_trimmed_payload_is_signed_as_it_is_on_the_wire() -> None:
     frame = framed(encoder.encode(ParamValue("", 0.0, 0, 0, 0)))
     assert len(frame.payload) == 1
     assert Signing(KEY).accepts(frame)
+
+
+def test_streams_that_are_remembered_are_bounded() -> None:
+    """Whoever has the key may make up senders; the table of them does not grow beyond 1024."""
+    listener = Signing(KEY)
+    for number in range(1100):
+        sender = Signing(KEY, timestamp=100 + number, link_id=number // 250)
+        assert listener.accepts(framed(signed(sender, system_id=1 + number % 250)))
+    assert len(listener.streams) == 1024

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
+from for_each import for_each
 
 from aerokit import missions
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import MissionItem, RallyPoints
 from aerokit.missions.check import check_item
+from aerokit.position import Position
 
 PLACE = (47.3977419, 8.545594)
 XY = {"x": 473977419, "y": 85455940}
@@ -100,7 +103,7 @@ CASES: list[tuple[MissionItem, MissionItem]] = [
 ]
 
 
-@pytest.mark.parametrize(("built", "expected"), CASES, ids=lambda item: item.name)
+@for_each("built, expected", CASES)
 def test_what_builders_make(built: MissionItem, expected: MissionItem) -> None:
     assert built == expected
     check_item(built, "item", 2 if built.command == MavCmd.NAV_RALLY_POINT else 0)
@@ -112,6 +115,39 @@ def test_the_position_given_is_the_position_read() -> None:
     assert (position.latitude_deg, position.longitude_deg) == (-33.8567844, 151.2152967)
 
 
+POSITION = Position(*PLACE, altitude_amsl_m=518, altitude_relative_m=30)
+AT_POSITION: list[tuple[Any, tuple[float, ...]]] = [
+    (missions.waypoint, ()),
+    (missions.spline_waypoint, ()),
+    (missions.take_off, ()),
+    (missions.vtol_take_off, ()),
+    (missions.loiter_unlimited, ()),
+    (missions.loiter_time, (5,)),
+    (missions.loiter_turns, (2,)),
+    (missions.loiter_to_altitude, ()),
+    (missions.rally_point, ()),
+    (missions.region_of_interest, ()),
+]
+
+
+@pytest.mark.parametrize(("build", "first"), AT_POSITION)
+def test_builders_take_a_position_as_well_as_numbers(build: Any, first: tuple[float, ...]) -> None:
+    assert build(*first, POSITION) == build(*first, *PLACE, altitude_relative_m=30)
+    assert build(*first, Position(*PLACE, altitude_amsl_m=518)) == build(*first, *PLACE, altitude_amsl_m=518)
+    assert build(*first, POSITION, altitude_terrain_m=7) == build(*first, *PLACE, altitude_terrain_m=7)
+
+
+@pytest.mark.parametrize("build", [missions.land, missions.vtol_land])
+def test_landing_at_a_position_ignores_its_altitude(build: Any) -> None:
+    assert build(POSITION) == build(*PLACE)
+    assert build(POSITION, altitude_amsl_m=488) == build(*PLACE, altitude_amsl_m=488)
+
+
+@pytest.mark.parametrize("build", [missions.take_off, missions.vtol_take_off, missions.loiter_to_altitude])
+def test_a_number_alone_is_the_altitude_above_home(build: Any) -> None:
+    assert build(10) == build(altitude_relative_m=10)
+
+
 WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.waypoint(91, 8, altitude_relative_m=30), "latitude_deg = 91 is not allowed: -90 to 90"),
     (
@@ -119,7 +155,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
         "longitude_deg = 181 is not allowed: -180 to 180",
     ),
     (lambda: missions.waypoint(NAN, 8, altitude_relative_m=30), "latitude_deg = nan"),
-    (lambda: missions.waypoint("47", 8, altitude_relative_m=30), "latitude_deg = '47'"),  # type: ignore[arg-type]
+    (lambda: missions.waypoint("47", 8, altitude_relative_m=30), "latitude_deg = '47'"),  # type: ignore[call-overload]
     (lambda: missions.waypoint(47, 8), "exactly one of altitude_relative_m .* not none"),
     (
         lambda: missions.waypoint(47, 8, altitude_relative_m=3, altitude_terrain_m=3),
@@ -133,6 +169,14 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.waypoint(47, 8, altitude_relative_m=3, hold_s=-1), "hold_s = -1"),
     (lambda: missions.waypoint(47, 8, altitude_relative_m=3, yaw_deg=400), "yaw_deg = 400"),
     (lambda: missions.take_off(47, altitude_relative_m=3), "latitude_deg and longitude_deg: give both"),
+    (lambda: missions.waypoint(POSITION, altitude_amsl_m=3, altitude_relative_m=3), "exactly one of"),
+    (lambda: missions.waypoint(Position(*PLACE)), "exactly one of .* not none"),
+    (lambda: missions.waypoint(POSITION, 8.5), "longitude_deg = 8.5 .* beside a Position"),  # type: ignore[call-overload]
+    (lambda: missions.waypoint(47.0, altitude_amsl_m=3), "give both, or a Position"),  # type: ignore[call-overload]
+    (lambda: missions.waypoint(None, altitude_amsl_m=3), "give both, or a Position"),  # type: ignore[call-overload]
+    (lambda: missions.take_off(True), "altitude_relative_m = True"),
+    (lambda: missions.take_off(10, altitude_amsl_m=3), "give both or none of them"),
+    (lambda: missions.land(10), "give both or none of them"),
     (lambda: missions.take_off(altitude_relative_m=3, pitch_deg=91), "pitch_deg = 91"),
     (lambda: missions.loiter_turns(256, altitude_relative_m=3), "turns = 256 .* 0 to 255"),
     (lambda: missions.loiter_time(math.inf, altitude_relative_m=3), "duration_s = inf"),

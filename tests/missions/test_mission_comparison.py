@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 
 import pytest
+from for_each import for_each
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,7 +86,7 @@ ARDUPILOT = [  # sent, and what ArduPilot 4.7 gives back
 ]
 
 
-@pytest.mark.parametrize(("sent", "changes"), ARDUPILOT, ids=lambda value: getattr(value, "name", ""))
+@for_each("sent, changes", ARDUPILOT)
 def test_what_ardupilot_changes_is_no_difference(sent: MissionItem, changes: dict[str, object]) -> None:
     received = back(sent, **changes)
     assert item_differences(sent, received, Storage.ARDUPILOT) == ()
@@ -108,7 +110,7 @@ PX4 = [
 ]
 
 
-@pytest.mark.parametrize(("sent", "changes"), PX4, ids=lambda value: getattr(value, "name", ""))
+@for_each("sent, changes", PX4)
 def test_what_px4_changes_is_no_difference(sent: MissionItem, changes: dict[str, object]) -> None:
     received = back(sent, **changes)
     assert item_differences(sent, received, Storage.PX4) == ()
@@ -139,8 +141,7 @@ def test_real_differences_are_told(changes: dict[str, object], text: str, storag
     assert text in difference
 
 
-@pytest.mark.parametrize("sent", [item for item, _ in ARDUPILOT + PX4], ids=lambda item: item.name)
-@pytest.mark.parametrize("storage", list(Storage))
+@for_each("sent, storage", list(itertools.product([item for item, _ in ARDUPILOT + PX4], list(Storage))))
 def test_an_item_is_as_itself(sent: MissionItem, storage: Storage) -> None:
     assert item_differences(sent, sent, storage) == ()
     assert item_differences(sent, back(sent), storage) == ()

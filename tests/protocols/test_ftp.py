@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from for_each import for_each
 from ftp_server import as_message, make_client, reply_to, requests_in
 from hypothesis import given
 from hypothesis import strategies as st
@@ -145,7 +146,7 @@ def test_numbers_of_errors_are_those_of_the_systems() -> None:
     assert {(name, number) for number, (name, _) in ERRNOS.items()} == {*NEWLIB.items(), *LINUX.items()}
 
 
-@pytest.mark.parametrize(("name", "number"), [*NEWLIB.items(), *LINUX.items()])
+@for_each("name, number", [*NEWLIB.items(), *LINUX.items()])
 def test_every_number_of_an_error_is_told_by_its_name(name: str, number: int) -> None:
     error = file_error(MavFtpOpcode.REMOVEFILE, "/a", MavFtpErr.FAILERRNO, number)
     assert str(error) == f"remove /a: {ERRNOS[number][1]} (FAILERRNO, {name})"

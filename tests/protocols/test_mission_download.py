@@ -15,8 +15,10 @@ from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire, to_wire_float
 from aerokit.protocols.exchange import Progress, RoundTrip
-from aerokit.protocols.mission_download import MAX_RESTARTS, MissionDownload
+from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.missions import MissionClear, MissionSetCurrent
+
+MAX_RESTARTS = 8
 
 HELD = items(50)
 WINDOWS: list[tuple[type[Store], int]] = [(ArduPilotModel, 10), (ArduPilotModel, 1), (Px4Model, 1)]

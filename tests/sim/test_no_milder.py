@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 
 import pytest
+from for_each import for_each
 from simulated_client import Client, flying_copter, ready_copter
 
 from aerokit.mavlink import messages as m
@@ -41,9 +43,11 @@ def flying_px4() -> tuple[SimulatedPx4, Client]:
 
 # ------------------------------------------------------------------------------------------------ PX4
 
+COMMANDS = (MavCmd.DO_REPOSITION, ARM, MavCmd.DO_SET_HOME, 31999)
+OTHER_FRAMES = [frame for frame in MavFrame if frame != MavFrame.GLOBAL_INT]
 
-@pytest.mark.parametrize("frame", [each for each in MavFrame if each != MavFrame.GLOBAL_INT])
-@pytest.mark.parametrize("command", [MavCmd.DO_REPOSITION, ARM, MavCmd.DO_SET_HOME, 31999])
+
+@for_each("command, frame", list(itertools.product(COMMANDS, OTHER_FRAMES)))
 def test_px4_command_int_in_another_frame_than_global_int_is_refused(command: int, frame: int) -> None:
     px4, client = ready_px4()
     assert client.command_int(command, frame, 1, 1) == MavResult.COMMAND_UNSUPPORTED_MAV_FRAME

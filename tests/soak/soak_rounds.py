@@ -22,7 +22,7 @@ __all__ = ["Left", "fly_round", "left"]
 
 SPEEDUP = 8.0
 """Faster, a busy machine starves the simulated vehicles rather than the library."""
-LIMIT_S = 60.0
+LIMIT_S = 200.0
 
 
 @dataclass(frozen=True)

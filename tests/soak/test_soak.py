@@ -21,6 +21,7 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
+@pytest.mark.exhaustive
 async def test_nothing_grows(capsys: pytest.CaptureFixture[str]) -> None:
     begin: Left | None = None
     end, count, until = None, 0, time.monotonic() + 60 * MINUTES

@@ -25,7 +25,7 @@ from aerokit.testing.failure import what_was_flown
 from aerokit.testing.interruption import Interruption
 from aerokit.testing.served import ServedFlight
 
-LIMIT_S = 30.0
+LIMIT_S = 100.0
 
 
 class Mistake(Exception):

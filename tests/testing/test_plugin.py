@@ -7,6 +7,7 @@ import sys
 from importlib.machinery import SourceFileLoader
 
 import pytest
+from exhaustive import exhaustive
 
 import aerokit.errors
 
@@ -56,7 +57,7 @@ def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunRe
     )
 
 
-@pytest.mark.parametrize("kind", ["copter", "px4"])
+@pytest.mark.parametrize("kind", ["copter", exhaustive("px4")])
 def test_flights_need_no_async_plugin(pytester: pytest.Pytester, kind: str) -> None:
     run(pytester, ASYNC.format(kind=kind), "-p", "no:anyio").assert_outcomes(passed=2)
 
@@ -328,6 +329,7 @@ def test_importing_it_is_cheap() -> None:
     own = {name for name in done.stdout.split() if name.startswith("aerokit")}
     assert own == {
         "aerokit",
+        "aerokit._internal",
         "aerokit._internal.imports",
         "aerokit.testing",
         "aerokit.testing.plugin",

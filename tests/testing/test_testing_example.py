@@ -12,6 +12,7 @@ pytest_plugins = ["pytester"]
 PROJECT = Path(__file__).parent.parent.parent / "examples" / "testing_a_mission"
 
 
+@pytest.mark.exhaustive
 def test_the_example_passes(pytester: pytest.Pytester) -> None:
     for file in PROJECT.glob("*.py"):
         shutil.copy(file, pytester.path)

@@ -228,7 +228,7 @@ def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
 
 def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
     from aerokit.dronekit.sitl import parse_home, serve_for_program
-    from aerokit.sim.place import HOME
+    from aerokit.sim.local_frame import HOME
 
     if not 0.1 <= options.speedup <= 100:
         raise InvalidArgument(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.util import errprinter
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.sim.kinds import simulated
-from aerokit.sim.patience import wait_longer
-from aerokit.sim.place import HOME
+from aerokit.sim.kinds import simulated, wait_longer
+from aerokit.sim.local_frame import HOME
 from aerokit.sim.server import open_simulator
 
 if TYPE_CHECKING:

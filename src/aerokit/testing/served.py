@@ -6,8 +6,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.sim.kinds import simulated
-from aerokit.sim.patience import wait_longer
+from aerokit.sim.kinds import simulated, wait_longer
 from aerokit.sim.server import SimulatorServer, open_simulator
 from aerokit.testing.faults import FaultInjector
 from aerokit.testing.interruption import Interruption

@@ -101,7 +101,7 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
         yield options.connect
         return
     from aerokit.sim import open_simulator
-    from aerokit.sim.patience import wait_longer
+    from aerokit.sim.kinds import wait_longer
 
     vehicle = simulated_vehicle(options.vehicle)
     wait_longer([vehicle], options.speedup)

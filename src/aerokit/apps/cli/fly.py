@@ -250,8 +250,8 @@ async def _simulated(options: argparse.Namespace, plan: Plan, stack: AsyncExitSt
     """A vehicle of the kind that the plan was made for, where it begins."""
     from aerokit.apps.cli.sim import simulated_vehicle
     from aerokit.sim import simulated_link
-    from aerokit.sim.patience import wait_longer
-    from aerokit.sim.place import HOME
+    from aerokit.sim.kinds import wait_longer
+    from aerokit.sim.local_frame import HOME
 
     kind = options.vehicle or _kind_for(plan)
     places = [plan.mission.home, *(item.position for item in plan.mission.items)]

@@ -27,8 +27,8 @@ from aerokit.apps.cli.output import add_json, tell
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.apps.cli.vehicle_command import add_signing_key
 from aerokit.sim import SimulatedVehicle, SimulatorServer, Wind
-from aerokit.sim.patience import wait_longer
-from aerokit.sim.place import HOME
+from aerokit.sim.kinds import wait_longer
+from aerokit.sim.local_frame import HOME
 from aerokit.transport import create_link
 from aerokit.transport.address import parse_address
 
@@ -73,8 +73,7 @@ def simulated_fleet(
     The name of a .tlog file gives the one vehicle of that recording, to which nothing else applies.
     """
     from aerokit.errors import InvalidArgument
-    from aerokit.sim.local_frame import GlobalPoint, LocalFrame
-    from aerokit.sim.place import HOME
+    from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
 
     if name.endswith(".tlog"):
         return [_recorded(name, count)]

@@ -1,0 +1,274 @@
+"""The command line: what it prints, how it ends, and that it brings the vehicle down whatever happens."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from exhaustive import exhaustive
+from served_copter import served, served_copter
+
+import aerokit
+import aerokit.sync
+from aerokit.apps.cli import main
+from aerokit.mavlink.tlog import read_tlog
+from aerokit.sim import SimulatedCopter
+
+posix_only = pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
+
+
+@contextmanager
+def program(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """``aerokit`` as a process of its own, its output line by line."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "aerokit", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def read_until(process: subprocess.Popen[str], text: str) -> str:
+    assert process.stdout is not None
+    read = ""
+    for line in process.stdout:
+        read += line
+        if text in line:
+            return read
+    raise AssertionError(f"{text!r} was not printed:\n{read}")
+
+
+def read_rest(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    rest = process.stdout.read()
+    process.wait(200)
+    assert "Traceback" not in rest
+    return rest
+
+
+# ---------------------------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["demo", "--connect", "nonsense"],
+        ["demo", "--altitude", "-3"],
+        ["demo", "--altitude", "high"],
+        ["demo", "--side", "nan"],
+        ["demo", "--system-id", "256"],
+        ["demo", "--record", "/there/is/no/such/directory/flight.tlog"],
+        ["demo", "--speedup", "0"],
+        ["sim", "nonsense"],
+        ["sim", "--vehicle", "balloon"],
+        ["sim", "--home", "91,0,0"],
+        ["sim", "--home", "47.4,8.5"],
+        ["sim", "--home", "47.4,8.5,nan"],
+        ["sim", "--parameter", "MNT1_TYPE"],
+        ["sim", "--parameter", "MNT1_TYPE=servo"],
+        ["sim", "--parameter", "RTL_ALT=nan"],
+        ["sim", "--parameter", "RTL_ALT=-inf"],
+        ["sim", "--parameter", "RTL_ALT=1e39"],
+        ["params", "set", "udpin:127.0.0.1:1", "RTL_ALT=nan"],
+        ["params", "set", "udpin:127.0.0.1:1", "RTL_ALT"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    assert re.search(r"error: ", capsys.readouterr().err)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["--version"])
+    assert exit_.value.code == 0
+    assert capsys.readouterr().out == f"aerokit {aerokit.__version__}\n"
+
+
+def test_an_address_where_nobody_listens(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["demo", "--connect", "tcp:127.0.0.1:1", "--record", str(tmp_path / "flight.tlog")]) == 3
+    assert "aerokit: cannot open tcp:127.0.0.1:1" in capsys.readouterr().err
+
+
+def test_an_address_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+    with served_copter() as address:
+        assert main(["sim", address.replace("tcp:", "tcpin:")]) == 3
+    assert capsys.readouterr().err.startswith("aerokit: cannot ")
+
+
+# --------------------------------------------------------------------------------------- demo
+
+
+@pytest.mark.parametrize("address", ["tcp:127.0.0.1:1", "/dev/no-such-device,57600"])
+def test_demo_that_cannot_connect_leaves_the_last_recording(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    last = tmp_path / "demo.tlog"
+    last.write_bytes(b"the last flight")
+    assert main(["demo", "--connect", address]) != 0
+    assert last.read_bytes() == b"the last flight"
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "firmware"), [("copter", "ArduCopter"), exhaustive(pytest.param("px4", "PX4"))]
+)
+def test_demo_on_its_own_vehicle(
+    vehicle: str, firmware: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    record = tmp_path / "flight.tlog"
+    arguments = [
+        "--vehicle",
+        vehicle,
+        "--altitude",
+        "4",
+        "--side",
+        "5",
+        "--speedup",
+        "30",
+        "--record",
+        str(record),
+    ]
+    assert main(["demo", *arguments]) == 0
+    told = capsys.readouterr().out
+    for text in (
+        f"found {firmware}",
+        "ready, home is",
+        "at the north-east corner",
+        "disarmed",
+        "flown ",
+        f"recorded in {record}",
+    ):
+        assert text in told
+    assert sum(1 for _ in read_tlog(record)) > 100
+
+
+def test_demo_that_is_refused_says_why(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.refuse(400, text="Arm: Motors not spinning freely")
+    with served([copter]) as address:
+        assert main(["demo", "--connect", address, "--record", str(tmp_path / "flight.tlog")]) == 1
+    assert "Arm: Motors not spinning freely" in capsys.readouterr().out
+
+
+@posix_only
+def test_ctrl_c_before_a_vehicle_is_found(tmp_path: Path) -> None:
+    record = str(tmp_path / "flight.tlog")
+    with program("demo", "--connect", "udpin:127.0.0.1:0", "--record", record) as process:
+        read_until(process, "connecting to")
+        process.send_signal(signal.SIGINT)
+        assert read_rest(process) == "interrupted\n"
+        assert process.returncode == 130
+
+
+@posix_only
+def test_ctrl_c_in_the_air_lands_the_vehicle(tmp_path: Path) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    with served([copter]) as address, in_the_air(address, tmp_path) as process:
+        process.send_signal(signal.SIGINT)
+        told = read_rest(process)
+        assert (
+            "interrupted, in GUIDED, still armed, " in told
+            or "interrupted, holding in BRAKE, still armed" in told
+        )
+        assert "landing here" in told
+        assert "disarmed" in told
+        assert process.returncode == 130
+        assert (copter.is_armed, copter.is_landed) == (False, True)
+
+
+@posix_only
+def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
+    with served_copter() as address, in_the_air(address, tmp_path) as process:
+        process.send_signal(signal.SIGINT)
+        read_until(process, "mode LAND")
+        process.send_signal(signal.SIGINT)
+        assert "interrupted again: left in LAND, still armed, " in read_rest(process)
+        assert process.returncode == 130
+
+
+@posix_only
+@pytest.mark.parametrize("mode", ["LOITER", exhaustive("BRAKE")])
+def test_a_pilot_who_takes_over_keeps_the_vehicle(mode: str, tmp_path: Path) -> None:
+    with (
+        served([SimulatedCopter(boot_time_s=0.0)], "tcpin:127.0.0.1:0") as address,
+        in_the_air(address, tmp_path) as process,
+        aerokit.sync.connect(address, source_system=254) as pilot,
+    ):
+        pilot.set_mode(mode)
+        told = read_rest(process)
+        assert f"the mode changed to {mode}" in told
+        assert f"left to whoever put it into {mode}" in told
+        assert process.returncode == 1
+        assert pilot.is_armed
+
+
+def test_demo_leaves_a_vehicle_that_flies_already_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with served_copter() as address, aerokit.sync.connect(address) as pilot:
+        pilot.wait_ready()
+        pilot.arm()
+        pilot.take_off(5)
+        pilot.set_mode("BRAKE")  # in which it could not be armed
+        record = str(tmp_path / "flight.tlog")
+        assert main(["demo", "--connect", address, "--record", record]) == 1
+        assert "it is left to whoever armed it (holding in BRAKE, still armed, " in capsys.readouterr().out
+        assert (pilot.mode_name, pilot.is_armed) == ("BRAKE", True)
+
+
+@posix_only
+def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    with served([copter]) as address, in_the_air(address, tmp_path, side_m=3) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        process.wait(200)
+        assert copter.is_landed
+
+
+@contextmanager
+def in_the_air(address: str, directory: Path, *, side_m: float = 30) -> Iterator[subprocess.Popen[str]]:
+    """The demonstration on its way to the first corner."""
+    arguments = ["--connect", address, "--altitude", "4", "--side", str(side_m)]
+    with program("demo", *arguments, "--record", str(directory / "flight.tlog")) as process:
+        read_until(process, "at altitude")
+        yield process
+
+
+# ---------------------------------------------------------------------------------------- sim
+
+
+def test_sim_refuses_a_parameter_that_the_vehicle_has_not(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "--parameter", "NO_SUCH=1"]) == 2
+    assert "NO_SUCH" in capsys.readouterr().err
+
+
+@posix_only
+def test_sim_serves_until_ctrl_c() -> None:
+    with program(
+        "sim", "tcpin:127.0.0.1:0", "--system-id", "9", "--speedup", "20", "--parameter", "rtl_alt=2000"
+    ) as process:
+        address = read_until(process, "aerokit demo --connect").split()[-1]
+        with aerokit.sync.connect(address) as vehicle:
+            assert vehicle.system_id == 9
+            assert vehicle.parameters.get("RTL_ALT") == 2000
+        process.send_signal(signal.SIGINT)
+        assert read_rest(process) == "stopped\n"
+        assert process.returncode == 0

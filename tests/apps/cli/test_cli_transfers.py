@@ -1,0 +1,234 @@
+"""`aerokit params|mission|files|logs`: what they print, what they leave on disk, and their exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from served_copter import served
+
+from aerokit.apps.cli import main
+from aerokit.apps.cli.terminal import progress_bar
+from aerokit.protocols.exchange import Progress
+from aerokit.sim import SimulatedCopter
+
+WAYPOINTS = """QGC WPL 110
+0\t1\t0\t16\t0\t0\t0\t0\t47.397742\t8.545594\t488\t1
+1\t0\t3\t22\t0\t0\t0\t0\t0\t0\t15\t1
+2\t0\t3\t16\t0\t0\t0\t0\t47.398\t8.5456\t15\t1
+3\t0\t3\t20\t0\t0\t0\t0\t0\t0\t0\t1
+"""
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def copter() -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def address(copter: SimulatedCopter) -> Iterator[str]:
+    with served([copter]) as address:
+        yield address
+
+
+@pytest.fixture
+def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command that talks to the copter; gives exit code, standard output and standard error."""
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        code = main([*arguments, "--connect", address])
+        told = capsys.readouterr()
+        return code, told.out, told.err
+
+    return run
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "aerokit.apps.cli.vehicle_command.LISTEN_S", 0.0
+    )  # there is one; tests/apps/cli has several
+
+
+# ------------------------------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["params"],
+        ["params", "get"],
+        ["params", "set", "WPNAV_SPEED"],
+        ["params", "set", "WPNAV_SPEED=fast"],
+        ["params", "get", "X", "--patience", "0"],
+        ["mission", "fly"],
+        ["mission", "show", "weather"],
+        ["files", "get"],
+        ["logs", "get", "one"],
+        ["logs", "get", "--to", "/there/is/no/such/directory"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    assert "error: " in capsys.readouterr().err
+
+
+def test_a_name_that_cannot_be_is_no_fault_of_the_vehicle(run: Run) -> None:
+    code, _, err = run("params", "get", "A_NAME_OF_MORE_THAN_16")
+    assert code == 2
+    assert "A_NAME_OF_MORE_THAN_16" in err
+
+
+# ------------------------------------------------------------------------------------ parameters
+
+
+def test_get_and_set(run: Run) -> None:
+    assert run("params", "set", "WPNAV_SPEED=725.5", "LOG_BITMASK=0xFF")[0] == 0
+    code, out, _ = run("params", "get", "WPNAV_SPEED", "LOG_BITMASK")
+    assert code == 0
+    assert [line.split() for line in out.splitlines()] == [["WPNAV_SPEED", "725.5"], ["LOG_BITMASK", "255"]]
+
+
+def test_one_that_cannot_be_set_is_told_and_the_others_are_set(run: Run) -> None:
+    code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
+    assert code == 1
+    assert "WPNAV_ACCEL      210          set" in out
+    assert "NO_SUCH          not set: " in out
+
+
+def test_list_by_pattern_and_what_was_changed(run: Run) -> None:
+    run("params", "set", "WPNAV_RADIUS=333")
+    code, out, _ = run("params", "list", "wpnav_r*", "--changed")
+    assert code == 0
+    assert out == "WPNAV_RADIUS     333           (default 200)\n"
+
+
+@pytest.mark.parametrize("format_", ["missionplanner", "mavproxy", "qgroundcontrol"])
+def test_save_diff_and_load(format_: str, run: Run) -> None:
+    assert run("params", "save", "mine.param", "--format", format_)[0] == 0
+    assert run("params", "diff", "mine.param")[0] == 0
+    run("params", "set", "WPNAV_SPEED_UP=311")
+    code, out, _ = run("params", "diff", "mine.param")
+    assert code == 1
+    assert "WPNAV_SPEED_UP" in out
+    assert "1 of 1349 differ" in out
+    assert run("params", "load", "mine.param")[0] == 0
+    assert run("params", "diff", "mine.param")[0] == 0
+
+
+def test_a_damaged_file_is_told_before_anything_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.param").write_text("WPNAV_SPEED,fast\n")
+    assert main(["params", "load", "mine.param", "--connect", "tcp:127.0.0.1:1"]) == 6
+    assert "mine.param" in capsys.readouterr().err
+
+
+# -------------------------------------------------------------------------------------- missions
+
+
+def test_check_needs_no_vehicle(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS)
+    assert main(["mission", "check", "m.waypoints"]) == 0
+    assert "mission: 3 items\n    0  NAV_TAKEOFF" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("47.398\t", "91\t"), ("QGC WPL 110", "something else"), ("2\t0\t3\t16", "2\t0\t77\t16")]
+)
+def test_check_refuses(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS.replace(old, new))
+    assert main(["mission", "check", "m.waypoints"]) in (2, 6)  # what no item can be, or no file
+    assert capsys.readouterr().err.startswith("aerokit: ")
+
+
+def test_upload_show_download_clear(run: Run) -> None:
+    Path("m.waypoints").write_text(WAYPOINTS)
+    code, out, _ = run("mission", "upload", "m.waypoints")
+    assert (code, out) == (0, "mission: 3 items are on vehicle 1\n")
+    code, out, _ = run("mission", "show", "mission", "fence")
+    assert "    1  NAV_WAYPOINT                     47.3980000 8.5456000 15 m" in out
+    assert "fence: 0 items" in out
+    assert run("mission", "download", "again.waypoints")[0] == 0
+    assert run("mission", "download", "again.plan")[0] == 0
+    assert len(json.loads(Path("again.plan").read_text())["mission"]["items"]) == 3
+    assert run("mission", "upload", "again.plan")[0] == 0
+    assert run("mission", "clear")[0] == 0
+    assert run("mission", "show")[1] == "mission: 0 items\n"
+
+
+def test_a_mission_is_not_started_on_a_disarmed_vehicle(run: Run) -> None:
+    code, _, err = run("mission", "start")
+    assert code == 5
+    assert "not armed" in err
+
+
+# ---------------------------------------------------------------------------------- files, logs
+
+
+def test_files(run: Run) -> None:
+    Path("here.txt").write_bytes(b"some bytes")
+    assert run("files", "mkdir", "/box")[0] == 0
+    assert run("files", "put", "here.txt", "/box/a.txt")[:2] == (0, "/box/a.txt: 10 bytes\n")
+    assert run("files", "mv", "/box/a.txt", "/box/b.txt")[0] == 0
+    assert run("files", "ls", "/box")[1].split() == ["10", "b.txt"]
+    assert run("files", "get", "/box/b.txt")[0] == 0
+    assert Path("b.txt").read_bytes() == b"some bytes"
+    assert len(run("files", "crc", "/box/b.txt")[1].strip()) == 8
+    assert run("files", "rm", "/box/b.txt")[0] == 0
+    assert run("files", "rmdir", "/box")[0] == 0
+    code, _, err = run("files", "rm", "/box/b.txt")
+    assert code == 5
+    assert "no such file" in err
+
+
+def test_logs(run: Run) -> None:
+    code, out, _ = run("logs", "list")
+    assert code == 0
+    newest, size, *_ = out.splitlines()[-1].split()
+    Path("there").mkdir()
+    code, out, _ = run("logs", "get", "--to", "there")
+    assert code == 0
+    (log,) = Path("there").iterdir()
+    assert log.stat().st_size == int(size)
+    assert f"{int(newest):05}" in log.name
+    assert run("logs", "get", "4711")[0] == 2
+
+
+def test_logs_are_not_erased_unasked(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = run("logs", "list")[1]
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
+    assert run("logs", "erase")[:2] == (1, "nothing was erased\n")
+    assert run("logs", "list")[1] == before
+    assert run("logs", "erase", "--yes")[:2] == (0, "erased\n")
+    assert run("logs", "list")[1] == ""
+
+
+# -------------------------------------------------------------------------------------- progress
+
+
+def test_the_progress_bar_shows_what_is_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    threads = threading.active_count()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with progress_bar("flight.bin", "B") as show:
+        show(Progress(0, None, 0.0))
+        show(Progress(512 * 1024, 1024 * 1024, 1.0))
+        show(Progress(1024 * 1024, 1024 * 1024, 2.0))
+    assert "flight.bin: 100%" in capsys.readouterr().err
+    assert threading.active_count() == threads
+
+
+def test_there_is_no_progress_bar_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar("flight.bin", "B") as show:
+        show(Progress(512, 1024, 1.0))
+    assert capsys.readouterr().err == ""

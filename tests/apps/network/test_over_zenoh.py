@@ -1,0 +1,148 @@
+"""The whole API through a zenoh network, and state for others; real time, real sockets."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from zenoh_network import HoldingProxy, eventually, free_port, router
+
+import aerokit
+from aerokit import VelocitySetpoint, events
+from aerokit.apps.network import found, publishing
+from aerokit.errors import CommandRejected, LinkOpenError
+from aerokit.missions import Mission, return_to_launch, take_off, waypoint
+from aerokit.sim import SimulatedCopter, open_simulator
+from aerokit.sim.kinds import wait_longer
+
+zenoh: Any = pytest.importorskip("zenoh")
+pytestmark = pytest.mark.anyio
+
+SPEEDUP = 20.0
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+@contextlib.asynccontextmanager
+async def copter_at(port: int) -> AsyncIterator[SimulatedCopter]:
+    """A simulated copter, which a router has as ``alpha``."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    wait_longer([copter], SPEEDUP)
+    address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"
+    with router(port):
+        async with open_simulator(copter, address, speedup=SPEEDUP):
+            yield copter
+
+
+async def test_the_whole_api() -> None:
+    port = free_port()
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client=ground-1"
+    async with copter_at(port), aerokit.connect(address) as vehicle:
+        await vehicle.wait_ready()
+        parameters = await vehicle.parameters.download()
+        assert len(parameters) > 100
+        await vehicle.parameters.set("RTL_ALT", 1600)
+        here = vehicle.position.value.offset(north_m=20)
+        mission = Mission([
+            take_off(altitude_relative_m=5),
+            waypoint(here.latitude_deg, here.longitude_deg, altitude_relative_m=5),
+            return_to_launch(),
+        ])  # fmt: skip
+        await vehicle.mission.upload(mission)
+        assert mission.matches(await vehicle.mission.download())
+        await vehicle.files.make_directory("/work")
+        await vehicle.files.write("/work/note", bytes(range(256)) * 20)
+        assert await vehicle.files.read("/work/note") == bytes(range(256)) * 20
+        await vehicle.set_mode("GUIDED")
+        await vehicle.arm()
+        await vehicle.take_off(5)
+        async with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
+            await stream.fly(VelocitySetpoint(north_m_s=2), 0.3)
+        await vehicle.land()
+        link: Any = vehicle.connection.link
+        assert link.helm == "ground-1"
+        assert link.dropped_writes == 0
+
+
+async def test_the_one_without_the_helm_is_told() -> None:
+    port = free_port()
+    address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client="
+    async with (
+        copter_at(port),
+        aerokit.connect(address + "one") as one,
+        aerokit.connect(address + "two", source_system=254) as two,
+    ):
+        await one.wait_ready()
+        await one.set_mode("GUIDED")
+        with two.subscribe(events.OrderRefused, capacity=8) as refusals:
+            with pytest.raises(CommandRejected) as refused:  # reasons are waited for; not a time-out
+                await two.arm(timeout=100)
+            assert "network: one has the helm" in refused.value.reasons
+            refusal = await refusals.get(timeout=100)
+            assert (refusal.message, refusal.reason, refusal.helm) == (
+                "COMMAND_LONG",
+                "one has the helm",
+                "one",
+            )
+        assert len(await two.parameters.download()) > 100  # anybody reads
+        assert not one.armed.value
+        await one.arm()
+
+
+@pytest.mark.exhaustive
+async def test_a_reconnecting_program_lives_through_a_partition() -> None:
+    port = free_port()
+    async with copter_at(port), HoldingProxy(port) as line:
+        address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{line.port}"
+        async with aerokit.connect(address, reconnect=True) as vehicle:
+            await vehicle.wait_ready()
+            line.hold()
+            await vehicle.link_state.wait_until(
+                lambda state: state is not aerokit.LinkState.CONNECTED, timeout=10
+            )
+            line.release()
+            await vehicle.link_state.wait_until(
+                lambda state: state is aerokit.LinkState.CONNECTED, timeout=10
+            )
+            await vehicle.set_mode("GUIDED")
+            await vehicle.arm()
+
+
+async def test_state_for_other_programs() -> None:
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    heard: dict[str, dict[str, Any]] = {}
+
+    def hear(sample: Any) -> None:
+        heard[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())
+
+    async with copter_at(port), aerokit.connect(f"zenoh://north/alpha?connect={endpoint}") as vehicle:
+        config = zenoh.Config()
+        for key, value in (
+            ("mode", "client"),
+            ("connect/endpoints", [endpoint]),
+            ("scouting/multicast/enabled", False),
+        ):
+            config.insert_json5(key, json.dumps(value))
+        other = zenoh.open(config)
+        subscriber: Any = other.declare_subscriber("aerokit/north/*/state/**", hear)
+        async with publishing(vehicle, f"zenoh://north/alpha?connect={endpoint}", rate_hz=20):
+            await eventually(lambda: "aerokit/north/alpha/state/1/position" in heard)
+            position = heard["aerokit/north/alpha/state/1/position"]
+            assert position["value"]["latitude_deg"] == pytest.approx(
+                vehicle.position.value.latitude_deg, abs=1e-4
+            )
+            assert await found("north", connect=[endpoint], wait=0.2) == ["alpha"]
+        del subscriber
+        other.close()
+
+
+async def test_no_network() -> None:
+    with pytest.raises(LinkOpenError):
+        await found("north", connect=[f"tcp/127.0.0.1:{free_port()}"])

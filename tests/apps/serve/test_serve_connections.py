@@ -1,0 +1,267 @@
+"""Connections of `aerokit serve` on real sockets: strangers without the token keep no owner out."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Any
+
+import anyio
+import pytest
+import uvicorn
+import websockets
+from serve_stage import TOKEN
+from websockets.typing import Subprotocol
+
+import aerokit
+import aerokit.apps.serve.guard as connections
+from aerokit.apps.cli.serve import config_of
+from aerokit.apps.serve import make_app
+from aerokit.apps.serve.guard import MAX_STRANGERS
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """Real sockets and the real clock."""
+    return "asyncio"
+
+
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+GIVEN = (200, 202)
+HALF = b"GET /api HTTP/1.1\r\nHost: 127"
+
+
+class Server:
+    """The application as `aerokit serve` serves it, and who connects to it."""
+
+    def __init__(self, server: uvicorn.Server) -> None:
+        self._server = server
+        self.port = server.servers[0].sockets[0].getsockname()[1]
+        self._streams: list[Stream] = []
+        self._keys = 0
+
+    async def connect(self, *, first: bytes = b"", host: str = "127.0.0.1") -> Stream:
+        stream = await asyncio.open_connection("127.0.0.1", self.port, local_addr=(host, 0))
+        self._streams.append(stream)
+        stream[1].write(first)
+        return stream
+
+    async def close(self) -> None:
+        for _, writer in self._streams:
+            writer.close()
+            with suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def flood(self, count: int, first: bytes = HALF, *, host: str = "127.0.0.1") -> None:
+        for _ in range(count):
+            await self.connect(first=first, host=host)
+
+    def open_connections(self) -> int:
+        return len(self._server.server_state.connections)
+
+    async def order(self, stream: Stream) -> int:
+        """Have the owner order `hold`; the status of the answer."""
+        self._keys += 1
+        head = (
+            f"POST /api/vehicles/1/hold?wait=false HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
+            f"Idempotency-Key: key-{self._keys:08}\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}"
+        )
+        return await ask(stream, head.encode())
+
+
+def has_ended(stream: Stream) -> bool:
+    return stream[0].at_eof() or stream[0].exception() is not None
+
+
+async def end_of(stream: Stream) -> bytes:
+    """What comes until the server ends the connection."""
+    with anyio.fail_after(100), suppress(ConnectionResetError):
+        return await stream[0].read()
+    return b""
+
+
+async def ask(stream: Stream, request: bytes) -> int:
+    reader, writer = stream
+    writer.write(request)
+    with anyio.fail_after(100):
+        head = await reader.readuntil(b"\r\n\r\n")
+        length = next(line for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:"))
+        await reader.readexactly(int(length.partition(b":")[2]))
+    return int(head.split()[1])
+
+
+@asynccontextmanager
+async def open_server() -> AsyncIterator[Server]:
+    async with (
+        simulated_link(SimulatedCopter(boot_time_s=0.0), speedup=10.0) as link,
+        aerokit.connect(link) as vehicle,
+        make_app(vehicle, token=TOKEN, open_reading=True) as app,
+    ):
+        server = uvicorn.Server(config_of(uvicorn, app, "127.0.0.1", 0))
+        serving = asyncio.ensure_future(server._serve())
+        with anyio.fail_after(100):
+            while not server.started:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        stage = Server(server)
+        try:
+            yield stage
+        finally:
+            await stage.close()
+            server.should_exit = True
+            await serving
+
+
+@pytest.mark.parametrize("first", [b"", HALF], ids=["silent", "half"])
+async def test_half_requests_of_strangers_keep_no_order_out(first: bytes) -> None:
+    async with open_server() as server:
+        owner = await server.connect()
+        assert await server.order(owner) in GIVEN
+        await server.flood(200, first)
+        assert await server.order(await server.connect()) in GIVEN
+        assert await server.order(owner) in GIVEN, "his own connection is not ended for strangers"
+        assert server.open_connections() <= MAX_STRANGERS + 2
+
+
+async def test_whole_requests_of_strangers_keep_no_order_out() -> None:
+    async with open_server() as server:
+        request = b"GET /api/vehicles HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+        await server.flood(200, request)
+        assert await server.order(await server.connect()) in GIVEN
+        assert await ask(await server.connect(), request) == 200
+        assert server.open_connections() <= MAX_STRANGERS + 2
+
+
+async def test_strangers_of_one_address_end_no_connection_of_another_one() -> None:
+    async with open_server() as server:
+        page = await server.connect(host="127.0.0.2")
+        await server.flood(200)
+        assert await ask(page, b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") == 200
+
+
+async def test_headers_that_do_not_come_end_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    whole = b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    async with open_server() as server:
+        silent, half, second = [await server.connect(first=first) for first in (b"", HALF, whole + HALF)]
+        idle = await server.connect()
+        assert await ask(idle, whole) == 200
+        assert await end_of(silent) == await end_of(half) == b""
+        await asyncio.sleep(0.5)
+        assert await ask(idle, whole) == 200, "between requests it may wait"
+        idle[1].write(HALF)
+        assert await end_of(idle) == b""
+        assert not has_ended(second), "it has uvicorn's time for the next request"
+
+
+async def test_bytes_that_trickle_in_win_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    async with open_server() as server:
+        stream = await server.connect(first=HALF)
+        with anyio.fail_after(100):
+            while not has_ended(stream):
+                stream[1].write(b"x")
+                await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize("noise", [b"\x16\x03\x01 TLS\r\n\r\n", b"GET /" + b"x" * 100_000, b"\xfd" * 1000])
+async def test_a_request_that_is_no_http_is_refused(noise: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    async with open_server() as server:
+        assert (await end_of(await server.connect(first=noise)))[9:12] in (b"400", b"")
+        assert await server.order(await server.connect()) in GIVEN
+
+
+# --------------------------------------------------------------------------------- the stream
+
+
+def stream(server: Server, token: str | None = TOKEN, **options: Any) -> Any:
+    protocols = [Subprotocol("aerokit.v1"), *([Subprotocol(f"bearer.{token}")] if token else [])]
+    return websockets.connect(f"ws://127.0.0.1:{server.port}/api/stream", subprotocols=protocols, **options)
+
+
+@pytest.mark.parametrize(
+    "said", ["x" * 2_000, "x" * 2_000_000, b"\0" * 2_000_000], ids=["text", "long text", "long bytes"]
+)
+async def test_a_socket_that_speaks_is_ended_before_its_message_is_read(said: str | bytes) -> None:
+    async with open_server() as server, stream(server) as socket:
+        with pytest.raises(websockets.ConnectionClosed), anyio.fail_after(100):
+            await socket.send(said)
+            while True:
+                await socket.recv()
+        assert await server.order(await server.connect()) in GIVEN
+
+
+async def test_a_stream_lasts_longer_than_a_request_may_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+    async with open_server() as server, stream(server, None) as viewer:
+        until = asyncio.get_running_loop().time() + 1.0
+        with anyio.fail_after(100):
+            while asyncio.get_running_loop().time() < until:
+                assert await viewer.recv()
+        await server.flood(100)
+        assert await viewer.recv()
+
+
+async def test_a_page_of_another_site_gets_no_stream() -> None:
+    """Cross-site WebSocket hijacking, and a name that was pointed here (DNS rebinding)."""
+    async with open_server() as server:
+        for wrong in ({"origin": "http://evil.example"}, {"origin": f"http://127.0.0.1:{server.port + 1}"}):
+            with pytest.raises(websockets.InvalidStatus):
+                async with stream(server, None, **wrong):
+                    pass
+        async with stream(server, None, origin=f"http://127.0.0.1:{server.port}") as own:
+            assert await own.recv()
+
+
+async def test_streams_opened_and_dropped_leave_nothing() -> None:
+    async with open_server() as server:
+        for _ in range(100):
+            reader, writer = await server.connect(
+                first=b"GET /api/stream HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+                b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+            )
+            with anyio.fail_after(100):
+                assert b" 101 " in await reader.readuntil(b"\r\n")
+            writer.transport.abort()
+        async with stream(server) as owner:
+            assert await owner.recv()
+        with anyio.fail_after(100):
+            while server.open_connections():  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+
+
+async def test_headers_that_nobody_asked_for_come_back_in_no_header() -> None:
+    async with open_server() as server:
+        evil = b"%0d%0aSet-Cookie:%20a=b"
+        for path in (
+            b"/" + evil,
+            b"/api/orders/" + evil,
+            b"/api?refresh=" + evil,
+            b"/api/vehicles/1/" + evil,
+        ):
+            reader, writer = await server.connect(
+                first=b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+            )
+            with anyio.fail_after(100):
+                assert b"set-cookie" not in (await reader.readuntil(b"\r\n\r\n")).lower()
+            writer.close()
+
+
+async def test_a_request_hidden_in_another_one_is_refused() -> None:
+    """Two lengths, or a length and chunks: what a proxy takes for a body would be a request here."""
+    hidden = b"POST /api/vehicles/1/land HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    async with open_server() as server:
+        for lengths in (
+            b"Content-Length: 0\r\nContent-Length: 60",
+            b"Content-Length: 4\r\nTransfer-Encoding: chunked",
+        ):
+            request = (
+                b"POST /api/vehicles/1/hold HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n\r\n" + hidden
+            )
+            answer = await end_of(await server.connect(first=request))
+            assert answer.count(b"HTTP/1.1 ") == 1
+            assert answer[9:12] in (b"400", b"401")

@@ -1,0 +1,493 @@
+"""Others who speak in a vehicle's name, or fill what there is of room: a link whose peers are "port@host"."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import anyio
+import pytest
+from test_routes import ATTITUDE, COPTER, PeersLink, command
+
+import aerokit
+from aerokit import Signing, SigningKey, events, open_connection
+from aerokit.connection.connection import Connection
+from aerokit.connection.frame_receiver import MOST_STRANGERS
+from aerokit.connection.routes import MOST_CLAIMS, Routes
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, SystemTime
+
+MOST_PEERS = 256
+MOST_ROUTES = 1024
+MOST_SENDERS = 2048
+
+pytestmark = pytest.mark.anyio
+
+DISARMED = Heartbeat(2, 3, 81, 9, 3)
+ARMED = Heartbeat(2, 3, 81 | 128, 4, 4)
+
+
+class KeptPeers(PeersLink):
+    """Remembers whom the connection keeps, as UdpListen does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kept: list[object] = []
+
+    def keep_peer(self, peer: object) -> None:
+        self.kept.append(peer)
+
+    def forget_peer(self, peer: object) -> None:
+        self.kept.remove(peer)
+
+
+class Copter:
+    """A vehicle with one counter and one clock, wherever it speaks from."""
+
+    def __init__(self, link: KeptPeers, first: int = 0, booted_at: float = -100.0) -> None:
+        self._link, self._booted_at = link, booted_at
+        self.encoder = FrameEncoder(1, 1)
+        self.encoder.sequence = first
+
+    def say(self, peer: str, *messages: Message) -> None:
+        assert self._link.connection is not None
+        for message in messages:
+            self._link.connection.bytes_received(self.encoder.encode(message), peer)
+
+    def tell_time(self, peer: str) -> None:
+        assert self._link.connection is not None
+        boot_ms = int((self._link.connection.now() - self._booted_at) * 1000)
+        self.say(peer, Attitude(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+    async def live(self, peer: str, seconds: float, heartbeat: Message = ARMED) -> None:
+        """Four attitudes and a heartbeat a second."""
+        for count in range(round(seconds * 4)):
+            if count % 4 == 0:
+                self.say(peer, heartbeat)
+            self.tell_time(peer)
+            await anyio.sleep(0.25)
+
+
+@pytest.fixture
+async def link() -> KeptPeers:
+    return KeptPeers()
+
+
+@asynccontextmanager
+async def flown(link: KeptPeers, **options: object) -> AsyncIterator[tuple[aerokit.Vehicle, Copter]]:
+    """A vehicle that has been heard from "14550@copter" for some seconds, armed."""
+    async with open_connection(link, **options) as connection:  # type: ignore[arg-type]
+        copter = Copter(link)
+        copter.say("14550@copter", ARMED)
+        async with aerokit.connect(connection, rates={}) as vehicle:
+            await copter.live("14550@copter", 6)
+            yield vehicle, copter
+
+
+def is_armed(vehicle: aerokit.Vehicle) -> bool:
+    return vehicle.armed.value
+
+
+def signed_by(key: SigningKey) -> FrameEncoder:
+    encoder = FrameEncoder(1, 1)
+    encoder.signing = Signing(key)
+    return encoder
+
+
+def told(connection: Connection) -> list[events.Event]:
+    heard: list[events.Event] = []
+    for kind in (events.HeardTwice, events.VehicleMoved, events.MoveRefused, events.ArmedChanged):
+        connection.bus.attach_event(kind, heard.append)
+    return heard
+
+
+def peer_of(vehicle: aerokit.Vehicle, link: KeptPeers) -> object:
+    link.sent.clear()
+    vehicle.send(command(1, 1))
+    (peer,) = link.peers_of(CommandLong)
+    return peer
+
+
+# -------------------------------------------------------------------------------------- room
+
+
+async def test_who_sends_noise_holds_no_place_and_pushes_nobody_out(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        connection = vehicle.connection
+        for port in range(300):
+            connection.bytes_received(b"\xfd", f"{port}@stranger")
+        assert link.kept == ["14550@copter"]
+        assert len(list(connection.statistics())) == 1 + MOST_STRANGERS
+        intruder = Copter(link, 77)
+        intruder.say("666@stranger", DISARMED, DISARMED)
+        assert is_armed(vehicle)
+        copter.say("14550@copter", DISARMED)
+        assert not is_armed(vehicle)
+        assert peer_of(vehicle, link) == "14550@copter"
+
+
+async def test_a_peer_with_a_live_route_is_never_forgotten_for_another_one(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, _):
+        connection = vehicle.connection
+        await anyio.sleep(100)
+        for port in range(2 * MOST_PEERS):
+            connection.bytes_received(FrameEncoder(250, 1).encode(ATTITUDE), f"{port}@stranger")
+        assert "14550@copter" in link.kept
+        assert len(link.kept) == MOST_PEERS
+
+
+async def test_while_all_places_are_taken_by_the_living_nobody_new_is_heard(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(MOST_PEERS):
+            link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
+        heard: list[Message] = []
+        connection.bus.attach(Attitude, heard.append)
+        link.hear("late@comer", (251, 1), ATTITUDE)
+        assert heard == []
+        await anyio.sleep(31)
+        link.hear("late@comer", (251, 1), ATTITUDE)
+        assert (len(heard), len(link.kept)) == (1, MOST_PEERS)
+
+
+async def test_who_is_not_listened_to_takes_no_place_among_the_counted(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(MOST_PEERS):
+            link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
+        for port in range(MOST_SENDERS):
+            link.hear(f"{port}@late", (251, 1), ATTITUDE)
+        for component_id in range(100, 200):
+            link.hear("0@swarm", (1, component_id), COPTER)
+        counted = [source for each in connection.statistics() for source in each.sources]
+        assert len(counted) == MOST_PEERS + 100
+
+
+async def test_who_is_forgotten_gives_back_its_places_among_the_counted(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(MOST_SENDERS // 8):
+            for component_id in range(1, 9):
+                link.hear(f"{port}@swarm", (1 + port % 250, component_id + 8 * (port // 250)), ATTITUDE)
+        for port in range(100):
+            link.hear(f"{port}@new", (251, 1), ATTITUDE)
+        counted = sum(len(each.sources) for each in connection.statistics())
+        assert counted == MOST_SENDERS - 100 * 8 + 99  # the first new one came when all places were taken
+
+
+async def test_of_who_was_pushed_out_nothing_is_kept(link: KeptPeers) -> None:
+    async with open_connection(link) as connection:
+        for port in range(2 * MOST_STRANGERS):
+            connection.bytes_received(b"\xfd", f"{port}@stranger")
+        assert len(connection._intake._peers._limit._statistics) == MOST_STRANGERS
+
+
+async def test_a_frame_in_pieces_makes_a_peer_too(link: KeptPeers) -> None:
+    """A bridge between a serial line and UDP cuts frames anywhere."""
+    async with open_connection(link) as connection:
+        for place in range(0, 60, 7):
+            data = FrameEncoder(1, 1).encode(COPTER) * 3
+            connection.bytes_received(data[place : place + 7], "bridge")
+        assert link.kept == ["bridge"]
+        assert (1, 1) in connection.heard
+
+
+async def test_heartbeats_of_everybody_fill_no_table(link: KeptPeers) -> None:
+    """65,000 senders behind one peer: the vehicle that is flown keeps its place, its counters and its route."""
+    async with flown(link) as (vehicle, copter):
+        connection, encoder = vehicle.connection, FrameEncoder(1, 1)
+        for system_id in range(2, 256):
+            for component_id in range(0, 256, 5):
+                encoder.system_id, encoder.component_id = system_id, component_id
+                connection.bytes_received(encoder.encode(COPTER), f"{component_id}@stranger")
+        assert len(connection.heard) <= MOST_ROUTES
+        assert len(connection._routes._routes) <= MOST_ROUTES
+        assert sum(len(each.sources) for each in connection.statistics()) <= MOST_SENDERS
+        await copter.live("14550@copter", 2)
+        assert connection.counts(1)[1] == 0
+        assert peer_of(vehicle, link) == "14550@copter"
+        await anyio.sleep(40)
+        link.hear("new@comer", (2, 3), COPTER)
+        link.hear("new@comer", (2, 3), COPTER)
+        assert (2, 3) in connection.heard
+        assert len(connection.heard) < 50
+
+
+async def test_claims_are_bounded(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, _):
+        for port in range(MOST_CLAIMS + 100):
+            for component_id in (1, 2, 3):
+                link.hear(f"{port % 200}@stranger", (1, component_id), COPTER)
+        routes = vehicle.connection._routes
+        assert isinstance(routes, Routes)
+        assert len(routes._claims) <= MOST_CLAIMS
+
+
+# ------------------------------------------------------------------------- taking a place
+
+
+async def test_a_stranger_takes_no_place_after_a_silence(
+    link: KeptPeers, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with flown(link) as (vehicle, copter):
+        heard = told(vehicle.connection)
+        await anyio.sleep(20)
+        intruder = Copter(link, 5, booted_at=3)
+        with caplog.at_level(logging.WARNING, "aerokit"):
+            await intruder.live("666@stranger", 10, DISARMED)
+        assert is_armed(vehicle)
+        assert vehicle.is_silent
+        kinds = [type(each) for each in heard]
+        assert kinds == [events.HeardTwice, events.MoveRefused]
+        assert heard[1] == events.MoveRefused(heard[1].at, 1, 1, "666@stranger")
+        assert "666@stranger speaks in its name" in caplog.text
+        copter.say("14550@copter", ARMED)
+        await copter.live("14550@copter", 1)
+        assert not vehicle.is_silent
+
+
+async def test_a_stranger_cannot_try_all_numbers(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, _):
+        await anyio.sleep(5)
+        for first in range(256):
+            intruder = Copter(link, first, booted_at=3)
+            intruder.say("666@stranger", DISARMED)
+            intruder.tell_time("666@stranger")
+        assert is_armed(vehicle)
+
+
+async def test_may_move_lets_anybody_take_it_after_a_silence_but_not_before(link: KeptPeers) -> None:
+    async with flown(link, may_move=True) as (vehicle, _):
+        heard = told(vehicle.connection)
+        other = Copter(link, 5, booted_at=3)
+        other.say("666@stranger", DISARMED)
+        assert is_armed(vehicle)
+        await anyio.sleep(5)
+        other.say("666@stranger", DISARMED)
+        assert not is_armed(vehicle)
+        assert events.VehicleMoved(vehicle.connection.now(), 1, 1, "14550@copter", "666@stranger") in heard
+
+
+async def test_after_a_silence_it_may_come_from_another_host_if_it_goes_on(link: KeptPeers) -> None:
+    """From the wireless network to the mobile one: the same counter, the same clock."""
+    async with flown(link) as (vehicle, copter):
+        heard = told(vehicle.connection)
+        await copter.live("14550@mobile", 8)
+        assert peer_of(vehicle, link) == "14550@mobile"
+        assert not vehicle.is_silent
+        assert [type(each) for each in heard] == [events.HeardTwice, events.VehicleMoved]
+
+
+async def test_the_clock_must_go_on_where_there_is_one(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        impostor = Copter(link, copter.encoder.sequence, booted_at=-90)
+        await anyio.sleep(4)
+        await impostor.live("14550@mobile", 4, DISARMED)
+        assert is_armed(vehicle)
+
+
+async def test_the_numbers_must_go_on_where_they_are_known(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        impostor = Copter(link, copter.encoder.sequence + 100 & 0xFF)
+        await anyio.sleep(4)
+        await impostor.live("14550@mobile", 4, DISARMED)
+        assert is_armed(vehicle)
+
+
+async def test_another_port_of_the_same_host_is_taken_at_once_if_it_goes_on(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        heard, begun = told(vehicle.connection), vehicle.connection.now()
+        await copter.live("14999@copter", 1)
+        assert peer_of(vehicle, link) == "14999@copter"
+        assert [type(each) for each in heard] == [events.VehicleMoved]
+        assert heard[0].at - begun < 1
+
+
+async def test_two_programs_on_one_host_do_not_take_turns(link: KeptPeers) -> None:
+    """The numbers of the second may fit by chance; the first one is heard all the same."""
+    async with flown(link) as (vehicle, copter):
+        heard = told(vehicle.connection)
+        second = Copter(link, copter.encoder.sequence)
+        for _ in range(40):
+            copter.say("14550@copter", ARMED)
+            second.say("14999@copter", DISARMED)
+            await anyio.sleep(0.25)
+        assert is_armed(vehicle)
+        assert [type(each) for each in heard] == [events.HeardTwice]
+
+
+async def test_a_reboot_on_the_same_host_takes_its_place_after_a_silence(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, _):
+        await anyio.sleep(1)
+        rebooted = Copter(link, 0, booted_at=vehicle.connection.now())
+        await rebooted.live("15000@copter", 6, DISARMED)
+        assert peer_of(vehicle, link) == "15000@copter"
+        assert not is_armed(vehicle)
+
+
+async def test_a_reboot_on_the_same_port_is_heard_at_once(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, _):
+        rebooted = Copter(link, 0, booted_at=vehicle.connection.now())
+        await rebooted.live("14550@copter", 1.5, DISARMED)
+        assert not is_armed(vehicle)
+
+
+async def test_a_signature_is_proof_enough_after_a_silence(link: KeptPeers) -> None:
+    key = SigningKey.from_passphrase("ours")
+    async with open_connection(link, signing=Signing(key)) as connection:
+        unix_time = connection.unix_time
+        copter = signed_by(key)
+        connection.bytes_received(copter.encode(ARMED, unix_time()), "14550@copter")
+        async with aerokit.connect(connection, rates={}) as vehicle:
+            await anyio.sleep(5)
+            copter.sequence = 99
+            connection.bytes_received(FrameEncoder(1, 1).encode(DISARMED), "666@stranger")
+            assert is_armed(vehicle)
+            connection.bytes_received(copter.encode(DISARMED, unix_time()), "14550@mobile")
+            assert not is_armed(vehicle)
+
+
+# -------------------------------------------------------------------- one peer, and disorder
+
+
+async def test_a_heartbeat_that_was_overtaken_is_not_believed(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        late = [copter.encoder.encode(message) for message in (ARMED, ATTITUDE)]
+        copter.say("14550@copter", ATTITUDE, DISARMED)
+        assert not is_armed(vehicle)
+        for frame in late:
+            vehicle.connection.bytes_received(frame, "14550@copter")
+        assert not is_armed(vehicle)
+
+
+async def test_a_heartbeat_overtaken_by_other_messages_only_is_believed(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        late = copter.encoder.encode(DISARMED)
+        copter.say("14550@copter", ATTITUDE, ATTITUDE)
+        vehicle.connection.bytes_received(late, "14550@copter")
+        assert not is_armed(vehicle)
+
+
+async def test_two_vehicles_behind_one_peer_do_not_flap(link: KeptPeers) -> None:
+    """Behind a router: the same ids, the same address."""
+    async with flown(link) as (vehicle, copter):
+        heard, begun = told(vehicle.connection), vehicle.connection.now()
+        changes: list[float] = []
+        vehicle.armed.observe(lambda *_: changes.append(vehicle.connection.now() - begun))
+        other = Copter(link, copter.encoder.sequence + 100, booted_at=-900)
+        async with anyio.create_task_group() as group:
+            group.start_soon(copter.live, "14550@copter", 20, ARMED)
+            group.start_soon(other.live, "14550@copter", 20, DISARMED)
+        assert events.HeardTwice in [type(each) for each in heard]
+        assert len([each for each in heard if isinstance(each, events.HeardTwice)]) == 1
+        assert max(changes) <= 3
+        assert len(changes) <= 3
+        assert is_armed(vehicle)
+
+
+async def test_what_the_second_behind_one_peer_says_is_not_listened_to(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, copter):
+        other = Copter(link, copter.encoder.sequence + 100, booted_at=-900)
+        times: list[SystemTime] = []
+        vehicle.connection.bus.attach(SystemTime, times.append)
+        async with anyio.create_task_group() as group:
+            group.start_soon(copter.live, "14550@copter", 10, ARMED)
+            group.start_soon(other.live, "14550@copter", 10, DISARMED)
+        other.say("14550@copter", SystemTime(1, 2))
+        assert times == []
+        copter.say("14550@copter", SystemTime(3, 4))
+        assert len(times) == 1
+
+
+async def test_one_forged_frame_does_not_turn_our_signing_off(link: KeptPeers) -> None:
+    key = SigningKey.from_passphrase("ours")
+    signing = Signing(key)
+    async with open_connection(link, signing=signing) as connection:
+        copter = signed_by(key)
+
+        def signed() -> None:
+            connection.bytes_received(copter.encode(DISARMED, connection.unix_time()), "14550@copter")
+
+        signed()
+        async with aerokit.connect(connection, rates={}) as vehicle:
+            forged = FrameEncoder(1, 1)
+            async with anyio.create_task_group() as group:
+
+                async def forge() -> None:
+                    while True:
+                        signed()
+                        connection.bytes_received(forged.encode(DISARMED), "666@stranger")
+                        connection.bytes_received(forged.encode(DISARMED), "14550@copter")
+                        await anyio.sleep(0.5)
+
+                group.start_soon(forge)
+                with pytest.raises(aerokit.errors.OperationTimeout):
+                    await vehicle.setup_signing(None)
+                group.cancel_scope.cancel()
+            assert connection.signing is signing
+
+
+async def test_frames_of_elsewhere_never_turn_our_signing_off(link: KeptPeers) -> None:
+    key = SigningKey.from_passphrase("ours")
+    signing = Signing(key)
+    async with open_connection(link, signing=signing) as connection:
+        copter = signed_by(key)
+        connection.bytes_received(copter.encode(DISARMED, connection.unix_time()), "14550@copter")
+        async with aerokit.connect(connection, rates={}) as vehicle:
+            forged = FrameEncoder(1, 1)
+            async with anyio.create_task_group() as group:
+
+                async def forge() -> None:
+                    while True:
+                        connection.bytes_received(forged.encode(DISARMED), "666@stranger")
+                        await anyio.sleep(0.1)
+
+                group.start_soon(forge)
+                with pytest.raises(aerokit.errors.OperationTimeout):
+                    await vehicle.setup_signing(None)
+                group.cancel_scope.cancel()
+            assert connection.signing is signing
+
+
+async def test_who_speaks_seldom_does_not_lose_its_place_to_another_program_of_its_host(
+    link: KeptPeers,
+) -> None:
+    """Heartbeats only, and no clock: the numbers of another one that speaks more often fit now and then."""
+    async with open_connection(link) as connection:
+        copter = Copter(link)
+        copter.say("14550@copter", ARMED)
+        async with aerokit.connect(connection, rates={}) as vehicle:
+            for _ in range(60):
+                copter.say("14550@copter", ARMED)
+                second = Copter(link, copter.encoder.sequence)
+                for _ in range(9):
+                    second.say("14999@copter", DISARMED)
+                    await anyio.sleep(0.1)
+            assert is_armed(vehicle)
+
+
+async def test_a_link_that_is_opened_again_is_told_who_its_peers_are(link: KeptPeers) -> None:
+    async with flown(link) as (vehicle, _):
+        link.kept.clear()
+        vehicle.connection.link_restored(1.0)
+        assert link.kept == ["14550@copter"]
+
+
+async def test_what_is_for_all_components_goes_to_no_other_vehicle_of_the_same_system_id(
+    link: KeptPeers,
+) -> None:
+    """Its autopilot is not listened to, its camera has ids that nobody else has; both would obey what is for all."""
+    camera = Heartbeat(30, 8, 0, 0, 4)
+    async with flown(link) as (vehicle, copter):
+        other = Copter(link, first=99, booted_at=-9000.0)
+        others_camera = FrameEncoder(1, 100)
+        for _ in range(3):
+            copter.say("14550@copter", ARMED)
+            other.say("14550@other", DISARMED)
+            vehicle.connection.bytes_received(others_camera.encode(camera), "14550@other")
+            await anyio.sleep(1.0)
+        link.sent.clear()
+        vehicle.send(command(1, 0))
+        assert link.peers_of(CommandLong) == ["14550@copter"]
+        link.sent.clear()
+        vehicle.send(command(1, 100))
+        assert link.peers_of(CommandLong) == ["14550@other"]

@@ -1,0 +1,190 @@
+"""Our own heartbeat: what it says, and that it pauses when the program shows no sign of life."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from typing import Any
+
+import anyio
+import pytest
+from exhaustive import exhaustive
+from flight_harness import open_flight
+from served_copter import served, served_copter
+
+import aerokit.sync
+from aerokit import OwnHeartbeat, dronekit
+from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.errors import InvalidArgument
+from aerokit.events import HeartbeatPaused, HeartbeatResumed
+from aerokit.mavlink.enums import MavType
+from aerokit.sim import SimulatedCopter
+
+BLOCKING_FED_WITHIN_S = 60.0
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("limit_s", [None, exhaustive(float("inf"))])
+async def test_heartbeat_in_asyncio_needs_no_feeding(limit_s: float | None) -> None:
+    async with open_flight(heartbeat=OwnHeartbeat(fed_within_s=limit_s)) as flight:
+        flight.wire.forget()
+        await anyio.sleep(600.0)
+        assert len(flight.wire.all(m.Heartbeat)) >= 600
+
+
+@pytest.mark.anyio
+async def test_heartbeat_not_fed_pauses_and_is_resumed(caplog: pytest.LogCaptureFixture) -> None:
+    async with open_flight(heartbeat=OwnHeartbeat(fed_within_s=5.0)) as flight:
+        connection = flight.vehicle.connection
+        with connection.subscribe(HeartbeatPaused, HeartbeatResumed, capacity=5) as told:
+            for _ in range(4):
+                connection.feed()
+                await anyio.sleep(4.0)
+            assert told.get_nowait() is None
+            await anyio.sleep(3.0)
+            flight.wire.forget()
+            await anyio.sleep(10.0)
+            assert flight.wire.all(m.Heartbeat) == []
+            paused = told.get_nowait()
+            assert isinstance(paused, HeartbeatPaused)
+            assert 5.0 < paused.idle_s <= 6.0
+            assert "has made no call for" in caplog.text
+            connection.feed()
+            await anyio.sleep(1.5)
+            assert flight.wire.all(m.Heartbeat)
+            assert isinstance(told.get_nowait(), HeartbeatResumed)
+
+
+@pytest.mark.anyio
+async def test_heartbeat_has_the_type_that_is_asked_for() -> None:
+    async with open_flight(heartbeat=OwnHeartbeat(type=MavType.ONBOARD_CONTROLLER)) as flight:
+        await anyio.sleep(2.0)
+        assert {each.type for each in flight.wire.all(m.Heartbeat)} == {MavType.ONBOARD_CONTROLLER}
+
+
+@pytest.mark.anyio
+async def test_no_heartbeat_is_sent_if_none_is_wanted() -> None:
+    async with open_flight(heartbeat=None) as flight:
+        await flight.vehicle.wait_ready()
+        flight.vehicle.connection.feed()
+        assert flight.wire.all(m.Heartbeat) == []
+
+
+@pytest.mark.parametrize(
+    "values", [{"type": 256}, {"type": "GCS"}, {"fed_within_s": 0.5}, {"fed_within_s": "5"}]
+)
+def test_heartbeat_of_nonsense_is_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(InvalidArgument, match=f"{next(iter(values))} = "):
+        OwnHeartbeat(**values)
+
+
+@pytest.mark.anyio
+async def test_heartbeat_of_an_open_connection_is_not_changed_by_connect() -> None:
+    async with open_flight() as flight:
+        with pytest.raises(InvalidArgument, match="heartbeat = … is not allowed here"):
+            async with aerokit.connect(flight.vehicle.connection, heartbeat=None):
+                raise AssertionError
+
+
+# ------------------------------------------------------------------------- blocking programs
+
+
+class Hang:
+    """The program's clock, which a test lets go on as if the program had made no call."""
+
+    def __init__(self, connection: Connection) -> None:
+        assert connection._heartbeat is not None
+        self._switch = connection._heartbeat
+
+    def __call__(self, seconds: float) -> bool:
+        """Whether our heartbeat is still sent after so many seconds without a call."""
+        self._switch.proof._fed_at -= seconds
+        return self._switch.is_on()
+
+
+def test_heartbeat_of_a_blocking_program_pauses_until_it_calls_again() -> None:
+    with served_copter() as address, aerokit.sync.connect(address) as vehicle:
+        hang = Hang(vehicle.aio.connection)
+        assert hang(BLOCKING_FED_WITHIN_S - 5.0)
+        assert not hang(10.0)
+        _ = vehicle.position.latest  # a reading is a sign of life
+        assert hang(0.0)
+        assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+        vehicle.wait_ready()
+        assert hang(0.0)
+        position = vehicle.position
+        assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+        _ = position.age  # and so is one of a cell that the program has kept
+        assert hang(0.0)
+
+
+def test_heartbeat_goes_on_while_a_blocking_call_waits() -> None:
+    with served_copter() as address, aerokit.sync.connect(address) as vehicle:
+        hang = Hang(vehicle.aio.connection)
+        seen: list[bool] = []
+
+        def look(_: object) -> bool:
+            seen.append(hang(BLOCKING_FED_WITHIN_S + 10.0))
+            return True
+
+        vehicle.armed.wait_until(look)
+        assert seen == [True]
+
+
+def test_heartbeat_of_a_blocking_fleet_and_connection_is_fed_by_calls() -> None:
+    with served_copter() as address, aerokit.sync.open_connection(address) as connection:
+        hang = Hang(connection.aio)
+        assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+        with aerokit.sync.fleet(connection, count=1) as fleet:
+            assert hang(0.0)
+            assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+            assert len(fleet) == 1
+            assert hang(0.0)
+
+
+def test_heartbeat_of_a_classic_program_is_fed_by_reading_attributes() -> None:
+    with served_copter() as address:
+        vehicle = dronekit.connect(address)
+        try:
+            hang = Hang(vehicle.aio.connection)
+            for name in ("mode", "armed", "location", "battery", "parameters", "is_armable", "channels"):
+                assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+                getattr(vehicle, name)
+                assert hang(0.0), name
+            assert hang(BLOCKING_FED_WITHIN_S - 5.0)
+        finally:
+            vehicle.close()
+
+
+HANGING = """
+import sys, time, aerokit.sync
+with aerokit.sync.connect(sys.argv[1], heartbeat=aerokit.OwnHeartbeat(fed_within_s=1)) as vehicle:
+    print("connected", flush=True)
+    while True:
+        time.sleep(0.01)
+"""
+
+
+def test_heartbeat_of_a_program_in_an_endless_loop_stops() -> None:
+    """With real sockets: the vehicle hears no ground station any more."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    heard: list[float] = []
+    copter.on(
+        m.Heartbeat, lambda beat, _: heard.append(time.monotonic()) if beat.type == MavType.GCS else None
+    )
+    with (
+        served([copter]) as address,
+        subprocess.Popen([sys.executable, "-c", HANGING, address], stdout=subprocess.PIPE) as program,
+    ):
+        try:
+            assert program.stdout is not None
+            program.stdout.readline()
+            give_up_at = time.monotonic() + 200.0
+            while not heard or time.monotonic() - heard[-1] < 4.0:
+                assert time.monotonic() < give_up_at, "heartbeats go on"
+                time.sleep(0.1)
+            assert program.poll() is None
+        finally:
+            program.kill()

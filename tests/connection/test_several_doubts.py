@@ -1,0 +1,429 @@
+"""Several links to one vehicle, and what may be wrong: nothing comes twice or late, nothing goes to somebody else."""
+
+from __future__ import annotations
+
+import socket
+from functools import partial
+
+import anyio
+import pytest
+from several_harness import GOOD, News, Radios, Told, over
+
+import aerokit
+from aerokit import events
+from aerokit import messages as m
+from aerokit.connection.connection import Connection
+from aerokit.connection.multilink.link_choice import PATIENCE_S, LinkChoice
+from aerokit.connection.multilink.link_questions import UNWANTED_HZ
+from aerokit.connection.opening import open_connection
+from aerokit.errors import BusyError, LinkLost, LinkOpenError
+from aerokit.events import LinkState
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame, x25
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.signing import Signing, SigningKey
+from aerokit.sim import SimulatedCopter
+from aerokit.testing import VIRTUAL_BACKEND, FaultModel
+from aerokit.transport import Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
+
+STEADY_S = 3.0
+
+pytestmark = pytest.mark.anyio
+
+AUTOPILOT = m.Heartbeat(2, 3, 81, 0, 4)
+STATION = m.Heartbeat(6, 8, 0, 0, 4)
+
+
+@pytest.fixture
+def anyio_backend() -> tuple[str, dict[str, object]]:
+    return VIRTUAL_BACKEND
+
+
+class Deaf:
+    """Listens at the far end of a link, and does nothing."""
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        pass
+
+    def link_lost(self, error: LinkLost) -> None:
+        pass
+
+
+def of_system_0(message: m.Heartbeat) -> bytes:
+    """A frame that no encoder of ours makes."""
+    frame = Frame.parse(FrameEncoder(1, 1).encode(message))
+    body = frame.body[:4] + b"\0" + frame.body[5:]
+    return b"\xfd" + body + x25(body + STANDARD.extras[frame.message_id]).to_bytes(2, "little")
+
+
+def orders(told: Told) -> list[int]:
+    """The radio that each order went over."""
+    return [index for index, _ in told.of(m.CommandLong)]
+
+
+def an_order_to_all() -> m.CommandLong:
+    return m.CommandLong(0, 0, 400, 0, 1.0, 0, 0, 0, 0, 0, 0)
+
+
+async def opened(radios: Radios) -> None:
+    for far in radios.far:
+        await far.open(Deaf())
+
+
+async def test_system_0_is_nobody_whom_orders_for_all_would_be_sent_to() -> None:
+    radios = Radios(2)
+    told = Told(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        radios.far[0].write(of_system_0(AUTOPILOT))
+        await anyio.sleep(0.5)
+        connection.send(an_order_to_all())
+        assert sorted(orders(told)) == [0, 1]
+
+
+async def test_an_order_for_all_reaches_nobody_twice_where_one_link_reaches_everybody() -> None:
+    """A ground station was heard over the other radio first, and over the vehicle's as well."""
+    radios = Radios(2)
+    told = Told(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        radios.far[1].write(FrameEncoder(250, 190).encode(STATION))
+        await anyio.sleep(0.1)
+        for far in radios.far:
+            far.write(FrameEncoder(250, 190).encode(STATION))
+        radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        await anyio.sleep(0.1)
+        connection.send(an_order_to_all())
+        assert len(orders(told)) == 1
+
+
+def test_another_vehicle_is_not_believed_because_ours_was_silent_for_long() -> None:
+    """Two that were switched on ten seconds apart; ours is switched off."""
+    choice, now = LinkChoice(needs_proof=True), 0.0
+    while now < 30.0:
+        for link in (0, 1):
+            choice.heard(link, now, is_costly=False)
+        choice.choose(now)
+        choice.note_answer(0, now, 100.0 + now, 0.02, now)
+        choice.note_answer(1, now, 90.0 + now, 0.02, now)
+        now += 0.5
+    assert choice.candidates[1].is_doubted
+    while now < 3000.0:
+        choice.heard(1, now, is_costly=False)
+        choice.note_answer(1, now, 90.0 + now, 0.02, now)
+        choice.choose(now)
+        assert choice.used is choice.candidates[0]
+        now += 0.5
+
+
+def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> None:
+    choice, now = LinkChoice(needs_proof=True), 0.0
+    while now < 30.0:
+        choice.heard(0, now, is_costly=False)
+        choice.choose(now)
+        choice.note_answer(0, now, 100.0 + now, 0.02, now)
+        now += 0.5
+    now = 600.0
+    for _ in range(4):
+        choice.heard(1, now, is_costly=False)
+        choice.note_answer(1, now - 0.1, 100.03 + now - 0.1, 0.2, now)
+        now += 0.5
+    choice.choose(now)
+    assert choice.used is choice.candidates[1]
+
+
+@pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
+@pytest.mark.parametrize("dies", [False, True])
+async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s: float, dies: bool) -> None:
+    """Both radios carry 100 frames a second; one of them begins to be late, and the other dies perhaps."""
+    radios = Radios(2)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        came: list[int] = []
+        states: list[int] = []
+        connection.bus.attach(m.Attitude, lambda message: came.append(message.time_boot_ms))
+        connection.bus.attach(m.Heartbeat, lambda message: states.append(message.base_mode))
+        encoder = FrameEncoder(1, 1)
+        for step in range(1200):
+            if step == 400:
+                radios.links[1].incoming.model = FaultModel(delay_s=late_s)
+            if step == 500 and dies:
+                radios.cut(0)
+            frames = [encoder.encode(m.Attitude(10_000 + 10 * step, 0, 0, 0, 0, 0, 0))]
+            if step % 50 == 0:
+                armed = 128 if step < 450 else 0
+                frames.append(encoder.encode(m.Heartbeat(2, 3, 1 | armed, 0, 4)))
+            for data in frames:
+                for far in radios.far:
+                    far.write(data)
+            await anyio.sleep(0.01)
+        assert came == sorted(set(came))
+        assert sorted(states, reverse=True) == states, "armed was not told after disarmed"
+
+
+async def test_signed_copies_are_taken_whichever_comes_first() -> None:
+    """The quicker radio is not in use yet; nothing but heartbeats comes, which prove nothing."""
+    radios = Radios(2, models=[FaultModel(delay_s=0.05), GOOD])
+    await opened(radios)
+    key = SigningKey(bytes(range(32)))
+    async with open_connection(radios.together(), signing=Signing(key)) as connection:
+        refused = News(connection, events.FrameRefused)
+        states: list[int] = []
+        connection.bus.attach(m.Heartbeat, lambda message: states.append(message.custom_mode))
+        vehicle = FrameEncoder(1, 1)
+        vehicle.signing = Signing(key)
+        for step in range(10):
+            data = vehicle.encode(m.Heartbeat(2, 3, 81, step, 4), connection.unix_time())
+            for far in radios.far[: 1 if step == 0 else 2]:
+                far.write(data)
+            await anyio.sleep(1)
+        assert states == list(range(10))
+        assert refused.all == []
+
+
+async def test_a_link_that_is_in_use_elsewhere_stays_as_it_is() -> None:
+    near, far = memory_link_pair()
+    other, _ = memory_link_pair()
+    await far.open(Deaf())
+    async with open_connection(near) as connection:
+        with pytest.raises(BusyError):
+            async with open_connection([other, near]):
+                pass
+        far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        await anyio.sleep(0.1)
+        assert (1, 1) in connection.heard
+
+
+class SlowLink(MemoryLink):
+    """Takes a second to open."""
+
+    async def _connect(self) -> None:
+        await anyio.sleep(1)
+        await super()._connect()
+
+
+async def test_a_link_that_goes_while_another_is_still_being_opened_does_not_end_the_connection() -> None:
+    near, far = memory_link_pair()
+    await far.open(Deaf())
+    async with anyio.create_task_group() as tasks:
+
+        async def close_soon() -> None:
+            await anyio.sleep(0.5)
+            far.close()
+
+        tasks.start_soon(close_soon)
+        async with open_connection([near, SlowLink("memory:slow")]) as connection:
+            await anyio.sleep(1)
+            assert connection.is_open
+            assert connection.links is not None
+            assert [each.state for each in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
+
+
+async def test_links_that_all_go_while_they_are_opened_are_an_error() -> None:
+    near, far = memory_link_pair()
+    await far.open(Deaf())
+
+    class Refused(SlowLink):
+        async def _connect(self) -> None:
+            await super()._connect()
+            raise OSError(111, "refused")
+
+    async with anyio.create_task_group() as tasks:
+
+        async def close_soon() -> None:
+            await anyio.sleep(0.5)
+            far.close()
+
+        tasks.start_soon(close_soon)
+        with pytest.raises((LinkLost, LinkOpenError)):
+            async with open_connection([near, Refused("memory:refused")]) as connection:
+                connection.raise_if_ended()
+
+
+async def test_a_link_that_is_opened_late_ends_the_interruption() -> None:
+    near, far = memory_link_pair()
+    await far.open(Deaf())
+    tries = 0
+
+    class Third(MemoryLink):
+        """Opens at the third attempt."""
+
+        async def _connect(self) -> None:
+            nonlocal tries
+            tries += 1
+            if tries < 6:
+                raise OSError(111, "refused")
+            await super()._connect()
+
+    late = Third("memory:late")
+    both: list[Link] = [near, late]
+    together = SeveralLinks([partial(both.__getitem__, index) for index in range(2)], stays=True)
+    async with open_connection(together) as connection:
+        news = News(connection, events.LinkInterrupted, events.LinkRestored)
+        far.close()
+        await anyio.sleep(0.1)
+        assert [type(each) for each in news.all] == [events.LinkInterrupted]
+        await anyio.sleep(20)
+        assert [type(each) for each in news.all] == [events.LinkInterrupted, events.LinkRestored]
+        late._lose("gone")
+        assert not connection.is_open
+
+
+async def test_a_camera_that_is_heard_first_over_another_link_does_not_hide_the_vehicle() -> None:
+    radios = Radios(2)
+    camera = FrameEncoder(1, 100)
+    copter = SimulatedCopter(boot_time_s=5.0)
+    async with over(radios, copter, server={"vehicles_on": [[copter], []]}) as connection:
+        for _ in range(3):
+            radios.far[1].write(camera.encode(m.Heartbeat(30, 8, 0, 0, 4)))
+            await anyio.sleep(1)
+        async with aerokit.connect(connection, timeout=20) as vehicle:
+            assert vehicle.system_id == 1
+            told = connection.links
+            assert told is not None
+            assert told.value[0].used_for == (1,)
+
+
+async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_taken() -> None:
+    """Over the radio in use an order takes a second and a half; a better one is taken while it is under way."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    radios = Radios(2, models=[FaultModel(delay_s=1.5), GOOD])
+    radios.cut(1)
+    async with over(radios, copter) as connection, aerokit.connect(connection) as vehicle:
+        await vehicle.wait_ready()
+        await anyio.sleep(20)
+        news = News(connection)
+        radios.mend(1)
+        assert connection._several is not None
+        choice = connection._several._choices[1]
+        with anyio.fail_after(60):
+            while choice._better is None or connection.now() - choice._better_since < 2.0:  # noqa: ASYNC110
+                await anyio.sleep(0.05)
+            connection.send(m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0))
+            while not news.chosen:  # noqa: ASYNC110
+                await anyio.sleep(0.05)
+        connection.send(m.CommandLong(1, 1, 400, 0, 0.0, 0, 0, 0, 0, 0, 0))
+        await anyio.sleep(5)
+        assert not copter.is_armed
+        assert news.chosen == [(radios.links[1].address, "better")]
+
+
+def test_orders_without_end_put_a_better_link_off_for_a_while_only() -> None:
+    choice, now, changed_at = LinkChoice(needs_proof=False), 0.0, None
+    choice.heard(0, now, is_costly=False)
+    choice.choose(now)
+    while now < 40.0 and changed_at is None:
+        for link, round_trip_s in ((0, 1.0), (1, 0.02)):
+            choice.heard(link, now, is_costly=False).note_round_trip(round_trip_s, now)
+        choice.ordered(now)
+        if choice.choose(now) == "better":
+            changed_at = now
+        now += 0.05
+    assert changed_at is not None
+    assert STEADY_S + PATIENCE_S <= changed_at <= STEADY_S + PATIENCE_S + 0.2
+
+
+class Ports:
+    """An autopilot with a port for each radio, each with numbers of its own."""
+
+    def __init__(self, radios: Radios) -> None:
+        self._far = radios.far
+        self._encoders = [FrameEncoder(1, 1) for _ in radios.far]
+
+    def say(self, message: Message, *ports: int) -> None:
+        for port in ports:
+            self._far[port].write(self._encoders[port].encode(message))
+
+
+async def changed_for_the_better(connection: Connection, ports: Ports, radios: Radios) -> LinkChoice:
+    """The second radio is the better one, and has just been taken."""
+    for step in range(200):
+        both = (0,) if step < 20 else (0, 1)
+        if step % 10 == 0:
+            ports.say(m.Heartbeat(2, 12, 81, 0, 4), *both)
+        await anyio.sleep(0.1)
+        assert connection._several is not None
+        choice = connection._several._choices.get(1)
+        if choice is not None and 1 in choice.candidates:
+            choice.candidates[1].is_proven = True
+            choice.candidates[0].note_round_trip(1.0, connection.now())
+            choice.candidates[1].note_round_trip(0.01, connection.now())
+        if choice is not None and choice.used is choice.candidates.get(1):
+            return choice
+    raise AssertionError("it was not taken")
+
+
+async def test_the_answer_to_what_was_ordered_before_a_change_is_taken_over_the_former_link_once() -> None:
+    """ArduPilot answers over the port that was asked, PX4 over all ports where it has seen us."""
+    radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        ports = Ports(radios)
+        await changed_for_the_better(connection, ports, radios)
+        answers: list[tuple[int, int]] = []
+        connection.bus.attach(m.CommandAck, lambda ack: answers.append((ack.command, ack.result)))
+        ports.say(m.CommandAck(176, 0), 0)
+        ports.say(m.CommandAck(400, 0), 0, 1)
+        await anyio.sleep(0.1)
+        ports.say(m.CommandAck(400, 4), 0, 1)
+        ports.say(m.CommandAck(400, 0), 0, 1)
+        await anyio.sleep(1)
+        assert answers == [(400, 0), (400, 4), (400, 0), (176, 0)]
+
+
+async def test_the_former_link_is_known_to_lead_to_the_vehicle() -> None:
+    radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        choice = await changed_for_the_better(connection, Ports(radios), radios)
+        radios.far[1].close()
+        await anyio.sleep(0.3)
+        assert choice.used is choice.candidates[0]
+
+
+async def test_a_peer_of_one_of_several_links_is_named_as_it_is_by_its_link() -> None:
+    """A program on board is started again, and has another port."""
+    here: socket.socket
+    async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]) as connection:
+        news = News(connection, events.VehicleMoved)
+        link = connection.link
+        assert isinstance(link, SeveralLinks)
+        said: list[str] = []
+        for round_ in range(2):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
+                here.bind(("127.0.0.1", 0))
+                said.append(f"127.0.0.1:{here.getsockname()[1]}")
+                encoder = FrameEncoder(1, 1)
+                for _ in range(4):
+                    link._heard(1, encoder.encode(AUTOPILOT), here.getsockname())
+                    await anyio.sleep(0.1)
+            if round_ == 0:
+                await anyio.sleep(4)
+        moved = news.all[0]
+        assert isinstance(moved, events.VehicleMoved)
+        assert [moved.before, moved.after] == said
+
+
+async def test_ids_that_somebody_makes_up_cost_little_and_not_for_long() -> None:
+    radios = Radios(2)
+    told = Told(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        for begin in (1, 101, 1, 101):
+            for system in range(1, 251):
+                for component in range(begin, begin + 4):
+                    radios.far[0].write(FrameEncoder(system, component).encode(AUTOPILOT))
+            await anyio.sleep(5)
+        asked = len(told.of(m.Timesync))
+        assert 200 < asked <= 25 * UNWANTED_HZ
+        await anyio.sleep(40)
+        told.messages.clear()
+        await anyio.sleep(10)
+        assert told.of(m.Timesync) == []
+        assert connection._several is not None
+        assert not any(connection._several._counters.values())
+        radios.far[0].write(FrameEncoder(7, 1).encode(AUTOPILOT))
+        await anyio.sleep(5)
+        assert len(told.of(m.Timesync)) >= 9

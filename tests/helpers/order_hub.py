@@ -1,0 +1,186 @@
+"""A hub between a program and a vehicle, with the bad air on either side of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+from order_air import Air, Crossing, Diary, Silence, Weather
+from order_airs import Airs, TwoLinks, joined, unused_airs
+from stream_splitter import Splitter
+
+import aerokit
+from aerokit.connection.routes import MOVES_AFTER_S
+from aerokit.errors import LinkLost
+from aerokit.hub import Endpoint, Hub
+from aerokit.hub.attachment import Attachment
+from aerokit.mavlink.message import Message
+from aerokit.sim import SimulatedVehicle, SimulatorServer
+from aerokit.transport import Link, memory_link_pair
+
+Side = Literal["vehicle", "program"]
+Ways = Literal["one", "vehicle twice", "program twice", "program copied"]
+FULL = 1 << 20
+"""More than any link of a hub may have before what follows has to wait."""
+
+
+NEVER = Silence(0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ThroughHub:
+    """Where the hub's trouble is; times are (from, until), in seconds since the order was given.
+
+    The weather is that on the bad ``side``. There the hub's endpoint takes nothing during ``jam``, and has gone during
+    ``away``. ``ways``: the vehicle is heard at two endpoints, of which the first falls into ``silence``; or the program
+    has two links to the hub, of which the one in use does; or a router copies what it sends to two endpoints.
+    """
+
+    side: Side
+    ways: Ways = "one"
+    jam: tuple[float, float] | None = None
+    away: tuple[float, float] | None = None
+    silence: Silence = NEVER
+
+    @property
+    def quiet_until(self) -> float:
+        """When the vehicle is heard, and told something, again."""
+        ends = [each[1] for each in (self.jam, self.away) if each is not None]
+        dumb = min(self.silence.end_s, self.silence.begin_s + MOVES_AFTER_S + 1.0)
+        return max([0.0, *ends, dumb if "twice" in self.ways else 0.0])
+
+
+@dataclass
+class HubsEnd(Air):
+    """The hub's end of a link."""
+
+    jam: tuple[float, float] | None = None
+    away: tuple[float, float] | None = None
+    weather: Weather = field(default_factory=lambda: Weather(latency_s=0.0))
+
+    def begin(self) -> None:
+        super().begin()
+        if self.away is not None:
+            loop, (begin, end) = asyncio.get_running_loop(), self.away
+            loop.call_later(begin, self._attachment.link_interrupted, LinkLost("it was pulled out"))
+            loop.call_later(end, self._attachment.link_restored, end - begin)
+
+    @property
+    def unsent_bytes(self) -> int:
+        return FULL if self._is_now(self.jam) else 0
+
+    @property
+    def _attachment(self) -> Attachment:
+        assert isinstance(self._receiver, Attachment)
+        return self._receiver
+
+    def _is_now(self, when: tuple[float, float] | None) -> bool:
+        since = asyncio.get_running_loop().time() - self.began_at
+        return when is not None and when[0] <= since < when[1]
+
+    def _is_out(self, *, is_up: bool) -> bool:
+        return self._is_now(self.away) or super()._is_out(is_up=is_up)
+
+    def _arrive(self, raw: bytes, message: Message) -> None:
+        if not self._is_now(self.away):
+            super()._arrive(raw, message)
+
+
+class HubSky:
+    """As :class:`order_air.Sky`: what the program has sent and heard. ``at_vehicle``: what the hub has sent to the
+    vehicle, by whichever endpoint, and heard of it.
+    """
+
+    def __init__(self, near: Air | Airs, through: ThroughHub) -> None:
+        self.near, self._through = near, through
+        self.at_vehicle = Diary()
+        self.vehicles_ends: list[HubsEnd] = []
+        self.programs_ends: list[HubsEnd] = []
+        self._weather = Weather()
+
+    @property
+    def weather(self) -> Weather:
+        return self._weather
+
+    @weather.setter
+    def weather(self, weather: Weather) -> None:
+        self._weather = weather
+        if self._through.side == "program":
+            self.near.weather = weather
+            return
+        for each in self.vehicles_ends:
+            each.weather = weather
+
+    def begin(self) -> None:
+        """The order is given now."""
+        ends = self.vehicles_ends if self._through.side == "vehicle" else self.programs_ends
+        ends[0].jam, ends[0].away = self._through.jam, self._through.away
+        if self._through.ways == "vehicle twice":
+            self.vehicles_ends[0].silence = self._through.silence
+        for each in (self.near, *self.vehicles_ends, *self.programs_ends):
+            each.begin()
+
+    def end(self) -> None:
+        """What of the program's has not come to the vehicle is lost."""
+        arrived = {each.raw for each in self.at_vehicle.sent if not each.is_lost}
+        for each in self.sent:
+            each.is_lost |= each.raw not in arrived
+
+    @property
+    def sent(self) -> list[Crossing]:
+        return self.near.sent
+
+    @property
+    def heartbeats(self) -> list[Crossing]:
+        return self.near.heartbeats
+
+
+@asynccontextmanager
+async def through_hub(
+    vehicle: SimulatedVehicle, through: ThroughHub
+) -> AsyncIterator[tuple[HubSky, Link | aerokit.Connection]]:
+    """What a vehicle is connected to by, and what crosses it."""
+    async with AsyncExitStack() as stack:
+        near, fars = await _programs_side(stack, through)
+        sky = HubSky(near, through)
+        sky.programs_ends = [HubsEnd(each) for each in fars]
+        sky.vehicles_ends = await _vehicles_side(stack, vehicle, through, sky.at_vehicle)
+        ends = {"vehicle": sky.vehicles_ends, "program": sky.programs_ends}
+        named = [
+            Endpoint(each, name=f"{name} {number}")
+            for name, those in ends.items()
+            for number, each in enumerate(those, 1)
+        ]
+        await stack.enter_async_context(Hub(named))
+        yield sky, near if isinstance(near, Air) else await stack.enter_async_context(joined(near))
+        sky.end()
+
+
+async def _programs_side(stack: AsyncExitStack, through: ThroughHub) -> tuple[Air | Airs, list[Link]]:
+    """The program's end, and the hub's."""
+    pairs = [memory_link_pair() for _ in range(1 if through.ways in ("one", "vehicle twice") else 2)]
+    fars: list[Link] = [far for _, far in pairs]
+    if through.ways == "program copied":
+        splitter = Splitter([near for near, _ in pairs])
+        await splitter.open(stack)
+        return Air(splitter.port), fars
+    if through.ways == "program twice":
+        return unused_airs([near for near, _ in pairs], TwoLinks(through.silence)), fars
+    return Air(pairs[0][0]), fars
+
+
+async def _vehicles_side(
+    stack: AsyncExitStack, vehicle: SimulatedVehicle, through: ThroughHub, diary: Diary
+) -> list[HubsEnd]:
+    """The hub's ends."""
+    pairs = [memory_link_pair() for _ in range(2 if through.ways == "vehicle twice" else 1)]
+    ports: list[Link] = [far for _, far in pairs]
+    if len(pairs) > 1:
+        splitter = Splitter([far for _, far in pairs])
+        await splitter.open(stack)
+        ports = [splitter.port]
+    await stack.enter_async_context(SimulatorServer(vehicle, ports))
+    return [HubsEnd(near, diary=diary) for near, _ in pairs]

@@ -1,0 +1,145 @@
+"""A zenoh network on this machine: explicit endpoints on 127.0.0.1, no scouting, other processes, a line that holds."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+
+import anyio
+
+__all__ = ["VEHICLE_SIDE", "HoldingProxy", "eventually", "free_port", "process", "router"]
+
+ROUTER = """
+import json, sys, zenoh
+config = zenoh.Config.from_file(sys.argv[2]) if len(sys.argv) > 2 else zenoh.Config()
+for key, value in (("mode", "router"), ("scouting/multicast/enabled", False), ("listen/endpoints", [sys.argv[1]])):
+    config.insert_json5(key, json.dumps(value))
+session = zenoh.open(config)
+print("up", flush=True)
+sys.stdin.read()
+"""
+VEHICLE_SIDE = """
+import asyncio, sys
+from aerokit.transport import create_link
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import Heartbeat
+
+class Ears:
+    def bytes_received(self, data, peer): pass
+    def link_lost(self, error): sys.exit(str(error))
+
+async def main():
+    link, encoder = create_link(sys.argv[1]), FrameEncoder(1, 1)
+    await link.open(Ears())
+    print("up", flush=True)
+    while True:
+        link.write(encoder.encode(Heartbeat(2, 3, 81, 4, 3)))
+        await asyncio.sleep(0.1)
+
+asyncio.run(main())
+"""
+
+
+async def eventually(condition: Callable[[], bool]) -> None:
+    """Until it holds: threads of others and other processes are waited for; 100 s are for hung tests only."""
+    with anyio.fail_after(100):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+def free_port() -> int:
+    """One that nobody listens on now."""
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+@contextlib.contextmanager
+def process(program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Another process, from when it says that it is up."""
+    with subprocess.Popen(
+        [sys.executable, "-c", program, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as running:
+        try:
+            assert running.stdout is not None
+            assert running.stdout.readline() == "up\n"
+            yield running
+        finally:
+            running.kill()
+
+
+def router(port: int, config: str = "") -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
+    """A zenoh router, with a configuration file or without."""
+    return process(ROUTER, f"tcp/127.0.0.1:{port}", *filter(None, [config]))
+
+
+class HoldingProxy:
+    """A line to a port that can keep back what is on it, and let it go later."""
+
+    def __init__(self, port: int) -> None:
+        self.port = free_port()
+        self.held_bytes = 0
+        self._to = port
+        self._flows = asyncio.Event()
+        self._flows.set()
+        self._writers: list[asyncio.StreamWriter] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._server: asyncio.AbstractServer | None = None
+
+    async def __aenter__(self) -> HoldingProxy:
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", self.port)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._server is not None
+        self._server.close()
+        for task in self._tasks:
+            task.cancel()
+        for writer in self._writers:
+            writer.close()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(writer.wait_closed() for writer in self._writers), return_exceptions=True)
+
+    def hold(self) -> None:
+        """From now on nothing arrives."""
+        self._flows.clear()
+
+    def release(self) -> None:
+        """All that was kept back arrives."""
+        self._flows.set()
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there, back = await asyncio.open_connection("127.0.0.1", self._to)
+        self._writers += [writer, back]
+        for source, sink in ((reader, back), (there, writer)):
+            task = asyncio.get_running_loop().create_task(self._carry(source, sink))
+            self._tasks.add(task)
+
+    async def _carry(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        held: list[bytes] = []
+
+        async def let_go() -> None:
+            await self._flows.wait()
+            sink.writelines(held)
+            held.clear()
+
+        letting_go: asyncio.Task[None] | None = None
+        with contextlib.suppress(ConnectionError):
+            while data := await source.read(65536):
+                held.append(data)
+                if self._flows.is_set() and (letting_go is None or letting_go.done()):
+                    await let_go()
+                    continue
+                self.held_bytes += len(data)
+                if letting_go is None or letting_go.done():
+                    letting_go = asyncio.get_running_loop().create_task(let_go())
+                    self._tasks.add(letting_go)
+        sink.close()

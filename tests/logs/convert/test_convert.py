@@ -1,0 +1,291 @@
+"""Converted logs are read back by the libraries of their formats and compared with the log itself."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import struct
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+from defusedxml import ElementTree
+
+from aerokit import messages as m
+from aerokit.apps.cli import main
+from aerokit.errors import FileFormatError, InvalidArgument
+from aerokit.logs.convert import convert
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.tlog import TlogWriter, read_tlog
+from aerokit.protocols.exchange import Progress
+
+RECORDING = Path(__file__).parents[2] / "recordings" / "px4-quad.tlog"
+BEGIN = 1_700_000_000.25
+PLACES = [(47.4 + i * 1e-4, 8.5 - i * 1e-4, 500.0 + i, float(i)) for i in range(5)]
+"""Degrees, and metres above the sea and above home: one a second."""
+
+
+def flight() -> Iterator[tuple[float, Message]]:
+    for i, (latitude, longitude, amsl, relative) in enumerate(PLACES):
+        at = BEGIN + i
+        yield at, m.Heartbeat(2, 3, 81 | (128 if i > 1 else 0), 4 if i > 1 else 0, 4, 3)
+        yield at, m.Attitude(i * 1000, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0)
+        yield (
+            at + 0.1,
+            m.GlobalPositionInt(
+                i * 1000,
+                round(latitude * 1e7),
+                round(longitude * 1e7),
+                round(amsl * 1e3),
+                round(relative * 1e3),
+                100,
+                200,
+                -300,
+                9000,
+            ),
+        )
+    yield BEGIN + 4.2, m.Statustext(4, "hello <sea> & sky")
+    yield BEGIN + 4.3, m.SetupSigning(1, 1, b"s" * 32, 5)
+    for item in (
+        m.MissionItemInt(255, 0, 1, 3, 16, 0, 1, 0, 0, 0, 0, 474010000, 85010000, 30.0),  # above home
+        m.MissionItemInt(255, 0, 2, 0, 16, 0, 1, 0, 0, 0, 0, 474020000, 85020000, 555.0),  # above the sea
+        m.MissionItemInt(255, 0, 3, 10, 16, 0, 1, 0, 0, 0, 0, 474030000, 85030000, 7.0),  # above the ground
+    ):
+        yield BEGIN + 4.4, item
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "a & b.tlog"
+    encoder = FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for at, message in flight():
+            writer.write(encoder.encode(message), at)
+    return path
+
+
+def mcap_messages(path: Path) -> list[tuple[str, str, float, dict[str, Any]]]:
+    reader = pytest.importorskip("mcap.reader")
+    with path.open("rb") as file:
+        return [
+            (channel.topic, schema.name, message.log_time / 1e9, json.loads(message.data))
+            for schema, channel, message in reader.make_reader(file).iter_messages()
+        ]
+
+
+def test_mcap_has_the_topics_of_the_bridge_and_the_messages(log: Path, tmp_path: Path) -> None:
+    done = convert(log, tmp_path / "out.mcap")
+    read = mcap_messages(tmp_path / "out.mcap")
+    assert done.written == len(read)
+    assert (done.begins_at, done.ends_at) == pytest.approx((BEGIN, BEGIN + 4.4), abs=1e-5)
+    fixes = [(at, fields) for topic, _, at, fields in read if topic == "/vehicle/1/location"]
+    for i, ((at, fix), place) in enumerate(zip(fixes, PLACES, strict=True)):
+        assert at == pytest.approx(BEGIN + i + 0.1, abs=1e-5)
+        assert (fix["latitude"], fix["longitude"], fix["altitude"]) == pytest.approx(place[:3], abs=1e-7)
+        assert fix["velocity"] == pytest.approx({"x": 2.0, "y": 1.0, "z": 3.0})
+        assert fix["timestamp"]["sec"] == int(at)
+    names = {topic: schema for topic, schema, _, _ in read}
+    assert names["/vehicle/1/location"] == "foxglove.LocationFix"
+    assert names["/vehicle/1/transform"] == "foxglove.FrameTransform"
+    assert names["/vehicle/1/pose"] == "foxglove.PoseInFrame"
+    by_topic = {topic: fields for topic, _, _, fields in read}
+    assert by_topic["/vehicle/1/log"]["message"] == "hello <sea> & sky"
+    assert by_topic["/vehicle/1/log"]["level"] == 3
+    assert by_topic["/vehicle/1/armed"] == {"value": True}
+    assert by_topic["/vehicle/1/mode"]["name"] == "GUIDED"
+    assert by_topic["/vehicle/1/pose"]["pose"]["position"]["z"] == pytest.approx(4.0)
+    assert by_topic["/mavlink/1/1/GLOBAL_POSITION_INT"]["alt"] == 504_000
+    assert "secret_key" not in by_topic["/mavlink/1/1/SETUP_SIGNING"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_table_of_the_flight(log: Path, tmp_path: Path, suffix: str) -> None:
+    done = convert(log, tmp_path / f"out{suffix}")
+    rows = read_table(tmp_path / f"out{suffix}")
+    assert done.written == len(rows) == len(PLACES)
+    for i, (row, place) in enumerate(zip(rows, PLACES, strict=True)):
+        assert row["time_utc"].timestamp() == pytest.approx(BEGIN + i + 0.1, abs=2e-6)
+        columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m")
+        assert [float(row[name]) for name in columns] == pytest.approx(place, abs=1e-7)
+        assert float(row["down_m_s"]) == -3.0
+        assert float(row["yaw_deg"]) == pytest.approx(17.188734)
+        assert str(row["armed"]) == str(i > 1)
+        assert row["mode"] == ("GUIDED" if i > 1 else "STABILIZE")
+        assert row["satellites"] in (None, "")
+
+
+def read_table(path: Path) -> list[dict[str, Any]]:
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8", newline="") as file:
+            return [
+                {**row, "time_utc": datetime.fromisoformat(row["time_utc"])} for row in csv.DictReader(file)
+            ]
+    rows: list[dict[str, Any]] = pytest.importorskip("pyarrow.parquet").read_table(path).to_pylist()
+    return rows
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_folder_has_a_table_for_each_message(tmp_path: Path, kind: str) -> None:
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
+    done = convert(RECORDING, tmp_path / "all", tables=kind)
+    decoded = [
+        (at, STANDARD.decode(frame))
+        for at, raw in read_tlog(RECORDING)
+        if (frame := Frame.parse(raw)).message_id in STANDARD
+    ]
+    assert done.written == len(decoded)
+    tables = {path.stem: read_table(path) for path in (tmp_path / "all").iterdir()}
+    assert tables.keys() == {message.NAME for _, message in decoded}
+    positions = [(at, each) for at, each in decoded if isinstance(each, m.GlobalPositionInt)]
+    for row, (at, position) in zip(tables["GLOBAL_POSITION_INT"], positions, strict=True):
+        assert row["time_utc"].timestamp() == pytest.approx(at, abs=2e-6)
+        assert int(row["lat_degE7"]) == position.lat
+        assert int(row["alt_mm"]) == position.alt
+        assert int(row["vx_cm_s"]) == position.vx
+        assert int(row["time_boot_ms"]) == position.time_boot_ms
+        assert int(row["system_id"]) == 1
+
+
+def test_gpx_has_times_elevations_and_the_mission(log: Path, tmp_path: Path) -> None:
+    gpxpy = pytest.importorskip("gpxpy")
+    convert(log, tmp_path / "out.gpx")
+    read = gpxpy.parse((tmp_path / "out.gpx").read_text())
+    points = read.tracks[0].segments[0].points
+    for i, (point, place) in enumerate(zip(points, PLACES, strict=True)):
+        assert (point.latitude, point.longitude, point.elevation) == pytest.approx(place[:3], abs=1e-7)
+        assert point.time.timestamp() == pytest.approx(BEGIN + i + 0.1, abs=1e-3)
+    assert [(each.name, each.elevation) for each in read.waypoints] == [
+        ("1 NAV_WAYPOINT", 530.0),
+        ("2 NAV_WAYPOINT", 555.0),
+        ("3 NAV_WAYPOINT", None),
+    ]
+
+
+def test_kml_says_what_its_altitudes_are_above(log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("simplekml")
+    convert(log, tmp_path / "out.kml")
+    root: Any = ElementTree.parse(tmp_path / "out.kml").getroot()
+    spaces = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
+    track = root.find(".//gx:Track", spaces)
+    assert track.findtext("k:altitudeMode", namespaces=spaces) == "absolute"
+    when = [
+        datetime.fromisoformat(each.text.replace("Z", "+00:00")) for each in track.findall("k:when", spaces)
+    ]
+    assert when[0] == datetime.fromtimestamp(BEGIN + 0.1, timezone.utc)
+    where = [[float(each) for each in place.text.split()] for place in track.findall("gx:coord", spaces)]
+    assert where == [pytest.approx((place[1], place[0], place[2]), abs=1e-7) for place in PLACES]
+    points = [
+        (
+            mark.findtext(".//k:altitudeMode", namespaces=spaces),
+            mark.findtext(".//k:coordinates", namespaces=spaces),
+        )
+        for mark in root.findall(".//k:Placemark", spaces)
+        if mark.find("k:Point", spaces) is not None
+    ]
+    assert points == [
+        ("absolute", "8.501,47.401,530.0"),
+        ("absolute", "8.502,47.402,555.0"),
+        ("relativeToGround", "8.503,47.403,7.0"),
+    ]
+
+
+def test_nothing_is_overwritten_unasked_and_nothing_half_written_stays(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = tmp_path / "out.csv"
+    there.write_text("mine")
+    folder = tmp_path / "all"
+    folder.mkdir()
+    (folder / "mine.txt").write_text("mine")
+    for target in (there, folder):
+        with pytest.raises(InvalidArgument, match="there already"):
+            convert(log, target)
+    assert there.read_text() == "mine"
+
+    def break_off(progress: Progress) -> None:
+        raise OSError("the disk is full")
+
+    for target in (there, folder):
+        with pytest.raises(OSError, match="full"):
+            convert(log, target, force=True, on_progress=break_off)
+    assert there.read_text() == "mine"
+    assert sorted(each.name for each in tmp_path.iterdir()) == sorted([log.name, "all", "out.csv"])
+    convert(log, there, force=True)
+    convert(log, folder, force=True)
+    assert there.read_text().startswith("time_utc,")
+    assert (folder / "mine.txt").read_text() == "mine"
+    assert (folder / "ATTITUDE.csv").exists()
+    assert sorted(each.name for each in tmp_path.iterdir()) == sorted([log.name, "all", "out.csv"])
+
+
+def test_a_damaged_log_is_converted_as_far_as_it_goes(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray(log.read_bytes())
+    at = data.index(struct.pack(">Q", round((BEGIN + 2.1) * 1e6))) + 25
+    data[at] ^= 0xFF  # inside the payload of a position
+    damaged = tmp_path / "damaged.tlog"
+    damaged.write_bytes(data[:-9])
+    assert main(["convert", str(damaged), str(tmp_path / "out.csv"), "--json"]) == 0
+    captured = capsys.readouterr()
+    told = json.loads(captured.out)
+    assert told["type"] == "conversion"
+    assert told["written"] == len(PLACES) - 1 == len(read_table(tmp_path / "out.csv"))
+    assert len(told["notes"]) == 1
+    assert "1 of" in captured.err
+    assert "damaged" in captured.err
+
+
+def test_what_is_no_log_or_no_format_is_said(log: Path, tmp_path: Path) -> None:
+    text = tmp_path / "text.tlog"
+    text.write_text("no log at all")
+    for source, target, error, says in [
+        (text, "out.csv", FileFormatError, "no MAVLink"),
+        (tmp_path / "log.txt", "out.csv", FileFormatError, ".tlog"),
+        (log, "out.xlsx", InvalidArgument, ".mcap"),
+        (tmp_path / "missing.tlog", "out.csv", FileNotFoundError, "missing"),
+    ]:
+        with pytest.raises(error, match=says):
+            convert(source, tmp_path / target)
+    for suffix in (".bin", ".ulg"):
+        other = shutil.copy(text, tmp_path / f"text{suffix}")
+        with pytest.raises(FileFormatError, match="no log of"):
+            convert(other, tmp_path / "out.csv")
+    assert not list(tmp_path.glob("out*"))
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_the_command_says_what_it_did(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 0
+    assert "2023-11-14 22:13:20" in capsys.readouterr().out
+    assert main(["convert", str(log), str(tmp_path / "out.gpx")]) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("out.csv", "5 rows from 20 entries, "),
+        ("out.mcap", "messages from 20 entries, "),
+        ("out.gpx", "5 points from 20 entries, "),
+        ("folder", "20 rows from 20 entries, "),
+    ],
+)
+def test_counts_are_of_what_they_say(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, says: str
+) -> None:
+    assert main(["convert", str(log), str(tmp_path / name)]) == 0
+    told = capsys.readouterr().out
+    assert says in told
+    assert " kB, 2023" in told
+    assert main(["convert", str(log), str(tmp_path / name), "--force", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert f": {record['written']} " in told
+    assert record["entries"] == 20

@@ -1,0 +1,355 @@
+"""The report is read back: what is in it, what is not, and that a hostile log says nothing but text."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+import aerokit
+from aerokit import messages as m
+from aerokit.apps.cli import main
+from aerokit.logs.flights import Columns, Flight, failsafes, read_flight
+from aerokit.logs.flights.flight import Said, Waypoint
+from aerokit.logs.report.charts import points, rows_to_draw
+from aerokit.logs.report.figures import clock, length, span
+from aerokit.logs.report.writing import report_html
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.tlog import TlogWriter
+from aerokit.position import Position
+from aerokit.testing import open_flight, run_virtual
+
+pytest.importorskip("plotly")
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+
+
+class Page(HTMLParser):
+    """What a browser would see: tags with what runs in them, and texts."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(convert_charrefs=True)
+        self.tags: list[str] = []
+        self.handlers: list[str] = []
+        self.addresses: list[str] = []
+        self.scripts: list[str] = []
+        self.text = ""
+        self._script: dict[str, str | None] | None = None
+        self.charts: dict[str, Any] = {}
+        self.html = path.read_text(encoding="utf-8")
+        self.feed(self.html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.handlers += [name for name, _ in attrs if name.startswith("on")]
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        self._script = dict(attrs) if tag == "script" else None
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "script" and self._script is not None:
+            if self._script.get("id") == "charts":
+                self.charts = json.loads(self.scripts.pop())
+            self._script = None
+
+    def handle_data(self, data: str) -> None:
+        if self._script is not None:
+            self.scripts[-1] += data
+        else:
+            self.text += data + "\n"
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """A simulated flight whose battery runs low on the way, recorded by the program, and what was truly flown."""
+    path = tmp_path_factory.mktemp("flown") / "flight.tlog"
+    parameters = {"BATT_FS_LOW_ACT": 2, "FENCE_ENABLE": 1, "FENCE_TYPE": 2, "FENCE_RADIUS": 150}
+
+    async def fly() -> dict[str, Any]:
+        async with open_flight("copter", connect=False, seed=3, parameters=parameters) as flight:
+            async with aerokit.connect(flight.link, record=path) as vehicle:
+                await vehicle.wait_ready()
+                for name in parameters:
+                    await vehicle.parameters.read(name)
+                await vehicle.arm()
+                await vehicle.take_off(20)
+                await vehicle.go_to(vehicle.position.value.offset(north_m=60, east_m=30))
+                flight.faults.set_battery(12)
+                await anyio.sleep(60)
+            return {"path": path, "track": flight.track, "journal": flight.journal}
+
+    return run_virtual(fly())
+
+
+@pytest.fixture(scope="module")
+def page(flown: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Page:
+    target = tmp_path_factory.mktemp("report") / "flight.html"
+    assert main(["report", str(flown["path"]), "-o", str(target)]) == 0
+    return Page(target)
+
+
+def test_the_flight_is_what_was_flown(flown: dict[str, Any]) -> None:
+    flight, track = read_flight(flown["path"]), flown["track"]
+    assert [change.name for change in flight.modes] == track.modes
+    ((begin, end),) = flight.armed
+    assert end - begin == pytest.approx(track.armed_s, abs=1.5)
+    assert max(flight.track["altitude_relative_m"]) == pytest.approx(track.max_altitude_m, abs=0.5)
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.kind, failsafe.acted) == ("battery", True)
+    assert failsafe.reaction.startswith("mode GUIDED → RTL")
+    said = next(text for text in flown["journal"].texts if "is low" in text.text)
+    assert any(said.text in sign.text for sign in failsafe.signs)
+    assert any("67 m from home" in fact for fact in failsafe.led_to)
+    assert any("BATT_FS_LOW_ACT = 2" in fact for fact in failsafe.led_to)
+
+
+def test_the_page_says_it_in_words_and_draws_it(page: Page, flown: dict[str, Any]) -> None:
+    track = flown["track"]
+    assert f"highest {track.max_altitude_m:.1f} m above home" in page.text
+    assert "1 failsafe: Battery at" in page.text
+    assert "GUIDED → RTL" in page.text
+    traces = {trace["name"]: trace for trace in page.charts["map"]["traces"]}
+    assert {"STABILIZE", "GUIDED", "RTL", "home", "failsafe", "fence"} <= traces.keys()
+    assert (max(traces["fence"]["x"]), max(traces["fence"]["y"])) == pytest.approx((150, 150), abs=0.2)
+    assert (traces["failsafe"]["x"][0], traces["failsafe"]["y"][0]) == pytest.approx((30, 60), abs=2)
+    farthest = max((x**2 + y**2) ** 0.5 for x, y in zip(traces["RTL"]["x"], traces["RTL"]["y"], strict=True))
+    assert farthest == pytest.approx(track.max_distance_m, abs=1)
+    heights = page.charts["heights"]["traces"][-1]["y"]
+    assert max(heights) == pytest.approx(track.max_altitude_m, abs=0.5)
+    drawn = set(re.findall(r'data-chart="([^"]+)"', page.html))
+    assert drawn == page.charts.keys()
+
+
+def test_nothing_is_loaded_and_only_our_two_scripts_may_run(page: Page) -> None:
+    assert all(address.startswith("#") for address in page.addresses)
+    assert not {"link", "iframe", "object", "embed", "img", "base", "form"} & set(page.tags)
+    assert not page.handlers
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]+)"', page.html)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    allowed = re.findall(r"'sha256-([^']+)'", policy[1])
+    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in page.scripts]
+    assert allowed == hashes
+    assert "unsafe-inline" not in policy[1].split("script-src")[1].split(";")[0]
+
+
+@pytest.fixture
+def hostile_log(tmp_path: Path) -> Path:
+    path, encoder = tmp_path / f"{HOSTILE.replace('/', '')[:40]}.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for i in range(30):
+            for message in (
+                m.Heartbeat(2, 3, 81 + 128 * (i > 3), 0xFFFF_FFF0 + i // 10, 4, 3),
+                m.Statustext(2, HOSTILE[:50]),
+                m.Statustext(1, f"Battery failsafe {HOSTILE}"[:50]),
+                m.ParamValue("<b>&\"'</script>", float(i), 9, 1, 0),
+                m.GlobalPositionInt(i, 470000000 + i, 80000000, 500000, 1000 * i, 0, 0, 0, 0),
+                m.MissionItemInt(1, 1, 0, 3, 60000, 0, 1, 0, 0, 0, 0, 470000000, 80000000, float("nan")),
+            ):
+                writer.write(encoder.encode(message), 1_700_000_000 + i)
+    return path
+
+
+def test_what_a_hostile_log_says_is_text(hostile_log: Path, tmp_path: Path) -> None:
+    target = tmp_path / "out.html"
+    for arguments in ([str(hostile_log)], [str(hostile_log), str(hostile_log)]):
+        assert main(["report", *arguments, "-o", str(target), "--force"]) == 0
+        page = Page(target)
+        assert HOSTILE[:30] in page.text
+        assert page.tags.count("script") == 3
+        assert not page.handlers
+        assert not {"img", "b"} & set(page.tags)
+        texts = json.dumps(page.charts)
+        assert "alert" not in texts
+        assert "</" not in target.read_text().split('id="charts">')[1].split("</script>")[0]
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    path, encoder, target = tmp_path / "bare.tlog", FrameEncoder(1, 1), tmp_path / "bare.html"
+    with TlogWriter(path) as writer:
+        for i in range(5):
+            writer.write(encoder.encode(m.Heartbeat(2, 3, 81, 0, 3, 3)), 1_700_000_000 + i)
+    assert main(["report", str(path), "-o", str(target)]) == 0
+    page = Page(target)
+    assert "It was never armed" in page.text
+    for missing in (
+        *(
+            "The log has no positions.",
+            "The log has nothing of a battery.",
+            "The log has no levels of vibration.",
+        ),
+        *("The log has no attitude.", "The log has no parameters.", "the log has no texts."),
+        *("The log has nothing of the estimator.", "The log has nothing of a satellite receiver."),
+    ):
+        assert missing in page.text
+    assert page.charts.keys() == {"lost", "received"}
+
+
+def test_two_flights_are_compared(
+    flown: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target, other = tmp_path / "both.html", RECORDINGS / "px4-quad.tlog"
+    assert main(["report", str(flown["path"]), str(other), "-o", str(target), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["type"] == "report"
+    highest = [figures["highest_m"] for figures in told["figures"]]
+    page = Page(target)
+    assert f"{highest[0]:.1f}\n{highest[1]:.1f}\n{highest[1] - highest[0]:+.1f}" in page.text
+    assert [trace["name"] for trace in page.charts["both-height"]["traces"]] == ["A", "B"]
+    east = [x for trace in page.charts["maps"]["traces"] for x in trace["x"] if x is not None]
+    least, greatest = page.charts["maps"]["layout"]["xaxis"]["autorangeoptions"]["include"]
+    assert (least < min(east), greatest > max(east)) == (True, True)
+    assert "COM_LOW_BAT_ACT" in page.text
+    assert "not there" in page.text
+    assert "Failsafes of A" in page.text
+
+
+def test_a_file_is_not_replaced_unasked(
+    flown: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = Path(shutil.copy(flown["path"], tmp_path))
+    target = log.with_suffix(".html")
+    target.write_text("mine")
+    assert main(["report", str(log)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert target.read_text() == "mine"
+    assert main(["report", str(log), "-o", str(log), "--force"]) == 2
+    assert main(["report", str(tmp_path / "none.tlog")]) == 6
+    assert main(["report", str(log), "--force"]) == 0
+    assert target.read_text().startswith("<!doctype html>")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["flight.html", "flight.tlog"]
+
+
+def test_it_is_opened_only_if_asked(
+    flown: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    target = tmp_path / "a b.html"
+    assert main(["report", str(flown["path"]), "-o", str(target)]) == 0
+    assert opened == []
+    assert main(["report", str(flown["path"]), "-o", str(target), "--force", "--open"]) == 0
+    assert opened == [target.as_uri()]
+
+
+def test_peaks_and_gaps_stay_in_what_is_drawn() -> None:
+    columns = Columns("value")
+    for i in range(100_000):
+        columns.add(
+            i / 10,
+            1000.0
+            if i == 54_321
+            else -7.0
+            if i == 77_777
+            else float("nan")
+            if 30_000 < i < 40_000
+            else i % 3,
+        )
+    times, values = points(columns, "value")
+    assert len(times) <= 2100
+    assert values[times.index(5432.1)] == 1000.0
+    assert min(value for value in values if value is not None) == -7.0
+    assert None in values
+    assert all(value is None for time, value in zip(times, values, strict=True) if 3001 < time < 3999)
+    assert rows_to_draw(3, (columns["value"],)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("told", "expected"),
+    [
+        (clock(187.46), "3:07.5"),
+        (clock(59.96), "1:00.0"),
+        (span(47.2), "47 s"),
+        (span(725), "12 min 5 s"),
+        (span(3600 + 180), "1 h 3 min"),
+        (length(9.94), "9.9 m"),
+        (length(3440), "3.4 km"),
+    ],
+)
+def test_numbers_as_people_read_them(told: str, expected: str) -> None:
+    assert told == expected
+
+
+@pytest.fixture
+def chromium() -> str:
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None:
+        pytest.skip("no Chromium here")
+    return found
+
+
+def test_a_browser_without_network_draws_all_charts(page: Page, chromium: str, tmp_path: Path) -> None:
+    target = tmp_path / "page.html"
+    target.write_text(page.html, encoding="utf-8")
+    dumped = subprocess.run(
+        [
+            *(chromium, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+            *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+            *(f"--user-data-dir={tmp_path / 'browser'}", "--host-resolver-rules=MAP * ~NOTFOUND"),
+            *("--virtual-time-budget=4000", "--window-size=900,7000", "--dump-dom", target.as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=True,
+    ).stdout
+    assert dumped.count('class="main-svg"') >= len(page.charts)
+    assert dumped.count('class="chart js-plotly-plot"') == len(page.charts)
+
+
+def test_what_is_no_log_by_its_name_is_said_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "px4.html"
+    page.write_text("mine")
+    for more in ([], ["--force"]):
+        assert main(["report", str(page), *more]) == 6
+        assert "px4.html is no flight log by its name: .tlog, .bin, .ulg" in capsys.readouterr().err
+    assert page.read_text() == "mine"
+
+
+def test_of_a_flight_that_was_none_nothing_is_called_flown(tmp_path: Path) -> None:
+    flight = Flight(
+        tmp_path / "ground.bin", ends_at=4.0, autopilot="ArduPilot", home=Position(47.0, 8.0, 500.0)
+    )
+    flight.note_mode(0.0, "STABILIZE")
+    flight.mission = [Waypoint(0, 16, 47.0, 8.0, 500.0, 0)]
+    flight.receiver(0).add(0.0, 3, 10, 0.8, 1.0)
+    flight.receiver(0).add(1.0, 6, 10, 0.8, 1.0)
+    flight.receiver(0).add(2.0, 42, 10, 0.8, 1.0)
+    flight.texts = [Said(1.0, None, "hello"), Said(2.0, 3, "bad")]
+    for east in range(3):
+        flight.track.add(float(east), 47.0, 8.0 + east * 1e-4, 500.0, 0.0)
+    target = tmp_path / "ground.html"
+    target.write_text(report_html(flight), encoding="utf-8")
+    page = Page(target)
+    assert "It was never armed: 4 s on the ground." in page.text
+    assert "\nIn STABILIZE (4 s)." in page.text
+    assert "Flown in" not in page.text
+    assert "No mission: home only" in page.text
+    assert "0:01.0\n—\nhello" in page.text
+    assert "0:02.0\nerror\nbad" in page.text
+    axis = page.charts["gps-fix_type"]["layout"]["yaxis"]
+    assert (axis["tickvals"], axis["ticktext"]) == ([3, 6, 42], ["3D", "RTK fixed", "42"])
+    least, greatest = page.charts["map"]["layout"]["xaxis"]["autorangeoptions"]["include"]
+    assert least <= -1
+    assert 16.1 < greatest < 17  # 15.2 m of track, and 1 m
+
+
+def test_whose_lost_messages_they_are_is_said(tmp_path: Path, page: Page) -> None:
+    flight = Flight(tmp_path / "px4.ulg", ends_at=4.0, autopilot="PX4")
+    flight.link.add(0.0, 1.0, float("nan"))
+    target = tmp_path / "px4.html"
+    target.write_text(report_html(flight), encoding="utf-8")
+    said = "What the autopilot counted of the messages that it did not get"
+    assert said in Page(target).text
+    assert said not in page.text

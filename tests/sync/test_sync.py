@@ -1,0 +1,514 @@
+"""The blocking twin: the same signatures, the same errors, Ctrl-C, and nothing left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from typing import Any
+
+import pytest
+from ctrl_c import interrupt_soon
+from for_each import for_each
+from served_copter import complaints, served, served_copter
+
+import aerokit
+import aerokit.sync
+import aerokit.sync.twins
+from aerokit import errors, events, messages
+from aerokit.connection.bus import Subscription
+from aerokit.connection.cells import StateCell
+from aerokit.connection.opening import open_connection
+from aerokit.events import LinkState
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.missions import Fence, FenceCircle, Mission, waypoint
+from aerokit.sim import SimulatedCopter, SimulatedGimbal
+from aerokit.sync.generator import FILE, generate
+from aerokit.vehicle.commanding.guided import Guided, SetpointStream
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+from aerokit.vehicle.files.files import Files
+from aerokit.vehicle.files.logs import Logs
+from aerokit.vehicle.missions.mission import MissionControl
+from aerokit.vehicle.missions.plans import FenceControl, RallyControl
+from aerokit.vehicle.parameters.parameters import Parameters, Transaction
+from aerokit.vehicle.state.field import Told
+
+LOOP_THREAD = "aerokit loop"
+
+
+def loop_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == LOOP_THREAD]
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left() -> Iterator[None]:
+    yield
+    for thread in loop_threads():
+        thread.join(100)  # closed by another thread a moment ago
+    assert not loop_threads()
+
+
+@pytest.fixture
+def copter() -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0.0)
+
+
+@pytest.fixture
+def vehicle(copter: SimulatedCopter) -> Iterator[aerokit.sync.Vehicle]:
+    with served([copter]) as address, aerokit.sync.connect(address) as vehicle:
+        yield vehicle
+
+
+# ------------------------------------------------------------------------------------- twins
+
+
+def public_names(cls: type) -> set[str]:
+    return {name for name in dir(cls) if not name.startswith("_")}
+
+
+def parameters(function: Any) -> list[inspect.Parameter]:
+    return list(inspect.signature(function).parameters.values())
+
+
+def kind_of(cls: type, name: str) -> str:
+    member = inspect.getattr_static(cls, name)
+    return "value" if isinstance(member, (property, cached_property, Told)) else "method"
+
+
+TWINS: list[tuple[type, type, set[str]]] = [
+    (aerokit.Vehicle, aerokit.sync.Vehicle, set()),
+    (StateCell, aerokit.sync.StateCell, {"observe", "set", "forget", "close"}),
+    (Guided, aerokit.sync.Guided, set()),
+    (SetpointStream, aerokit.sync.SetpointStream, set()),
+    (Files, aerokit.sync.twins.Files, set()),
+    (Logs, aerokit.sync.twins.Logs, set()),
+    (MissionControl, aerokit.sync.twins.MissionControl, set()),
+    (FenceControl, aerokit.sync.twins.FenceControl, set()),
+    (RallyControl, aerokit.sync.twins.RallyControl, set()),
+    (Parameters, aerokit.sync.twins.Parameters, set()),
+    (Transaction, aerokit.sync.twins.Transaction, set()),
+    (Subscription, aerokit.sync.Subscription, set()),
+]
+MEMBERS = [
+    (original, twin, name)
+    for original, twin, left_out in TWINS
+    for name in sorted(public_names(original) - left_out)
+]
+
+
+@for_each("original, twin, name", MEMBERS)
+def test_every_member_has_its_twin(original: type, twin: type, name: str) -> None:
+    assert hasattr(twin, name), f"aerokit.sync has no {twin.__name__}.{name}"
+    if name in original.__dict__.get("__slots__", ()):
+        return
+    assert kind_of(original, name) == kind_of(twin, name)
+    if kind_of(original, name) == "method":
+        assert not inspect.iscoroutinefunction(getattr(twin, name))
+        given, wanted = (inspect.signature(getattr(each, name)).parameters for each in (twin, original))
+        assert [(each.name, each.kind, each.default) for each in given.values()] == [
+            (each.name, each.kind, each.default) for each in wanted.values()
+        ]
+
+
+def test_the_twins_are_what_the_generator_makes_of_the_originals() -> None:
+    assert generate() == FILE.read_text(encoding="utf-8"), "python -m aerokit.sync.generator writes it"
+
+
+@pytest.mark.parametrize("name", ["connect", "open_connection"])
+def test_functions_take_the_same_arguments(name: str) -> None:
+    assert parameters(getattr(aerokit.sync, name)) == parameters(getattr(aerokit, name))
+
+
+def test_attributes_of_a_vehicle_are_there_too(vehicle: aerokit.sync.Vehicle) -> None:
+    internal = {"telemetry"}
+    public = {name for name in vars(vehicle.aio) if not name.startswith("_")} - internal
+    assert not {name for name in public if not hasattr(vehicle, name)}
+
+
+def test_importing_aerokit_does_not_import_it() -> None:
+    code = "import sys, aerokit; sys.exit('aerokit.sync' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# ------------------------------------------------------------------------------------ flying
+
+
+def test_a_flight(vehicle: aerokit.sync.Vehicle) -> None:
+    vehicle.wait_ready()
+    assert not vehicle.is_armed
+    assert vehicle.why_not_armable() == []
+    vehicle.set_mode("GUIDED")
+    assert vehicle.mode.value.name == vehicle.mode_name == "GUIDED"
+    vehicle.arm()
+    vehicle.take_off(6)
+    assert vehicle.position.fresh(within=5).altitude_relative_m == pytest.approx(6, abs=1)
+    target = vehicle.position.value.offset(east_m=8)
+    vehicle.go_to(target)
+    assert vehicle.distance_to(target) < 3
+    vehicle.land()
+    assert vehicle.armed.wait_until(lambda armed: not armed, timeout=100) is False
+
+
+def test_setpoints_stream_while_the_block_feeds_them(vehicle: aerokit.sync.Vehicle) -> None:
+    vehicle.wait_ready()
+    vehicle.arm()
+    vehicle.take_off(5)
+    start = vehicle.position.value
+    with vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=60.0) as stream:
+        running = [stream.is_running]
+        stream.fly(VelocitySetpoint(north_m_s=3), 0.2)
+    assert [*running, stream.is_running] == [True, False]
+    assert vehicle.mode_name == "BRAKE"
+    assert vehicle.position.value.distance_to(start) > 1
+    with pytest.raises(errors.SetpointStreamStopped):
+        stream.set(VelocitySetpoint())
+
+
+def test_commands_and_their_refusals(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
+    assert vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID).result == MavResult.ACCEPTED
+    copter.faults.refuse(MavCmd.DO_SET_ROI_NONE, MavResult.DENIED, "No such thing")
+    with pytest.raises(errors.CommandRejected) as refused:
+        vehicle.stop_looking()
+    assert refused.value.result == MavResult.DENIED
+    assert "No such thing" in refused.value.reasons
+
+
+def test_exceptions_come_through_as_they_are(vehicle: aerokit.sync.Vehicle) -> None:
+    with pytest.raises(errors.InvalidArgument, match="FASTER"):
+        vehicle.set_mode("FASTER")
+    with pytest.raises(errors.OperationRejected, match="not armed"):
+        vehicle.take_off(5)
+    with pytest.raises(ZeroDivisionError):
+        vehicle.armed.wait_until(lambda armed: 1 / 0)
+
+
+# ----------------------------------------------------------------------- following and waiting
+
+
+def test_subscriptions_iterate(vehicle: aerokit.sync.Vehicle) -> None:
+    with vehicle.subscribe(messages.Attitude, capacity=20, rate_hz=10) as attitudes:
+        for number, attitude in enumerate(attitudes):
+            assert isinstance(attitude, messages.Attitude)
+            if number == 3:
+                break
+        assert isinstance(attitudes.get(timeout=100), messages.Attitude)
+        assert attitudes.missed == 0
+        attitudes.close()
+        while attitudes.get_nowait() is not None:
+            pass
+        assert list(attitudes) == []
+
+
+def test_a_subscription_times_out(vehicle: aerokit.sync.Vehicle) -> None:
+    with vehicle.subscribe(events.VehicleRebooted) as reboots, pytest.raises(errors.OperationTimeout):
+        reboots.get(timeout=0.01)
+
+
+def test_changes_iterate(vehicle: aerokit.sync.Vehicle) -> None:
+    changes = vehicle.system_time.updates()
+    assert next(changes).since_boot_s < next(changes).since_boot_s
+    assert changes.missed >= 0
+
+
+def test_cells_read_without_the_loop(vehicle: aerokit.sync.Vehicle) -> None:
+    vehicle.wait_ready()
+    cell = vehicle.position
+    assert cell is vehicle.position
+    assert cell.name == "position"
+    assert cell.is_known
+    assert cell.source is not None
+    vehicle.close()
+    assert cell.latest == cell.value
+    assert 0 <= cell.age < 60
+    with pytest.raises(TypeError, match="neither true nor false"):
+        bool(cell)
+    with pytest.raises(errors.ConnectionClosed):
+        cell.wait_until(lambda _: False)
+
+
+def test_a_rate_is_kept_for_the_time_of_a_block(vehicle: aerokit.sync.Vehicle) -> None:
+    with (
+        vehicle.subscribe(messages.Vibration) as vibrations,
+        vehicle.rate(messages.Vibration, 10),
+    ):
+        assert vibrations.get(timeout=100)
+
+
+# ------------------------------------------------------------------------- ends of all kinds
+
+
+def test_close_is_idempotent_and_ends_the_thread() -> None:
+    with served_copter() as address:
+        vehicle = aerokit.sync.connect(address)
+        assert len(loop_threads()) == 1
+        vehicle.close()
+        vehicle.close()
+        assert not loop_threads()
+        with pytest.raises(errors.ConnectionClosed):
+            vehicle.arm()
+        with pytest.raises(errors.ConnectionClosed):
+            vehicle.send(messages.Ping(0, 0, 0, 0))
+
+
+def test_close_from_another_thread_ends_a_call_that_waits() -> None:
+    with served_copter() as address:
+        vehicle = aerokit.sync.connect(address)
+        threading.Timer(0.05, vehicle.close).start()
+        with pytest.raises(errors.ConnectionClosed):
+            vehicle.armed.wait_until(lambda armed: armed, timeout=60)
+        vehicle.close()
+
+
+def test_the_end_of_the_link_ends_a_call_that_waits() -> None:
+    with served_copter() as address:
+        vehicle = aerokit.sync.connect(address)
+        started = threading.Event()
+
+        def note(armed: bool) -> bool:
+            started.set()
+            return armed
+
+        def wait() -> None:
+            with pytest.raises((errors.LinkLost, errors.ConnectionClosed)):
+                vehicle.armed.wait_until(note, timeout=60)
+
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        assert started.wait(100)
+    waiting.join(100)
+    assert not waiting.is_alive()
+    vehicle.close()
+
+
+def test_a_link_that_comes_back(copter: SimulatedCopter) -> None:
+    with contextlib.ExitStack() as stack:
+        with served([copter]) as address:
+            vehicle = stack.enter_context(aerokit.sync.connect(address, reconnect=True))
+            restored = stack.enter_context(vehicle.subscribe(events.LinkRestored))
+            vehicle.wait_ready()
+        with served([copter], address.replace("tcp:", "tcpin:")):
+            restored.get(timeout=100)
+            vehicle.position.wait_until(lambda _: vehicle.position.age < 1, timeout=100)
+            vehicle.arm()
+            assert vehicle.is_armed
+            assert len(vehicle.parameters.download()) > 100
+
+
+def test_a_call_on_the_loop_thread_is_refused(vehicle: aerokit.sync.Vehicle) -> None:
+    def predicate(armed: bool) -> bool:
+        vehicle.hold()
+        return armed
+
+    with pytest.raises(errors.BusyError, match="loop's own thread"):
+        vehicle.armed.wait_until(predicate)
+
+
+def test_close_on_the_loop_thread(copter: SimulatedCopter) -> None:
+    with served([copter]) as address:
+        vehicle = aerokit.sync.connect(address)
+        thread = loop_threads()[0]
+        with pytest.raises(errors.ConnectionClosed):
+            vehicle.armed.wait_until(lambda armed: vehicle.close())
+        thread.join(100)
+
+
+def test_a_connect_that_fails_leaves_no_thread() -> None:
+    with pytest.raises(errors.InvalidArgument):
+        aerokit.sync.connect("nonsense")
+    with pytest.raises(errors.LinkOpenError):
+        aerokit.sync.connect(f"tcp:127.0.0.1:{unused_port()}")
+    with pytest.raises(errors.ConnectFailed):
+        aerokit.sync.connect("udpin:127.0.0.1:0", timeout=0.05)
+    with pytest.raises(errors.InvalidArgument):
+        aerokit.sync.open_connection("nonsense")
+
+
+def unused_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+def test_ctrl_c_ends_a_call_and_the_vehicle_holds(vehicle: aerokit.sync.Vehicle) -> None:
+    vehicle.wait_ready()
+    vehicle.arm()
+    vehicle.take_off(5)
+    timer = interrupt_soon()
+    with pytest.raises(KeyboardInterrupt):
+        vehicle.go_to(vehicle.position.value.offset(north_m=2000))
+    timer.join()
+    vehicle.mode.wait_until(lambda mode: mode.name == "BRAKE", timeout=100)
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+def test_ctrl_c_ends_a_connect() -> None:
+    timer = interrupt_soon()
+    with pytest.raises(KeyboardInterrupt):
+        aerokit.sync.connect("udpin:127.0.0.1:0", timeout=60)
+    timer.join()
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
+@pytest.mark.exhaustive
+def test_the_tests_interrupt_themselves_also_where_ctrl_c_is_ignored() -> None:
+    test = f"{__file__}::{test_ctrl_c_ends_a_connect.__name__}"
+    ignore = "import signal, sys, pytest; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+    code = f"{ignore}; sys.exit(pytest.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "-n", "0", "-q", "-p", "no:cacheprovider", "--timeout", "50", test]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+
+
+def test_a_program_that_forgets_to_close_still_ends() -> None:
+    code = "import sys, aerokit.sync; vehicle = aerokit.sync.connect(sys.argv[1]); print(vehicle.system_id)"
+    with served_copter(system_id=7) as address:
+        done = subprocess.run(
+            [sys.executable, "-W", "error", "-c", code, address],
+            capture_output=True,
+            text=True,
+            timeout=200,
+            check=False,
+        )
+    assert (done.returncode, done.stdout, complaints(done.stderr)) == (0, "7\n", "")
+
+
+# --------------------------------------------------------------------------------- missions
+
+
+def test_missions_fences_and_rally_points(vehicle: aerokit.sync.Vehicle) -> None:
+    place = vehicle.home.wait_until(lambda _: True, timeout=100).position
+    mission = Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=20)] * 3)
+    vehicle.mission.upload(mission)
+    assert mission.matches(vehicle.mission.download(method="items"))
+    assert vehicle.mission.count.value == 3
+    with pytest.raises(errors.OperationRejected, match="not armed"):
+        vehicle.mission.start()
+    vehicle.fence.upload(Fence(circles=[FenceCircle(place, 100.0)]))
+    vehicle.rally.clear()
+    vehicle.mission.clear()
+    assert vehicle.mission.count.value == 0
+
+
+# ------------------------------------------------------------------------- several vehicles
+
+
+def test_how_each_of_several_links_does_is_in_a_cell() -> None:
+    with served_copter() as address:
+        with aerokit.sync.connect([address, "udpin:127.0.0.1:0"], rates={}) as vehicle:
+            links = vehicle.connection.links
+            assert isinstance(links, aerokit.sync.StateCell)
+            told = links.wait_until(lambda each: each[0].state is LinkState.CONNECTED, timeout=100)
+            assert [each.link.split(":")[0] for each in told] == ["tcp", "udpin"]
+            assert links.value[0].used_for == (1,)
+        with aerokit.sync.connect(address, rates={}) as vehicle:
+            assert vehicle.connection.links is None
+
+
+def test_two_vehicles_on_one_connection_share_its_thread() -> None:
+    copters = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (1, 2)]
+    with (
+        served(copters) as address,
+        aerokit.sync.open_connection(address) as connection,
+        aerokit.sync.connect(connection, system_id=1) as first,
+        aerokit.sync.connect(connection, system_id=2) as second,
+    ):
+        assert len(loop_threads()) == 1
+        second.wait_ready()
+        second.arm()
+        assert (first.is_armed, second.is_armed) == (False, True)
+        second.close()
+        assert connection.is_open
+        first.set_mode("GUIDED")
+        assert connection.counts(1)[0] > 0
+        with connection.subscribe(messages.Heartbeat, capacity=10) as heartbeats:
+            assert heartbeats.get(timeout=100)
+
+
+def test_vehicles_are_found_without_async() -> None:
+    with (
+        served([SimulatedCopter(boot_time_s=0.0)]) as address,
+        aerokit.sync.open_connection(address) as connection,
+    ):
+        first = next(iter(connection.vehicles()))
+        for found in connection.vehicles():
+            with aerokit.sync.connect(connection, system_id=found.system_id) as vehicle:
+                assert vehicle.components.value[0].kind == "autopilot"
+                assert vehicle.component(1).kind == "autopilot"
+                assert vehicle.component(1).files.aio is vehicle.files.aio
+            break
+        search = connection.vehicles()
+        assert next(search).system_id == first.system_id
+    with pytest.raises(errors.ConnectionClosed):
+        next(search)
+
+
+def test_the_asynchronous_vehicle_is_in_reach(vehicle: aerokit.sync.Vehicle) -> None:
+    assert isinstance(vehicle.aio, aerokit.Vehicle)
+    assert inspect.isasyncgenfunction(inspect.unwrap(open_connection))
+
+
+def test_an_exception_in_flight_says_what_the_vehicle_does(caplog: pytest.LogCaptureFixture) -> None:
+    with (
+        served_copter() as address,
+        pytest.raises(KeyboardInterrupt),
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        vehicle.wait_ready()
+        vehicle.arm()
+        vehicle.take_off(5)
+        raise KeyboardInterrupt
+    assert "vehicle 1 is let go: in GUIDED, still armed, " in caplog.text
+
+
+# --------------------------------------------------------------------------- parts that are read first
+
+
+def test_a_part_may_be_read_first_by_a_predicate(vehicle: aerokit.sync.Vehicle) -> None:
+    """Which runs on the loop's thread, while another thread reads it first, too."""
+    entered = threading.Event()
+
+    def looks(_: object) -> bool:
+        entered.set()
+        return vehicle.mission.current.latest != 99 and vehicle.gimbal.attitude.latest is None
+
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(vehicle.position.wait_until, looks, timeout=60)
+        assert entered.wait(100)
+        assert vehicle.mission is vehicle.mission
+        waiting.result()
+
+
+def test_parts_that_are_read_first_after_the_end_know_nothing(copter: SimulatedCopter) -> None:
+    with served([copter]) as address, aerokit.sync.connect(address) as vehicle:
+        pass
+    assert len(vehicle.parameters.table) == 0
+    assert (vehicle.mission.current.latest, vehicle.gimbal.attitude.latest) == (None, None)
+    with pytest.raises(errors.ConnectionClosed):
+        vehicle.fence.download()
+
+
+def test_gimbals_are_found_and_steered() -> None:
+    gimbal = SimulatedGimbal(171)
+    with (
+        served_copter(parameters={"MNT1_TYPE": 1.0}, components=[gimbal]) as address,
+        aerokit.sync.connect(address) as vehicle,
+    ):
+        assert vehicle.gimbals.discover() == (1, 171)
+        assert [each.device_id for each in vehicle.gimbals] == [1, 171]
+        assert len(vehicle.gimbals) == 2
+        with vehicle.gimbals[171].control() as control:
+            vehicle.gimbals[171].point(-20.0, 0.0, frame="vehicle")
+            was_held = control.is_held
+            with vehicle.gimbals[171].rates(rate_hz=50) as rates:
+                rates.turn(-1.0, 0.0, 0.2)
+        assert (was_held, control.is_held) == (True, False)
+        with pytest.raises(errors.NotSupported):
+            vehicle.gimbal.control(secondary=True).__enter__()

@@ -1,0 +1,288 @@
+"""The loop's thread: what many threads ask of it at once, what they cancel, its end, and children of the process."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import linecache
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+import anyio
+import pytest
+
+from aerokit.errors import ConnectionClosed, LinkOpenError
+from aerokit.sync.loop_thread import LoopThread
+
+LIMIT_S = 100.0
+
+
+@pytest.fixture
+def loop() -> Iterator[LoopThread]:
+    thread = LoopThread()
+    yield thread
+    thread.close()
+
+
+async def nothing() -> None:
+    pass
+
+
+def test_the_loop_may_ask_itself_while_others_ask_it(loop: LoopThread) -> None:
+    end = time.monotonic() + 0.3
+    asked: list[int] = []
+
+    async def ask_itself() -> None:
+        while time.monotonic() < end:
+            loop.call_soon(asked.append, 1)
+            await asyncio.sleep(0)
+
+    def ask() -> None:
+        while time.monotonic() < end:
+            loop.run(nothing)
+
+    askers = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
+    for each in askers:
+        each.start()
+    asking = threading.Thread(target=loop.run, args=(ask_itself,), daemon=True)
+    asking.start()
+    for each in (*askers, asking):
+        each.join(LIMIT_S)
+        assert not each.is_alive()
+    assert asked
+
+
+def test_the_loop_may_close_itself_while_others_ask_it(loop: LoopThread) -> None:
+    ends: list[type[BaseException]] = []
+
+    def ask() -> None:
+        try:
+            while True:
+                loop.run(nothing)
+        except ConnectionClosed as error:
+            ends.append(type(error))
+
+    askers = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
+    for each in askers:
+        each.start()
+    loop.call_soon(loop.close)
+    for each in askers:
+        each.join(LIMIT_S)
+    assert ends == [ConnectionClosed] * 3
+
+
+def test_what_waits_ends_with_the_loop_and_cleans_up(loop: LoopThread) -> None:
+    ended, started = [], threading.Event()
+
+    async def wait() -> None:
+        try:
+            started.set()
+            await asyncio.sleep(1000)
+        finally:
+            ended.append(1)
+
+    errors: list[type[BaseException]] = []
+
+    def ask() -> None:
+        try:
+            loop.run(wait)
+        except ConnectionClosed as error:
+            errors.append(type(error))
+
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
+    assert started.wait(LIMIT_S)
+    loop.close()
+    asking.join(LIMIT_S)
+    assert (ended, errors) == ([1], [ConnectionClosed])
+
+
+def test_an_exit_of_the_program_in_a_coroutine_is_the_callers(loop: LoopThread) -> None:
+    async def leave() -> None:
+        sys.exit(3)
+
+    with pytest.raises(SystemExit, match="3"):
+        loop.run(leave)
+    loop.run(nothing)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_child_of_the_process_neither_uses_nor_waits_for_it(loop: LoopThread) -> None:
+    child = os.fork()
+    if child == 0:  # pragma: no cover - another process
+        errors = 0
+        uses: tuple[Callable[[], None], ...] = (lambda: loop.run(nothing), lambda: loop.call_soon(print))
+        for use in uses:
+            try:
+                use()
+            except ConnectionClosed:
+                errors += 1
+        loop.close()
+        os._exit(errors)
+    deadline = time.monotonic() + LIMIT_S
+    while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0):
+        if time.monotonic() > deadline:
+            os.kill(child, 9)
+        time.sleep(0.01)
+    assert os.waitstatus_to_exitcode(ended[1]) == 2
+    loop.run(nothing)
+
+
+NO_DESCRIPTORS = """
+import os
+import subprocess
+import resource
+import aerokit.sync
+from aerokit.errors import LinkOpenError
+from aerokit.sync.twins import connect
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+taken = []
+try:
+    while True:
+        taken.append(os.dup(0))
+except OSError:
+    pass
+for spare in range(4):
+    try:
+        connect("udpin:127.0.0.1:0", timeout=0.01)
+    except LinkOpenError as error:
+        print(spare, error.errno, error)
+    os.close(taken.pop())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of descriptors to set")
+def test_a_loop_that_cannot_start_is_an_error() -> None:
+    """It needs several descriptors; however many there are, connecting does not wait for what never begins."""
+    done = subprocess.run(
+        [sys.executable, "-c", NO_DESCRIPTORS], capture_output=True, text=True, timeout=200, check=False
+    )
+    assert done.stdout.startswith(
+        f"0 {errno.EMFILE} the event loop's thread cannot start: Too many open files"
+    )
+    assert done.returncode in (0, 1)
+
+
+def test_a_thread_that_cannot_start_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(LinkOpenError, match="the event loop's thread cannot start: can't start new thread"):
+        LoopThread()
+
+
+def uses_of_the_loop(loops: list[LoopThread]) -> None:
+    """What a blocking program does, in short."""
+    loop = LoopThread()
+    loops.append(loop)
+    try:
+        held = loop.hold_open(contextlib.AsyncExitStack())
+        loop.run(nothing)
+        loop.call(len, "")
+        with pytest.raises(ConnectionClosed):
+            loop.run(fail)
+        held.close()
+    finally:
+        loop.close()
+
+
+async def fail() -> None:
+    await asyncio.sleep(0)
+    raise ConnectionClosed("as asked for")
+
+
+Place = tuple[str, int]
+
+
+def interrupted_at(
+    place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop
+) -> set[Place]:
+    """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
+    seen: set[Place] = set()
+
+    def trace(frame: FrameType, event: str, argument: object) -> Any:
+        here = (frame.f_code.co_filename, frame.f_lineno)
+        if event != "line" or here in seen:
+            return trace
+        seen.add(here)
+        if here == place:
+            raise KeyboardInterrupt
+        return trace
+
+    before, loops = sys.gettrace(), list[LoopThread]()
+    sys.settrace(trace)
+    try:
+        use(loops)
+    finally:
+        sys.settrace(before)
+        for loop in loops:  # where closing was interrupted, it can be closed again
+            loop.close()
+    return seen
+
+
+def test_what_is_run_to_its_end_is_run_wherever_ctrl_c_comes() -> None:
+    """At every line of ours but those before it can be noticed: the calls themselves."""
+    done: list[int] = []
+
+    async def work() -> None:
+        with anyio.CancelScope(shield=True):  # as what puts values back
+            await asyncio.sleep(0)
+            done.append(1)
+
+    def use(loops: list[LoopThread]) -> None:
+        loops[0].run_to_its_end(work)
+
+    def interrupted(place: Place | None) -> set[Place]:
+        loop = LoopThread()
+        try:
+            return interrupted_at(place, lambda _: use([loop]))
+        finally:
+            loop.close()
+
+    places = {place for place in interrupted(None) if place[0].endswith(("loop_thread.py", "reply.py"))}
+    assert len(places) > 20
+    left_undone, was_come_to = set(), set()
+    for place in places:
+        done.clear()
+        try:
+            interrupted(place)  # this time it may not come there: which thread is quicker decides
+        except KeyboardInterrupt:
+            was_come_to.add(place)
+            if not done:
+                left_undone.add(linecache.getline(*place).strip())
+    assert len(was_come_to) > 20
+    assert left_undone == {
+        "return self._run(None, function, *args, **kwargs)",
+        "call: _Call[T] | None = None",
+        "try:",
+    }
+
+
+def test_ctrl_c_is_never_lost_and_leaves_nothing_behind() -> None:
+    """At every line that the main thread runs, ours and those of threading; contextlib and pytest are not meant."""
+    ours = ("loop_thread.py", "reply.py", "threading.py")
+    places = sorted(place for place in interrupted_at(None) if place[0].endswith(ours))
+    assert len(places) > 80
+    lost = []
+    for place in places:
+        try:
+            interrupted_at(place)
+        except KeyboardInterrupt:
+            continue
+        except BaseException as error:
+            lost.append((place, error))
+    for thread in threading.enumerate():
+        if thread.name == "aerokit loop" and thread.ident is not None:
+            thread.join(LIMIT_S)
+            assert not thread.is_alive()
+    assert lost == []

@@ -1,0 +1,244 @@
+from __future__ import annotations
+
+import asyncio
+import errno
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from far_end import far_end
+from link_harness import Recorder, each_loop, each_traffic, eventually
+
+from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
+from aerokit.transport import SerialLink, serial
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
+
+
+@each_loop
+@each_traffic
+async def test_bytes_go_both_ways(pieces: list[bytes]) -> None:
+    with far_end() as far:
+        far.reads()
+        link, heard = SerialLink(far.device, 115200), Recorder()
+        await link.open(heard)
+        for piece in pieces:
+            link.write(piece)
+        await far.heard.until_data(b"".join(pieces))
+        await far.sends(b"".join(pieces))
+        await heard.until_data(b"".join(pieces))
+        assert heard.peers == [None]
+        link.write(b"")
+        link.close()
+        await link.wait_closed()
+    assert heard.losses == []
+    assert link.dropped_writes == 0
+
+
+@each_loop
+async def test_unplugging_loses_the_link_once() -> None:
+    with far_end() as far:
+        link, heard = SerialLink(far.device), Recorder()
+        await link.open(heard)
+        await far.sends(b"last words")
+        await heard.until_data(b"last words")
+        far.unplug()
+        error = await heard.until_lost()
+        assert str(error).startswith(f"serial://{far.device}:57600: the device is gone: ")
+        link.write(b"into the void")
+        await link.wait_closed()
+        link.close()
+        await link.wait_closed()
+        assert len(heard.losses) == 1
+        with pytest.raises(ConnectionClosed):
+            await link.open(Recorder())
+
+
+@each_loop
+async def test_unplugging_is_noticed_by_a_write_but_never_said_inside_it() -> None:
+    with far_end() as far:
+        link, heard = SerialLink(far.device), Recorder()
+        await link.open(heard)
+        far.unplug()
+        link.write(b"x")
+        link.write(b"y")
+        assert heard.losses == []
+        await heard.until_lost()
+        await link.wait_closed()
+        assert len(heard.losses) == 1
+
+
+@each_loop
+async def test_a_line_that_takes_nothing_costs_bounded_memory_and_never_blocks() -> None:
+    with far_end() as far:
+        link = SerialLink(far.device, 57600)
+        await link.open(Recorder())
+        frame, written = bytes(280), 0
+        while not link.dropped_writes:
+            link.write(frame)
+            written += 1
+            assert written < 1000
+            await asyncio.sleep(0)
+        assert link._transport.get_write_buffer_size() <= 2 * 5760 + len(frame)
+        before = link.dropped_writes
+        link.write(frame)
+        assert link.dropped_writes == before + 1
+        far.reads()
+        await far.heard.until(lambda: len(far.heard.data) == written * 280 - 280)
+        await eventually(lambda: not link.unsent_bytes)
+        link.write(b"again")
+        await far.heard.until(lambda: far.heard.data.endswith(b"again"))
+        link.close()
+        await link.wait_closed()
+
+
+@each_loop
+async def test_close_is_bounded_in_time_when_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial, "LINGER_S", 0.03)
+    with far_end() as far:
+        link, heard = SerialLink(far.device, 57600), Recorder()
+        await link.open(heard)
+        for _ in range(60):
+            link.write(bytes(280))
+            await asyncio.sleep(0)
+        link.close()
+        with anyio.fail_after(100):
+            await link.wait_closed()
+        assert not link._port.is_open
+        assert heard.losses == []
+
+
+@each_loop
+async def test_what_was_written_before_close_still_goes_out() -> None:
+    data = bytes(range(256)) * 40
+    with far_end() as far:
+        link = SerialLink(far.device, 57600)
+        await link.open(Recorder())
+        link.write(data)
+        link.close()
+        link.write(b"too late")
+        far.reads()
+        await link.wait_closed()
+        await far.heard.until_data(data)
+
+
+@each_loop
+async def test_no_callback_after_close() -> None:
+    with far_end() as far:
+        link, heard = SerialLink(far.device), Recorder()
+        heard.at_each_piece = lambda data, peer: link.close()
+        await link.open(heard)
+        await far.sends(b"first")
+        await heard.until_data(b"first")
+        await far.sends(b"second")
+        await link.wait_closed()
+        far.unplug()
+        await asyncio.sleep(0)
+        assert heard.data == b"first"
+        assert heard.losses == []
+
+
+@each_loop
+async def test_closed_in_the_same_turn_as_opened() -> None:
+    with far_end() as far:
+        link = SerialLink(far.device)
+        await link.open(Recorder())
+        link.close()
+        await link.wait_closed()
+        assert not link._port.is_open
+
+
+@each_loop
+async def test_a_port_is_not_shared_and_a_link_is_opened_once() -> None:
+    with far_end() as far:
+        first, second = SerialLink(far.device), SerialLink(far.device)
+        await first.open(Recorder())
+        with pytest.raises(LinkOpenError, match="another program uses this port"):
+            await second.open(Recorder())
+        with pytest.raises(BusyError):
+            await first.open(Recorder())
+        first.close()
+        await first.wait_closed()
+        await second.open(Recorder())
+        second.close()
+        await second.wait_closed()
+
+
+@each_loop
+async def test_a_missing_device_is_an_error_that_lists_the_ports() -> None:
+    link = SerialLink("/dev/ttyNoSuchPort", 57600)
+    assert link.unsent_bytes == 0
+    with pytest.raises(
+        LinkOpenError, match=r"cannot open serial:///dev/ttyNoSuchPort:57600: .*serial port"
+    ) as caught:
+        await link.open(Recorder())
+    assert caught.value.errno == errno.ENOENT
+    await link.wait_closed()
+    link.close()
+
+
+@each_loop
+async def test_a_file_that_is_no_port_is_an_error_with_a_hint(tmp_path: Path) -> None:
+    path = tmp_path / "flight"
+    path.write_bytes(b"")
+    with pytest.raises(LinkOpenError, match="this is no serial port; to replay a recording"):
+        await SerialLink(str(path)).open(Recorder())
+
+
+@each_loop
+async def test_a_missing_right_is_an_error_that_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    pyserial = importlib.import_module("serial")
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise pyserial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(pyserial, "Serial", refuse)
+    with pytest.raises(LinkOpenError, match="dialout"):
+        await SerialLink("/dev/ttyACM0").open(Recorder())
+
+
+def test_hardware_flow_control_is_in_the_address() -> None:
+    assert SerialLink("COM3", 9600, rtscts=True).address == "serial://COM3:9600?rtscts=1"
+
+
+def test_close_works_without_a_running_loop() -> None:
+    with far_end() as far:
+        loop = asyncio.new_event_loop()
+        link, gone = SerialLink(far.device), SerialLink(far.device)
+        loop.run_until_complete(link.open(Recorder()))
+        link.close()
+        assert not link._port.is_open
+        loop.run_until_complete(gone.open(Recorder()))
+        loop.close()
+        gone.close()
+        assert not gone._port.is_open
+        SerialLink(far.device).close()
+
+
+def test_pyserial_is_imported_only_when_a_port_is_opened() -> None:
+    program = "import aerokit.transport, sys; sys.exit('serial' in sys.modules)"
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, "PYTHONPATH": path})
+
+
+@each_loop
+@pytest.mark.parametrize("taken", [0, 1])
+async def test_a_byte_that_is_taken_out_of_a_serial_driver_is_a_write_less(
+    monkeypatch: pytest.MonkeyPatch, taken: int
+) -> None:
+    with far_end() as far:
+        link = SerialLink(far.device, 57600)
+        await link.open(Recorder())
+        waiting = iter((taken, 0))
+        monkeypatch.setattr(link, "_waiting_to_be_sent", lambda transport: next(waiting))
+        link.discard_unsent()
+        assert link.dropped_writes == taken
+        monkeypatch.undo()
+        link.close()
+        await link.wait_closed()

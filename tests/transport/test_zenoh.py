@@ -1,0 +1,462 @@
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from link_harness import Recorder, each_loop
+from zenoh_harness import Told, client, reconnecting, serving
+from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
+
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, SetPositionTargetLocalNed
+from aerokit.transport import create_link
+from aerokit.transport import link as needed
+from aerokit.transport.zenoh import listen as zenoh_listen
+from aerokit.transport.zenoh.keys import Stamp
+from aerokit.transport.zenoh.listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
+from aerokit.transport.zenoh.session import Handover
+
+pytest.importorskip("zenoh")
+pytestmark = pytest.mark.anyio
+
+ENCODER = FrameEncoder(255, 190)
+ARM = CommandLong(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+SET_POINT = SetPositionTargetLocalNed(0, 1, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0)
+PIECES = [b"\xfd\x09\x00", bytes(range(256)), b"\n\r\x11\x13", *(bytes([n]) * (1 + n) for n in range(200))]
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    return "asyncio"
+
+
+def frame(message: Message = ARM) -> bytes:
+    return ENCODER.encode(message)
+
+
+@each_loop
+async def test_bytes_go_both_ways() -> None:
+    port = free_port()
+    async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
+        frames = [frame(ParamRequestList(1, 1)) for _ in range(100)]
+        for each in frames:
+            link.write(each)
+        await heard.until_data(b"".join(frames))
+        assert heard.peers == ["ground"] == list(vehicle.peers)
+        for each in PIECES:
+            vehicle.write(each, "ground")
+        await answered.until_data(b"".join(PIECES))
+        vehicle.write(b"to all")
+        await answered.until_data(b"".join(PIECES) + b"to all")
+        assert answered.peers == [None]
+        assert link.helm is None
+        vehicle.write(b"to nobody", "stranger")
+        assert vehicle.dropped_writes == 1
+        assert vehicle.has_peer("ground") > vehicle.has_peer("stranger")
+        assert link.dropped_writes == link.late_frames == vehicle.late_datagrams == 0
+    assert heard.losses == []
+
+
+async def test_only_whole_frames_of_a_client_reach_the_vehicle() -> None:
+    port = free_port()
+    async with serving(port) as (_, heard), client(port) as (link, _told):
+        link.write(b"noise")
+        link.write(frame()[:10])
+        link.write(last := frame(ParamRequestList(1, 1)))
+        await eventually(lambda: heard.data != b"")
+        assert heard.data == last
+
+
+async def test_the_end_of_the_vehicle_side_is_a_lost_link() -> None:
+    port = free_port()
+    async with serving(port) as (vehicle, _), client(port) as (_link, answered):
+        vehicle.close()
+        await eventually(lambda: bool(answered.losses))
+        assert "the vehicle side was closed" in str(answered.losses[0])
+
+
+async def test_nobody_of_that_name() -> None:
+    port = free_port()
+    with router(port):
+        async with serving(port, "beta", "connect"), serving(port, "gamma", "connect"):
+            with pytest.raises(LinkOpenError, match=r"nobody is called alpha .*there are: beta, gamma"):
+                async with client(port, "&timeout=0.3"):
+                    pass
+        with pytest.raises(LinkOpenError, match="nobody else either"):
+            async with client(port, "&timeout=0.3"):
+                pass
+
+
+async def test_no_router() -> None:
+    with pytest.raises(
+        LinkOpenError, match=r"cannot open zenoh://north/alpha: nobody can be reached at tcp/127"
+    ):
+        async with client(free_port()):
+            pass
+    with pytest.raises(LinkOpenError, match="cannot open zenohin://north/alpha"):
+        async with serving(free_port(), how="connect"):
+            pass
+
+
+async def test_a_port_that_is_taken() -> None:
+    port = free_port()
+    async with serving(port):
+        with pytest.raises(LinkOpenError, match="cannot open zenohin://north/beta"):
+            async with serving(port, "beta"):
+                pass
+
+
+async def test_a_name_that_is_taken() -> None:
+    port = free_port()
+    with router(port):
+        async with serving(port, how="connect"):
+            with pytest.raises(LinkOpenError, match="another program serves this name"):
+                async with serving(port, how="connect"):
+                    pass
+        async with serving(port, how="connect"):
+            pass
+
+
+async def test_a_link_is_opened_once(tmp_path: Path) -> None:
+    port = free_port()
+    async with serving(port) as (vehicle, _), client(port) as (link, _told):
+        for each in (vehicle, link):
+            with pytest.raises(BusyError):
+                await each.open(Recorder())
+    for each in (vehicle, link):
+        with pytest.raises(ConnectionClosed):
+            await each.open(Recorder())
+        each.write(b"nothing happens")
+    wrong = tmp_path / "zenoh.json5"
+    wrong.write_text("{ mode: 7 }")
+    with pytest.raises(InvalidArgument, match="zenoh://north/alpha: config="):
+        await create_link(f"zenoh://north/alpha?config={wrong}").open(Recorder())
+
+
+async def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> Any:
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    monkeypatch.setattr(needed, "import_module", fail)
+    for address in ("zenoh://north/alpha", "zenohin://north/alpha"):
+        with pytest.raises(LinkOpenError, match=r"pip install 'aerokit-mavlink\[zenoh\]'"):
+            await create_link(address).open(Recorder())
+
+
+# ------------------------------------------------------------------------------------ broken connections
+
+
+async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
+    port = free_port()
+    async with serving(port) as (vehicle, heard), HoldingProxy(port) as line:  # noqa: SIM117 - the line's port
+        async with client(line.port, "&client=ground") as (link, told):
+            link.write(before := frame())
+            await heard.until_data(before)
+            line.hold()
+            written = 0
+            while link.dropped_writes == 0:  # until no beacon has come for two seconds
+                vehicle.write(b"telemetry")
+                link.write(frame())
+                written += 1
+                await asyncio.sleep(0.02)
+            assert line.held_bytes > 1000
+            await asyncio.sleep(
+                0.5
+            )  # until the youngest of them is too old: its stamp is one period older than it
+            line.release()
+            await eventually(lambda: vehicle.late_datagrams >= written - 1)
+            assert heard.data == before  # not one of them
+            await eventually(lambda: ("COMMAND_LONG", "it came too late", None) in told.refused)
+            assert set(told.answers) == {()}
+
+            def goes_through() -> bool:
+                link.write(frame())
+                return heard.data != before
+
+            await eventually(goes_through)
+            assert told.losses == []
+
+
+@pytest.mark.exhaustive
+async def test_a_router_is_killed_and_comes_back() -> None:
+    port = free_port()
+    with router(port) as first:
+        async with serving(port, how="connect") as (vehicle, heard), reconnecting(port) as (link, told):
+            link.write(frame())
+            await eventually(lambda: heard.data != b"")
+            first.kill()
+            first.wait()
+            await eventually(lambda: told.interruptions == 1)
+            heard.pieces.clear()
+            link.write(frame())  # into the void
+            with router(port):
+                await eventually(lambda: told.restored == 1)
+                assert heard.pieces == []
+                link.write(late := frame())
+                await heard.until_data(late)
+                assert len(vehicle.peers) == 1
+
+
+async def test_a_vehicle_side_is_killed_and_replaced() -> None:
+    port = free_port()
+    address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"
+    with router(port), process(VEHICLE_SIDE, address) as first:
+        async with reconnecting(port) as (_, told):
+            await eventually(lambda: told.data != b"")
+            first.kill()
+            await eventually(lambda: told.interruptions >= 1)
+            told.pieces.clear()
+            with process(VEHICLE_SIDE, address):
+                await eventually(lambda: told.restored >= 1 and told.data != b"")
+
+
+async def test_a_late_joiner_finds_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by the next beacon, which does not come."""
+    port = free_port()
+    with router(port):
+        async with serving(port, how="connect") as (vehicle, _):
+            monkeypatch.setattr(zenoh_listen, "BEACON_EVERY_S", 3600.0)
+            await asyncio.sleep(1.0)  # longer does no harm: the last beacon has gone
+            async with client(port):
+                pass
+            await eventually(lambda: vehicle.peers == ())
+
+
+# ------------------------------------------------------------------------------------ the helm
+
+
+async def test_two_programs_order_the_same_vehicle() -> None:
+    port = free_port()
+    with router(port):
+        async with (
+            serving(port, how="connect") as (vehicle, heard),
+            client(port, "&client=one") as (one, _),
+            client(port, "&client=two") as (two, told),
+        ):
+            one.write(frame())
+            await eventually(lambda: vehicle.helm == "one" == two.helm)
+            heard.pieces.clear()
+            two.write(frame())
+            two.write(frame(SET_POINT))
+            two.write(read := frame(ParamRequestList(1, 1)))
+            await eventually(lambda: len(told.refused) == 2)
+            assert told.refused[0] == ("COMMAND_LONG", "one has the helm", "one")
+            assert len(told.answers[0]) == 2
+            assert heard.data == read
+            assert vehicle.refused_frames == 2 == two.dropped_writes
+            one.close()
+            await one.wait_closed()
+            await eventually(lambda: vehicle.helm is None)
+            two.write(frame())
+            await eventually(lambda: vehicle.helm == "two")
+            async with (
+                client(port, "&client=three&helm=take") as (three, _),
+                client(port, "&helm=never") as (four, no),
+            ):
+                await eventually(lambda: vehicle.helm == "three" == three.helm)
+                four.write(frame())
+                await eventually(
+                    lambda: no.refused == [("COMMAND_LONG", "this link never orders (helm=never)", None)]
+                )
+                two.write(frame())
+                await eventually(lambda: told.refused[-1] == ("COMMAND_LONG", "three has the helm", "three"))
+
+
+async def test_who_may_see_and_who_may_order_is_the_routers_to_say(tmp_path: Path) -> None:
+    """The configuration of docs/network.md."""
+    port = free_port()
+    page = (Path(__file__).parents[2] / "docs" / "network.md").read_text(encoding="utf-8")
+    users, files = tmp_path / "users.txt", {}
+    users.write_text("router:r\nalpha:a\nground-1:g\nonlooker:o\n")
+    config = page.split("```json5\n")[1].split("```")[0]
+    assert config.count("tcp/0.0.0.0:7447") == config.count("/etc/zenoh/users.txt") == 1
+    files["router"] = tmp_path / "router.json5"
+    files["router"].write_text(
+        config.replace("tcp/0.0.0.0:7447", f"tcp/127.0.0.1:{port}").replace(
+            "/etc/zenoh/users.txt", str(users)
+        )
+    )
+    for user, password in (("alpha", "a"), ("ground-1", "g"), ("onlooker", "o")):
+        files[user] = tmp_path / f"{user}.json5"
+        files[user].write_text(
+            f"""{{ mode: "client", connect: {{ endpoints: ["tcp/127.0.0.1:{port}"] }},
+            scouting: {{ multicast: {{ enabled: false }} }},
+            transport: {{ auth: {{ usrpwd: {{ user: "{user}", password: "{password}" }} }} }} }}"""
+        )
+    with router(port, str(files["router"])):
+        vehicle, heard = create_link(f"zenohin://north/alpha?config={files['alpha']}"), Recorder()
+        pilot, onlooker = (
+            create_link(f"zenoh://north/alpha?client={name}&config={files[name]}")
+            for name in ("ground-1", "onlooker")
+        )
+        liar = create_link(f"zenohin://north/beta?config={files['ground-1']}")
+        seen, told = Told(), Told()
+        opened = ((vehicle, heard), (pilot, told), (onlooker, seen), (liar, Recorder()))
+        for link, receiver in opened:
+            await link.open(receiver)
+        vehicle.write(b"telemetry")
+        for each in (seen, told):
+            await each.until_data(b"telemetry")
+        onlooker.write(frame())
+        liar.write(b"a vehicle that is none")
+        pilot.write(order := frame())
+        await heard.until_data(order)
+        assert heard.peers == ["ground-1"]
+        with pytest.raises(
+            LinkOpenError, match=r"nobody is called beta in the fleet north \(there are: alpha\)"
+        ):
+            await create_link(f"zenoh://north/beta?timeout=0.3&config={files['onlooker']}").open(Told())
+        for link, _ in opened:
+            link.close()
+        for link, _ in opened:
+            await link.wait_closed()
+
+
+# ------------------------------------------------------------------------------------ nothing is left
+
+
+def what_is_left() -> tuple[int, int]:
+    gc.collect()
+    return threading.active_count(), len(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="Linux counts files")
+async def test_nothing_is_left() -> None:
+    async def once() -> None:
+        port = free_port()
+        async with serving(port) as (vehicle, heard), client(port) as (link, answered):
+            vehicle.write(b"x")
+            link.write(frame())
+            await eventually(lambda: heard.data != b"" and answered.data != b"")
+            link._session.put("aerokit/north/alpha/from/all", b"y", attachment=b"")
+        heard.pieces.clear()
+        await asyncio.sleep(0.05)
+        assert heard.pieces == []  # no callback after close
+
+    await once()
+    before = what_is_left()
+    for _ in range(3):
+        await once()
+    await eventually(lambda: what_is_left() <= (before[0] + 6, before[1]))  # threads of the loop's executor
+
+
+@pytest.mark.parametrize("after_s", [0, 0.001, 0.005, 0.02, 0.3])
+async def test_given_up_while_it_is_being_opened(after_s: float) -> None:
+    port = free_port()
+    link = create_link(f"zenoh://north/alpha?listen=tcp/127.0.0.1:{port}&timeout=5")
+    opening = asyncio.get_running_loop().create_task(link.open(Recorder()))
+    await asyncio.sleep(after_s)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    link.close()
+    await link.wait_closed()
+
+    def is_free() -> bool:
+        import socket
+
+        with socket.socket() as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                sock.bind(("127.0.0.1", port))
+            except OSError:
+                return False
+            return True
+
+    await eventually(is_free)
+
+
+async def test_a_slow_loop_costs_no_memory() -> None:
+    taken: list[int] = []
+    handover: Handover[int] = Handover(taken.append, most=100)
+
+    def post() -> None:
+        for number in range(10_000):
+            handover.post(number)
+
+    thread = threading.Thread(target=post)
+    thread.start()
+    thread.join()  # the loop does not come round
+    assert handover.dropped == 9_900
+    await eventually(lambda: len(taken) == 100)
+    assert taken == list(range(9_900, 10_000))
+    handover.post(1)
+    handover.close()
+    handover.post(2)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert len(taken) == 100
+
+
+async def test_a_handover_goes_on_after_a_mistake() -> None:
+    taken: list[int] = []
+
+    def take(number: int) -> None:
+        if number == 1:
+            raise ValueError("a mistake")
+        taken.append(number)
+
+    mistakes: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: mistakes.append(context))
+    handover: Handover[int] = Handover(take)
+    for number in range(600):
+        handover.post(number)
+    await eventually(lambda: len(taken) == 599)
+    assert len(mistakes) == 1
+
+
+def test_the_told_of_the_harness_is_a_listener() -> None:
+    from aerokit.transport import HelmListener
+
+    assert isinstance(Told, type)
+    assert issubclass(Told, HelmListener)
+    assert frame(Heartbeat(6, 8, 0, 0, 4, 3))
+
+
+async def test_names_that_only_put_something_keep_nobody_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client is greeted by its token; whoever just puts on its key is forgotten when there is no room."""
+    link, now = ZenohListen("north", "alpha"), 100.0
+    monkeypatch.setattr(link, "_now", lambda: now)
+    for number in range(MAX_CLIENTS):
+        link._hear(f"noise-{number}", b"", b"")
+    assert len(link.peers) == MAX_CLIENTS
+    assert link._come("ground-1") is None
+    now += SILENT_AFTER_S + 1
+    link._hear("noise-7", b"", b"")
+    assert link._come("ground-1") is not None
+    assert len(link.peers) == MAX_CLIENTS
+    assert "noise-7" in link.peers
+
+
+async def test_a_datagram_that_comes_twice_reaches_the_vehicle_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Doubled on its way, or replayed by somebody on the network: an order is carried out once, and in order."""
+    link, taken = ZenohListen("north", "alpha"), list[bytes]()
+    monkeypatch.setattr(link, "_now", lambda: 100.0)
+    monkeypatch.setattr(link, "_deliver", lambda data, peer: taken.append(data))
+    epoch = link._judge.beacon(100.0).epoch
+    orders = [frame(ParamRequestList(1, 1)) for _ in range(3)]
+    for sequence in (1, 1, 3, 2, 3):
+        link._hear("ground", orders[sequence - 1], Stamp(epoch, 1, 7, sequence).encode())
+    assert taken == [orders[0], orders[2]]
+    assert (link._judge.doubled, link.late_datagrams) == (3, 0)
+
+
+async def test_what_is_larger_than_a_datagram_is_not_listened_to() -> None:
+    """On either side: nobody who may publish on the network fills the other's memory or keeps its loop busy."""
+    port = free_port()
+    async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
+        link.write(orders := frame(ParamRequestList(1, 1)))
+        await heard.until_data(orders)
+        for far in (vehicle, link):
+            far.write(orders * 10_000, "ground" if far is vehicle else None)
+        link.write(orders)
+        vehicle.write(b"small", "ground")
+        await heard.until_data(orders + orders)
+        await answered.until_data(b"small")

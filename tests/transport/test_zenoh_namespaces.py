@@ -1,0 +1,134 @@
+"""Two machines, as network namespaces with a cable between them, which is pulled out; where the system allows it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+pytest.importorskip("zenoh")
+
+VEHICLE = """
+import asyncio, sys
+from aerokit.transport import create_link
+
+class Ears:
+    def bytes_received(self, data, peer): print("heard", len(data), flush=True)
+    def link_lost(self, error): sys.exit(str(error))
+
+async def main():
+    link = create_link("zenohin://north/alpha?listen=tcp/10.99.7.1:7447")
+    await link.open(Ears())
+    print("up", flush=True)
+    while await asyncio.to_thread(sys.stdin.readline):
+        print("late", link.late_datagrams, flush=True)
+
+asyncio.run(main())
+"""
+CLIENT = """
+import asyncio, sys
+from aerokit.transport import create_link
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.messages import CommandLong
+
+class Ears:
+    def bytes_received(self, data, peer): pass
+    def link_lost(self, error): sys.exit(str(error))
+
+async def main():
+    link, encoder = create_link("zenoh://north/alpha?connect=tcp/10.99.7.1:7447"), FrameEncoder(255, 190)
+    await link.open(Ears())
+    print("up", flush=True)
+    while (line := await asyncio.to_thread(sys.stdin.readline)):
+        until_dropped, dropped = line.startswith("until dropped"), link.dropped_writes
+        while True:
+            link.write(encoder.encode(CommandLong(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)))
+            is_dropped = link.dropped_writes > dropped
+            if is_dropped == until_dropped:
+                break
+            dropped = link.dropped_writes
+            await asyncio.sleep(0.05)
+        print("done", flush=True)
+
+asyncio.run(main())
+"""
+
+
+def ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, capture_output=True, timeout=100)
+
+
+@pytest.fixture
+def machines() -> Iterator[tuple[str, str]]:
+    """Names of two namespaces, 10.99.7.1 and 10.99.7.2."""
+    if sys.platform != "linux" or shutil.which("ip") is None or os.geteuid() != 0:
+        pytest.skip("namespaces are made by root, with iproute2, on Linux")
+    one, two = (f"aerokit-{os.getpid()}-{n}" for n in (1, 2))
+    with ExitStack() as stack:
+        try:
+            for name in (one, two):
+                ip("netns", "add", name)
+                stack.callback(ip, "netns", "del", name)
+            ip("link", "add", "cable", "netns", one, "type", "veth", "peer", "name", "cable", "netns", two)
+            for name, address in ((one, "10.99.7.1/24"), (two, "10.99.7.2/24")):
+                ip("-n", name, "addr", "add", address, "dev", "cable")
+                ip("-n", name, "link", "set", "cable", "up")
+        except subprocess.CalledProcessError as error:
+            pytest.skip(f"no namespaces here: {error.stderr!r}")
+        yield one, two
+
+
+class Program:
+    """One in a namespace, which answers lines with lines."""
+
+    def __init__(self, namespace: str, program: str) -> None:
+        self.running = subprocess.Popen(
+            ["ip", "netns", "exec", namespace, sys.executable, "-c", program],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> Program:
+        assert self.line() == "up"
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.running.kill()
+        self.running.communicate()
+
+    def line(self) -> str:
+        assert self.running.stdout is not None
+        return self.running.stdout.readline().strip()
+
+    def ask(self, words: str) -> str:
+        assert self.running.stdin is not None
+        self.running.stdin.write(words + "\n")
+        self.running.stdin.flush()
+        return self.line()
+
+
+def test_a_cable_is_pulled_out(machines: tuple[str, str]) -> None:
+    one, two = machines
+    with Program(one, VEHICLE) as vehicle, Program(two, CLIENT) as client:
+        assert client.ask("until sent") == "done"
+        assert vehicle.line().startswith("heard")
+        ip("-n", one, "link", "set", "cable", "down")
+        assert client.ask("until dropped") == "done"  # for two seconds it is written into the void
+        ip("-n", one, "link", "set", "cable", "up")
+        assert client.ask("until sent") == "done"  # a beacon has come
+        heard = late = 0
+        while not (heard and late):  # TCP had kept them, and brings them
+            line = vehicle.ask("late?")
+            while line.startswith("heard"):
+                heard += 1
+                line = vehicle.line()
+            late = int(line.split()[1])
+            time.sleep(0.05)
+        assert heard <= 5

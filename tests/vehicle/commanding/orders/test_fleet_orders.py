@@ -1,0 +1,26 @@
+"""The order table by a fleet of three, each in its own air: no rule is broken by any of them, nor by the policy.
+
+`nox -s orders -- SEEDS` flies every action with every policy and many seeds.
+"""
+
+from __future__ import annotations
+
+import pytest
+from exhaustive import sampled
+from order_fleet import ACTIONS, POLICIES, faults_of, random_fleet_case
+from test_orders import IS_SESSION, SEEDS
+
+from aerokit.fleets.policy import PolicyName
+
+EVERY = [(action, policy) for action in ACTIONS for policy in POLICIES]
+FLOWN, SEEDS_EACH = (
+    (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*each) for each in EVERY[::2]], 4), 1)
+)
+"""Few of them in the tests, all of them in the session."""
+
+
+@pytest.mark.parametrize("seed", range(SEEDS_EACH))
+@pytest.mark.parametrize(("action", "policy"), FLOWN)
+def test_no_rule_is_broken(action: str, policy: PolicyName, seed: int) -> None:
+    """Nothing is sent twice, blind or against a pilot, by the action or by the policy; what is told is true."""
+    assert faults_of(case := random_fleet_case(action, policy, seed)) == [], case

@@ -1,0 +1,87 @@
+"""A program that is stopped in flight, while the failsafe for a lost ground station acts: it keeps the vehicle."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from exhaustive import exhaustive
+from served_copter import served
+
+from aerokit.sim import SimulatedCopter
+
+PAUSE_S, RTL = 7.0, "RTL"
+CASES = [(scheme, what) for scheme in ("udpin", "tcpin") for what in ("go_to", "cancelled", "stream")]
+
+PROGRAM = """
+import asyncio, json, sys, aerokit
+from aerokit import errors
+from aerokit.mavlink import Framer
+from aerokit.mavlink.dialect import STANDARD
+
+async def main(address, what):
+    async with aerokit.connect(address) as vehicle:
+        await vehicle.wait_ready(); await vehicle.arm(); await vehicle.take_off(8)
+        sent, ages = [], []
+        vehicle.connection.tap_sent(
+            lambda raw: sent.append(STANDARD.decode(Framer().receive(raw, 0.0)[0]).to_dict().get("command")))
+        vehicle.armed.observe(lambda *_: ages.append(vehicle.armed.age), every_arrival=True)
+        print("flying", flush=True)
+        far, error = vehicle.position.value.offset(north_m=300), None
+        try:
+            if what == "go_to":
+                await vehicle.go_to(far)
+            elif what == "cancelled":
+                await asyncio.wait_for(vehicle.go_to(far), 4)
+            else:
+                async with vehicle.guided.velocity() as stream:
+                    await stream.fly(aerokit.VelocitySetpoint(north_m_s=2), 60)
+        except (errors.AerokitError, asyncio.TimeoutError) as caught:
+            error = type(caught).__name__
+        await asyncio.sleep(2.5)
+        print(json.dumps([error, [each for each in sent if each in (176, 192)], max(ages), vehicle.mode_name]))
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
+    """What became of it, and the mode that the vehicle is in at the end."""
+    copter = SimulatedCopter(boot_time_s=0.0, parameters={"FS_GCS_ENABLE": 1.0})
+    with served([copter], f"{scheme}:127.0.0.1:0", speedup=1.0) as address:
+        here = address.replace("udpin:", "udpout:")
+        program = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, here, what], stdout=subprocess.PIPE, text=True
+        )
+        with program:
+            try:
+                assert program.stdout is not None
+                assert program.stdout.readline() == "flying\n"
+                time.sleep(1.5)  # the order is under way
+                os.kill(program.pid, signal.SIGSTOP)
+                time.sleep(PAUSE_S)
+                os.kill(program.pid, signal.SIGCONT)
+                error, sent, oldest_s, told = json.loads(program.stdout.readline())
+            finally:
+                program.kill()
+        return error, sent, oldest_s, told, copter.mode.name
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are stopped by signals")
+@pytest.mark.parametrize("cases", [CASES[:1], exhaustive(CASES[1:])], ids=["one", "others"])
+def test_stopped_program_leaves_the_failsafe_alone(cases: list[tuple[str, str]]) -> None:
+    """All of them at once, since they wait for the failsafe most of the time."""
+    with ThreadPoolExecutor(len(cases)) as pool:
+        flown = dict(zip(cases, pool.map(lambda case: fly(*case), cases), strict=True))
+    for (scheme, what), (error, sent, oldest_s, told, mode) in flown.items():
+        where = f"{what} over {scheme}: {flown[scheme, what]}"
+        assert error is not None, where
+        assert len(sent) == (what != "stream"), where  # what was sent before the pause
+        assert oldest_s > PAUSE_S - 1.5, where  # HEARTBEATs that waited are called as old as they are
+        assert told == mode == RTL, where

@@ -1,0 +1,175 @@
+"""Several orders at once, some cancelled, on a bad link, and a pilot: only the newest is sent, nothing against him."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import random
+from collections.abc import Awaitable, Callable, Hashable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import anyio
+import pytest
+from exhaustive import sampled
+from order_air import Air, Crossing, Weather
+from order_flights import RATES, Simulated, mode_of, take_over
+
+import aerokit
+from aerokit.errors import AerokitError
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import CommandInt, CommandLong, SetPositionTargetLocalNed
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
+from aerokit.testing import run_virtual
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
+
+SEEDS = int(os.environ.get("AEROKIT_ORDER_SEEDS", "2"))
+COMMANDS = (176, 192, 400, 20)
+
+
+def kind_of(message: Message) -> Hashable:
+    """What a message orders; None: nothing that steers or arms."""
+    if isinstance(message, SetPositionTargetLocalNed):
+        return "set-point"
+    if isinstance(message, CommandInt):
+        return "place" if message.command == 192 else None
+    if not isinstance(message, CommandLong) or message.command not in (20, 115, 176, 192, 400):
+        return None
+    if message.command == 176:
+        return "mode", int(message.param2), int(message.param3)
+    if message.command == 192:
+        return "stop" if math.isnan(message.param4) else "turn"
+    return message.command, int(message.param1) if message.command == 400 else 0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One order of a program, and what it may send, on ArduCopter and on PX4; empty: it does not steer."""
+
+    name: str
+    give: Callable[[aerokit.Vehicle], Awaitable[object]]
+    sends: tuple[set[Hashable], set[Hashable]] = (set(), set())
+
+
+async def _stream(vehicle: aerokit.Vehicle) -> None:
+    async with vehicle.guided.velocity() as stream:
+        await stream.fly(aerokit.VelocitySetpoint(north_m_s=1.0), 3.0)
+
+
+GUIDED = ("mode", 4, 0)
+HOLD: tuple[set[Hashable], set[Hashable]] = ({("mode", 17, 0)}, {"stop", ("mode", 4, 3)})
+CHOICES = (
+    Choice("hold", lambda v: v.hold(), HOLD),
+    Choice("land", lambda v: v.land(), ({("mode", 9, 0)}, {("mode", 4, 6)})),
+    Choice("return", lambda v: v.return_to_launch(), ({("mode", 6, 0)}, {("mode", 4, 5)})),
+    Choice("go_to", lambda v: v.go_to(v.position.value.offset(north_m=9)), ({"place"}, {"place"})),
+    Choice("set_mode", lambda v: v.set_mode("LOITER"), ({("mode", 5, 0)}, {("mode", 4, 3)})),
+    Choice("set_heading", lambda v: v.set_heading(90), ({(115, 0), GUIDED}, {"turn"})),
+    Choice("stream", _stream, ({"set-point", GUIDED}, {"set-point", ("mode", 6, 0)})),
+    Choice("command", lambda v: v.command(20), ({(20, 0)}, {(20, 0)})),
+    Choice("set_speed", lambda v: v.set_speed(3)),
+    Choice("arm", lambda v: v.arm()),
+    Choice("disarm", lambda v: v.disarm()),
+)
+
+
+@dataclass
+class Given:
+    """An order, and how much the program had sent before it."""
+
+    choice: Choice
+    sent: int
+    at: float
+
+
+async def _fly(seed: int, is_px4: bool) -> None:
+    dice = random.Random(f"{seed} {is_px4}")
+    simulated: Simulated = SimulatedPx4(boot_time_s=1.0) if is_px4 else SimulatedCopter(boot_time_s=0.0)
+    given: list[Given] = []
+    async with simulated_link(simulated) as link:
+        air = Air(link)
+        async with aerokit.connect(air, rates=RATES) as vehicle:
+            await _climb(simulated, vehicle)
+            air.weather = _weather(dice)
+            air.begin()
+            taken_at = dice.choice((None, dice.uniform(0.1, 5.0)))
+            if taken_at is not None:
+                asyncio.get_running_loop().call_later(taken_at, take_over, simulated)
+            await _give_some(dice, vehicle, air, given)
+            await anyio.sleep(15.0)
+    pilots = {2} if not is_px4 else {3 << 16}
+    told = next((each for each in air.heartbeats if getattr(each.message, "custom_mode", 0) in pilots), None)
+    story = f"seed {seed}: {[(round(each.at - air.began_at, 2), each.choice.name) for each in given]}"
+    for place, crossing in enumerate(air.sent):
+        _judge(crossing, [each for each in given if each.sent <= place], told, is_px4, story)
+
+
+async def _climb(simulated: Simulated, vehicle: aerokit.Vehicle) -> None:
+    await vehicle.wait_ready()
+    if isinstance(simulated, SimulatedCopter):
+        simulated.rc[2] = 1500
+        await vehicle.set_mode("GUIDED")
+    await vehicle.arm()
+    await vehicle.take_off(10.0)
+    await anyio.sleep(2.5)
+    assert mode_of(simulated) in ("GUIDED", "LOITER")
+
+
+def _weather(dice: random.Random) -> Weather:
+    weather = Weather(
+        command=dice.choice(COMMANDS),
+        lost_acks=dice.choice((0, 1, 9)),
+        lost_commands=dice.choice((0, 1, 2)),
+        latency_s=dice.choice((0.01, 0.2)),
+    )
+    if dice.random() < 0.3:
+        begin = dice.uniform(0.0, 4.0)
+        weather.outage = begin, begin + dice.uniform(1.0, 8.0)
+    return weather
+
+
+async def _give_some(dice: random.Random, vehicle: aerokit.Vehicle, air: Air, given: list[Given]) -> None:
+    async def give(choice: Choice) -> None:
+        given.append(Given(choice, len(air.sent), asyncio.get_running_loop().time()))
+        with suppress(AerokitError):
+            await choice.give(vehicle)
+
+    tasks: list[asyncio.Task[None]] = []
+    for _ in range(dice.randint(2, 6)):
+        await anyio.sleep(dice.choice((0.0, 0.01, 0.1, 0.5, 1.0)))
+        tasks.append(asyncio.ensure_future(give(dice.choice(CHOICES))))
+        if dice.random() < 0.3:
+            dice.choice(tasks).cancel()
+    await anyio.sleep(25.0)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _judge(sent: Crossing, given: list[Given], told: Crossing | None, is_px4: bool, story: str) -> None:
+    kind = kind_of(sent.message)
+    if kind is None:
+        return
+    about = f"{kind} at {sent.at:.2f}; {story}"
+    if kind in ((400, 0), (400, 1)):
+        newest = [each for each in given if each.choice.name in ("arm", "disarm")][-1]
+        is_old = newest.choice.name == "disarm" and newest.at < sent.at
+        assert kind == (400, 0) or not is_old, f"armed after disarm(): {about}"
+        return
+    steering = [each for each in given if each.choice.sends[is_px4]]
+    newest = steering[-1]
+    at_once = [each for each in steering if each.at == newest.at]
+    allowed = HOLD[is_px4].union(*(each.choice.sends[is_px4] for each in at_once))
+    assert kind in allowed, f"an order that was overruled: {about}"
+    is_against_the_pilot = told is not None and newest.at < told.at and sent.number > told.number
+    own = [each.at for each in given if each.choice.name == "command"]
+    if told is not None and own and told.at - own[-1] < MODE_GRACE_S:
+        return  # any mode is taken for its effect: docs/reliability.md says so
+    assert kind == "set-point" or not is_against_the_pilot, f"after the pilot was told: {about}"
+
+
+@pytest.mark.parametrize("is_px4", [False, True], ids=["ardupilot", "px4"])
+@pytest.mark.parametrize("seed", sampled(range(4 * SEEDS), 3))
+def test_only_the_newest_order_is_sent(seed: int, is_px4: bool) -> None:
+    run_virtual(_fly(seed, is_px4))

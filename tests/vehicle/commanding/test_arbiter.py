@@ -1,0 +1,456 @@
+"""Who steers: every rule by which an order, or one sending of it, ends; without a vehicle, a loop or a clock."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack, nullcontext
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from aerokit.autopilots import Mode, autopilot_for
+from aerokit.connection.cells import Source, StateCell
+from aerokit.errors import CommandRejected, CommandTimeout
+from aerokit.mavlink.enums import MavCmd, MavState
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.vehicle.commanding.arbiter import KNOWN_S, MODE_GRACE_S, CommandArbiter
+from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, QUESTIONS, Order, SentCommand
+from aerokit.vehicle.state.telemetry import Telemetry
+
+HEARTBEAT = Source(1, 1, "HEARTBEAT")
+GUIDED, LOITER, RTL, BRAKE = (
+    Mode(name, number) for number, name in ((4, "GUIDED"), (5, "LOITER"), (6, "RTL"), (17, "BRAKE"))
+)
+
+
+COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
+
+
+class Stage:
+    """An arbiter, and heartbeats at the test's word."""
+
+    def __init__(self, mode: Mode | None = LOITER, armed: bool | None = True) -> None:
+        self.now, self.open = 0.0, ExitStack()
+        self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
+        self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
+        self.state = StateCell[int]("system_status", lambda: self.now, "HEARTBEAT")
+        cells = SimpleNamespace(
+            mode=self.mode, armed=self.armed, system_status=self.state, autopilot=COPTER, is_vtol=False
+        )
+        self.arbiter = CommandArbiter(lambda: self.now, cast("Telemetry", cells))
+        if mode is not None and armed is not None:
+            self.tell(mode, armed)
+
+    def tell(
+        self, mode: Mode, armed: bool = True, *, after: float = 1.0, state: int = MavState.ACTIVE
+    ) -> None:
+        self.now += after
+        self.mode.set(mode, HEARTBEAT)
+        self.state.set(state, HEARTBEAT)
+        self.armed.set(armed, HEARTBEAT)
+
+
+# -------------------------------------------------------------------------------- the newest
+
+
+def test_a_newer_order_ends_the_one_before_and_is_announced_first() -> None:
+    stage, ends = Stage(), list[str]()
+    first = stage.arbiter.order(GUIDED)
+    stage.arbiter.on_steering(lambda: ends.append(first.end))
+    second = stage.arbiter.order(RTL)
+    assert ends == [""]  # called before
+    assert first.end == "another order was given"
+    assert (first.taken_by, second.end) == ("", "")
+    assert stage.arbiter.newest is second
+
+
+def test_what_does_not_steer_ends_with_the_order_that_steers_and_ends_none() -> None:
+    stage = Stage()
+    steering = stage.arbiter.order(GUIDED)
+    with stage.arbiter.aside() as aside:
+        assert (steering.end, aside.end) == ("", "")
+        assert aside.modes == steering.modes
+        stage.arbiter.order(RTL)
+        assert aside.end == "another order was given"
+
+
+def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
+    stage = Stage()
+    with stage.arbiter.aside() as aside:
+        assert aside.modes == ()
+        stage.tell(LOITER)
+    stage.tell(RTL)
+    assert aside.end == ""
+    with pytest.raises(KeyError), stage.arbiter.aside() as aside:
+        raise KeyError
+    stage.tell(BRAKE)
+    assert aside.end == ""
+
+
+# ------------------------------------------------------------------------------ somebody else
+
+
+@pytest.mark.parametrize("told", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
+def test_the_mode_before_and_the_orders_own_are_nobody_elses(told: list[Mode]) -> None:
+    stage = Stage()
+    order = stage.arbiter.order(GUIDED)
+    for mode in told:
+        stage.tell(mode)
+    assert order.end == ""
+
+
+@pytest.mark.parametrize("told", [[RTL], [GUIDED, LOITER], [GUIDED, RTL, GUIDED], [LOITER, RTL, LOITER]])
+def test_another_mode_ends_it_for_good(told: list[Mode]) -> None:
+    """The mode before, too, once the vehicle was in the one that was ordered."""
+    stage = Stage()
+    order = stage.arbiter.order(GUIDED)
+    for mode in told:
+        stage.tell(mode)
+    assert (
+        order.end
+        == order.taken_by
+        == f"the mode changed to {next(m for m in told[1:] or told if m != GUIDED)}"
+    )
+
+
+def test_the_first_who_took_it_is_named() -> None:
+    stage = Stage()
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(RTL)
+    stage.tell(BRAKE, armed=False)
+    stage.arbiter.note_reboot()
+    assert order.end == "the mode changed to RTL"
+
+
+def test_disarming_and_rebooting_end_it() -> None:
+    stage = Stage()
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(LOITER, armed=False)
+    assert order.end == "the vehicle disarmed"
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(LOITER, armed=False)
+    assert order.end == ""  # it was so before
+    stage.arbiter.note_reboot()
+    assert order.end == "the vehicle rebooted"
+
+
+def test_disarming_counts_from_when_it_was_armed() -> None:
+    stage = Stage(armed=False)
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(LOITER, armed=True)
+    assert order.end == ""
+    stage.tell(LOITER, armed=False)
+    assert order.end == "the vehicle disarmed"
+
+
+def test_a_mode_that_was_not_known_before_is_the_one_before() -> None:
+    stage = Stage(mode=None)
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(RTL)
+    assert order.end == ""
+    stage.tell(BRAKE)
+    assert order.end == "the mode changed to BRAKE"
+
+
+# --------------------------------------------------------------------------------- doubts
+
+
+def test_the_mode_of_the_order_before_may_still_come_while_that_is_under_way() -> None:
+    stage = Stage()
+    stage.arbiter.order(GUIDED)
+    stage.tell(GUIDED)
+    order = stage.arbiter.order(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == ""
+    stage.tell(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == "the mode changed to GUIDED"
+
+
+@pytest.mark.parametrize(("in_doubt", "end"), [(True, ""), (False, "the mode changed to GUIDED")])
+def test_a_mode_that_was_ordered_and_not_told_may_come_while_it_is_in_doubt(in_doubt: bool, end: str) -> None:
+    stage = Stage()
+    stage.arbiter.order(GUIDED)
+    stage.arbiter.mode_is_in_doubt = in_doubt
+    order = stage.arbiter.order(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == end
+
+
+@pytest.mark.parametrize(
+    ("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")]
+)
+def test_a_mode_that_was_given_up_may_come_for_three_seconds(after_s: float, end: str) -> None:
+    stage = Stage()
+    stage.arbiter.order(GUIDED)
+    stage.arbiter.doubt_mode()
+    stage.arbiter.mode_is_in_doubt = False
+    stage.now += after_s
+    order = stage.arbiter.order(BRAKE)
+    stage.tell(GUIDED)
+    assert order.end == end
+
+
+@pytest.mark.parametrize(("after_s", "end"), [(2.9, ""), (3.0, "the mode changed to RTL")])
+def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
+    after_s: float, end: str
+) -> None:
+    stage = Stage()
+    own = stage.arbiter.order_of_the_programs_own()
+    order = stage.arbiter.order(GUIDED)
+    assert own.end == "another order was given"
+    stage.tell(RTL, after=after_s)
+    assert order.end == end
+
+
+def test_the_mode_that_an_order_of_the_programs_own_names_is_not_a_pilots_doing() -> None:
+    stage = Stage()
+    own = stage.arbiter.order_of_the_programs_own(modes=[GUIDED])
+    stage.tell(GUIDED)
+    assert (own.end, stage.arbiter.is_obeyed) == ("", True)
+    stage.tell(RTL)  # within three seconds: nothing is sent again after a pilot's mode
+    assert (own.end, stage.arbiter.is_obeyed) == ("the mode changed to RTL", False)
+
+
+def test_an_order_of_the_programs_own_ends_at_any_mode_so_that_it_is_not_sent_again_over_a_pilot() -> None:
+    stage = Stage()
+    own = stage.arbiter.order_of_the_programs_own()
+    with stage.arbiter.sending(own) as sending:
+        stage.tell(RTL, after=0.5)
+        assert sending.end == "the mode changed to RTL"
+
+
+@pytest.mark.parametrize(
+    ("error", "in_doubt", "settles_at"),
+    [
+        (None, False, -math.inf),
+        (CommandRejected("no", command=176, result=4), False, -math.inf),
+        (CommandTimeout("no answer"), True, 1.0 + MODE_GRACE_S),
+    ],
+)
+def test_a_mode_is_in_doubt_until_the_answer_is_known(
+    error: Exception | None, in_doubt: bool, settles_at: float
+) -> None:
+    helm, seen = Stage().arbiter, list[bool]()
+    with nullcontext() if error is None else pytest.raises(type(error)), helm.changing_mode():
+        seen.append(helm.mode_is_in_doubt)
+        if error is not None:
+            raise error
+    assert [*seen, helm.mode_is_in_doubt] == [True, in_doubt]
+    assert helm.mode_settles_at == settles_at
+
+
+def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
+    stage = Stage()
+    for later, known in ((KNOWN_S, True), (0.1, False)):
+        stage.now += later
+        assert stage.arbiter.is_known is known
+    assert not Stage(mode=None).arbiter.is_known
+
+
+# --------------------------------------------------------------------------------- sendings
+
+
+def sending(stage: Stage, **options: Any) -> SentCommand:
+    order = stage.arbiter.order(GUIDED)
+    return stage.open.enter_context(stage.arbiter.sending(order, **options))
+
+
+def test_a_sending_ends_when_its_mode_is_told_whatever_comes_then() -> None:
+    stage = Stage()
+    each = sending(stage, modes=(GUIDED,))
+    stage.tell(LOITER)
+    assert (each.end, each.has_worked) == ("", False)
+    stage.tell(GUIDED)
+    assert (each.end, each.has_worked) == ("its effect was told", True)
+    stage.tell(RTL)
+    assert each.end == "its effect was told"
+
+
+def test_a_sending_ends_when_it_is_armed_as_ordered() -> None:
+    for armed in (True, False):
+        stage = Stage(armed=not armed)
+        each = sending(stage, armed=armed)
+        stage.tell(LOITER, armed=not armed)
+        assert each.end == ""
+        stage.tell(LOITER, armed=armed)
+        assert each.has_worked
+
+
+def test_what_is_so_already_tells_nothing_of_an_effect() -> None:
+    stage = Stage(GUIDED)
+    each = sending(stage, modes=(GUIDED, LOITER), armed=True)
+    stage.tell(GUIDED)
+    assert not each.has_worked
+    stage.tell(LOITER)
+    assert each.has_worked
+
+
+def test_a_sending_ends_with_its_order_and_by_its_own_sign() -> None:
+    stage, done = Stage(), list[int]()
+    each = sending(stage, is_done=lambda: bool(done))
+    stage.tell(RTL)
+    assert each.end == "the mode changed to RTL"
+    done.append(1)
+    assert each.end == "its effect was told"
+    done.clear()
+    assert each.end == "its effect was told"
+
+
+def test_a_sending_knows_when_the_vehicle_told_last_until_its_block_ends() -> None:
+    stage = Stage()
+    with stage.arbiter.sending(stage.arbiter.order(GUIDED)) as each:
+        assert each.told_at == -math.inf
+        stage.tell(LOITER)
+        assert each.told_at == 2.0
+    stage.tell(LOITER)
+    assert each.told_at == 2.0
+
+
+def test_orders_know_what_moves_and_what_only_asks() -> None:
+    assert {MavCmd(each).name for each in CHANGED_BY_COMMAND} == {
+        *("NAV_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS", "NAV_LOITER_TIME", "NAV_RETURN_TO_LAUNCH"),
+        *("NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF", "NAV_VTOL_LAND", "DO_SET_MODE", "DO_REPOSITION"),
+        *("DO_FLIGHTTERMINATION", "DO_ORBIT", "DO_PAUSE_CONTINUE", "OVERRIDE_GOTO", "MISSION_START"),
+        "COMPONENT_ARM_DISARM",
+    }
+    for each in QUESTIONS - {MavCmd.SET_MESSAGE_INTERVAL, MavCmd.RUN_PREARM_CHECKS}:
+        assert MavCmd(each).name.startswith(("REQUEST_", "GET_")), "what changes something is no question"
+    assert len(QUESTIONS) == 11
+
+
+def test_an_order_of_nothing_in_no_mode_stands() -> None:
+    order = Order(0.0, 1, lambda _: True)
+    assert order.end == ""
+
+
+# --------------------------------------------------------------------------------- failsafes
+
+
+@pytest.mark.parametrize("state", [MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION])
+def test_order_failsafe_becomes_active_ends_it_for_good(state: int) -> None:
+    stage = Stage()
+    order = stage.arbiter.order(GUIDED)
+    with stage.arbiter.sending(order) as sending, stage.arbiter.aside() as aside:
+        stage.tell(GUIDED, state=state)
+        assert "failsafe" in order.end
+        assert sending.end == aside.end == order.end
+        stage.tell(GUIDED)
+        assert "failsafe" in order.end
+    assert not stage.arbiter.order(GUIDED).is_given
+
+
+def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
+    stage = Stage()
+    stage.tell(LOITER, state=MavState.CRITICAL)
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(GUIDED, state=MavState.CRITICAL)
+    assert not order.end
+    stage.tell(GUIDED)
+    assert not order.end
+    stage.tell(GUIDED, state=MavState.CRITICAL)
+    assert "failsafe" in order.end
+
+
+def test_order_worse_failsafe_than_the_known_one_ends_it() -> None:
+    stage = Stage()
+    stage.tell(LOITER, state=MavState.CRITICAL)
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(GUIDED, state=MavState.EMERGENCY)
+    assert "MAV_STATE_EMERGENCY" in order.end
+
+
+@pytest.mark.parametrize("mode", [RTL, Mode("LAND", 9)])
+def test_order_to_land_or_return_stands_under_a_failsafe(mode: Mode) -> None:
+    stage = Stage()
+    order = stage.arbiter.order(mode)
+    with (
+        stage.arbiter.sending(order, modes=[mode]) as sending,
+        stage.arbiter.aside(ends_flight=True) as disarm,
+    ):
+        stage.tell(LOITER, state=MavState.CRITICAL)
+        assert (order.end, sending.end, disarm.end) == ("", "", "")
+        assert "failsafe" in order.failsafe
+
+
+# --------------------------------------------------------------------------------- who flies it
+
+
+def arm(stage: Stage, *, is_refused: bool = False) -> None:
+    """An order to arm, until its answer."""
+    error = CommandRejected("no", command=400, result=4)
+    with (
+        pytest.raises(CommandRejected) if is_refused else nullcontext(),
+        stage.arbiter.aside() as order,
+        stage.arbiter.sending(order, armed=True),
+    ):
+        if is_refused:
+            raise error
+
+
+def test_vehicle_that_the_program_armed_is_flown_by_it_until_a_pilot_takes_it() -> None:
+    stage = Stage(armed=False)
+    arm(stage)
+    stage.tell(LOITER, True, after=0.8)
+    assert stage.arbiter.is_flown_by_program
+    stage.tell(RTL)
+    assert not stage.arbiter.is_flown_by_program
+
+
+def test_vehicle_told_armed_long_after_the_answer_is_the_programs_if_nothing_was_told_between() -> None:
+    stage = Stage(armed=False)
+    arm(stage)
+    stage.tell(LOITER, True, after=6.0)  # HEARTBEATs were lost
+    assert stage.arbiter.is_flown_by_program
+
+
+def test_vehicle_that_a_pilot_armed_after_a_refusal_or_a_disarming_is_his() -> None:
+    stage = Stage(armed=False)
+    arm(stage, is_refused=True)
+    stage.tell(LOITER, True, after=1.0)
+    assert not stage.arbiter.is_flown_by_program
+    stage = Stage(armed=False)
+    arm(stage)
+    for _ in range(4):
+        stage.tell(LOITER, False)  # he disarmed it at once
+    stage.tell(LOITER, True)
+    assert not stage.arbiter.is_flown_by_program
+
+
+def flies(stage: Stage) -> bool:
+    return stage.arbiter.is_flown_by_program
+
+
+def test_refused_order_changes_nothing_about_who_flies() -> None:
+    stage = Stage()
+    refused = stage.arbiter.order(GUIDED)
+    refused.was_refused = True
+    assert not flies(stage)
+    stage.arbiter.order(GUIDED)
+    assert flies(stage)
+    refused = stage.arbiter.order(BRAKE)
+    refused.was_refused = True
+    assert flies(stage)
+
+
+def test_failsafe_is_forgiven_when_the_program_takes_the_vehicle_back() -> None:
+    stage = Stage()
+    stage.arbiter.order(GUIDED)
+    stage.tell(GUIDED)
+    stage.tell(GUIDED, state=MavState.CRITICAL)
+    stage.tell(GUIDED)
+    assert not flies(stage)
+    stage.arbiter.forgive_failsafe()
+    assert flies(stage)
+
+
+def test_posted_mode_after_an_order_is_the_programs_own() -> None:
+    stage = Stage()
+    order = stage.arbiter.order(GUIDED)
+    stage.tell(GUIDED)
+    with stage.arbiter.post(["mode"], modes=[RTL]):
+        stage.tell(RTL)
+    assert not order.has_lost_mode
+    stage.tell(LOITER)
+    assert order.has_lost_mode

@@ -1,0 +1,298 @@
+"""Arming and disarming, and why it is refused: what the vehicle says, what its sensors and its estimator say."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+from flight_harness import Flight, now, open_flight, open_px4
+
+from aerokit.errors import CommandRejected, CommandTimeout, LinkLost, OperationTimeout
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavResult, MavSeverity
+from aerokit.mavlink.messages import Statustext, SysStatus
+from aerokit.sim import SimulatedCopter, SimulatedPx4
+
+pytestmark = pytest.mark.anyio
+
+ARM = MavCmd.COMPONENT_ARM_DISARM
+
+
+async def test_arm_and_disarm_end_when_heartbeat_says_so(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    await vehicle.arm()
+    assert (vehicle.is_armed, vehicle.armed.value, grounded.copter.is_armed) == (True, True, True)
+    await vehicle.disarm()
+    assert (vehicle.is_armed, vehicle.armed.value, grounded.copter.is_armed) == (False, False, False)
+    arm, disarm = grounded.wire.commands(ARM)
+    assert (arm.param1, arm.param2) == (1.0, 0.0)
+    assert (disarm.param1, disarm.param2) == (0.0, 0.0)
+
+
+async def test_arming_an_armed_vehicle_is_no_error(grounded: Flight) -> None:
+    await grounded.vehicle.arm()
+    await grounded.vehicle.arm()
+    assert grounded.vehicle.is_armed
+
+
+async def test_a_lost_answer_is_made_up_for_by_what_is_told(grounded: Flight) -> None:
+    grounded.copter.faults.lose_ack(ARM)
+    await grounded.vehicle.arm()
+    assert len(grounded.wire.commands(ARM)) == 1  # HEARTBEAT has told that it was heard
+
+
+async def test_arm_order_is_lost_ends_and_is_not_repeated(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(ARM, times=1)
+    with pytest.raises(CommandTimeout, match=r"never sent again: a second one arms a vehicle that a pilot"):
+        await grounded.vehicle.arm()
+    assert len(grounded.wire.commands(ARM)) == 1
+    await grounded.vehicle.arm()  # the program decides
+
+
+async def test_disarm_order_is_lost_is_repeated(grounded: Flight) -> None:
+    await grounded.vehicle.arm()
+    grounded.wire.forget()
+    grounded.copter.faults.ignore(ARM, times=1)
+    await grounded.vehicle.disarm()
+    first, second = grounded.wire.commands(ARM)
+    assert (first.confirmation, second.confirmation) == (0, 1)  # type: ignore[union-attr]
+
+
+async def test_refused_with_the_vehicles_own_words(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures += ["Compass not healthy", "Gyros inconsistent"]
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert caught.value.result == MavResult.FAILED
+    assert "Arm: Compass not healthy" in caught.value.reasons
+    assert "Arm: Gyros inconsistent" in caught.value.reasons
+    assert "\n  - Arm: Compass not healthy" in str(caught.value)
+    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # it has spoken already
+
+
+async def test_refused_in_silence_asks_the_vehicle_to_run_its_checks(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(ARM, MavResult.FAILED)
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert "PreArm: Compass not healthy" in caught.value.reasons
+    assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+
+
+async def test_each_reason_is_told_once(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert len(set(caught.value.reasons)) == len(caught.value.reasons)
+
+
+async def test_what_is_said_meanwhile_and_is_no_reason_is_left_out(grounded: Flight) -> None:
+    copter, refuse = grounded.copter, grounded.copter.faults.prearm_failures
+    refuse.append("Compass not healthy")
+    say_more = copter.send_text
+
+    def say(severity: int, text: str) -> None:
+        for other in ("ArduPilot Ready", "Barometer 1 calibration complete"):
+            say_more(MavSeverity.INFO, other)
+        say_more(MavSeverity.CRITICAL, "PreArm: Compass not healthy")
+        say_more(MavSeverity.WARNING, "EKF3 IMU0 stopped aiding")
+        for _ in range(2):
+            say_more(severity, text)
+
+    copter.send_text = say  # type: ignore[method-assign]
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.arm()
+    assert caught.value.reasons[:2] == ("PreArm: Compass not healthy", "EKF3 IMU0 stopped aiding")
+    assert str(caught.value).count("Compass not healthy") == 1
+    assert "Ready" not in str(caught.value)
+    assert "Barometer" not in str(caught.value)
+
+
+async def test_too_early_names_the_estimator_and_the_failing_bits() -> None:
+    async with open_flight(SimulatedCopter(boot_time_s=60.0)) as flight:
+        await anyio.sleep(12.0)
+        await flight.vehicle.set_mode("GUIDED")
+        with pytest.raises(CommandRejected) as caught:
+            await flight.vehicle.arm()
+        reasons = "; ".join(caught.value.reasons)
+        assert "the estimator has no absolute horizontal position (EKF_STATUS_REPORT)" in reasons
+        assert "pre-arm checks do not pass (SYS_STATUS)" in reasons
+        assert "Arm: " in reasons
+
+
+async def test_force_skips_the_checks(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    await grounded.vehicle.arm(force=True)
+    assert grounded.vehicle.is_armed
+    assert grounded.wire.commands(ARM)[0].param2 == 21196.0
+
+
+async def test_accepted_but_not_armed_is_a_timeout(grounded: Flight) -> None:
+    grounded.copter.arming.arm = lambda **_: True  # type: ignore[method-assign]
+    started = now()
+    with pytest.raises(
+        OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle said nothing about it"
+    ):
+        await grounded.vehicle.arm(timeout=3.0)
+    assert 3.0 <= now() - started < 4.0
+
+
+async def test_a_silent_vehicle_is_a_timeout(grounded: Flight) -> None:
+    grounded.copter.faults.silent = True
+    with pytest.raises(
+        CommandTimeout,
+        match=r"COMPONENT_ARM_DISARM, sent once within 4\.0 s; never sent again: .*; last heartbeat 4",
+    ):
+        await grounded.vehicle.arm()
+
+
+async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
+    with pytest.raises(CommandRejected):
+        await flying.vehicle.disarm()
+    assert flying.vehicle.is_armed
+    await flying.vehicle.disarm(force=True)
+    assert not flying.copter.is_armed
+    assert [each.param2 for each in flying.wire.commands(ARM)] == [0.0, 21196.0]
+
+
+async def test_an_answer_that_was_left_behind_is_not_the_next_ones() -> None:
+    """arm() is cancelled while its refusal is under way; disarm() must not take that for its own answer."""
+    async with open_flight(latency_s=0.2) as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.refuse(ARM, MavResult.FAILED, times=1)
+        with anyio.move_on_after(0.1):
+            await flight.vehicle.arm()
+        await flight.vehicle.disarm()
+
+
+# ---------------------------------------------------------------------------- beforehand
+
+
+async def test_nothing_keeps_it_from_arming(grounded: Flight) -> None:
+    assert await grounded.vehicle.why_not_armable() == []
+    await grounded.vehicle.arm()
+    assert await grounded.vehicle.why_not_armable() == []
+    assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
+
+
+async def test_why_not_armable_names_failing_checks_without_arming(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    reasons = await grounded.vehicle.why_not_armable()
+    assert "PreArm: Compass not healthy" in reasons
+    assert not grounded.wire.commands(ARM)
+    assert not grounded.copter.is_armed
+
+
+async def test_why_not_armable_names_a_mode_that_cannot_be_armed_in(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("LAND")
+    assert any("does not arm in LAND" in reason for reason in await grounded.vehicle.why_not_armable())
+
+
+async def test_why_not_armable_works_when_the_vehicle_cannot_run_its_checks(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(MavCmd.RUN_PREARM_CHECKS, MavResult.UNSUPPORTED)
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    await anyio.sleep(3.0)
+    assert await grounded.vehicle.why_not_armable() == [
+        "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
+    ]
+
+
+async def test_why_not_armable_asks_a_vehicle_that_does_not_answer_twice(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(MavCmd.RUN_PREARM_CHECKS)
+    assert await grounded.vehicle.why_not_armable() == []
+    assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2
+
+
+async def test_why_not_armable_gives_the_vehicle_a_second_for_its_texts(grounded: Flight) -> None:
+    async with anyio.create_task_group() as tasks:
+
+        async def say_it_late() -> None:
+            await anyio.sleep(0.9)
+            grounded.wire.deliver(FrameEncoder(1, 1).encode(Statustext(2, "PreArm: Gyros inconsistent")))
+
+        tasks.start_soon(say_it_late)
+        assert await grounded.vehicle.why_not_armable() == ["PreArm: Gyros inconsistent"]
+
+
+async def test_why_not_armable_works_without_default_streams() -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.refuse(MavCmd.RUN_PREARM_CHECKS, MavResult.UNSUPPORTED)
+    copter.faults.prearm_failures.append("Compass not healthy")
+    async with open_flight(copter, rates={}) as flight:
+        await anyio.sleep(3.0)
+        assert await flight.vehicle.why_not_armable() == [
+            "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
+        ]
+
+
+async def test_what_was_said_long_ago_is_no_reason(grounded: Flight) -> None:
+    grounded.copter.faults.prearm_failures.append("Compass not healthy")
+    assert await grounded.vehicle.why_not_armable()
+    grounded.copter.faults.prearm_failures.clear()
+    await anyio.sleep(3.0)
+    assert await grounded.vehicle.why_not_armable() == []
+
+
+# ------------------------------------------------------------------------------------------ PX4
+
+
+async def test_px4_says_why_not() -> None:
+    async with open_px4(SimulatedPx4(boot_time_s=30.0)) as flight:
+        await anyio.sleep(3.0)
+        reasons = await flight.vehicle.why_not_armable()
+        assert reasons
+        with pytest.raises(CommandRejected) as caught:
+            await flight.vehicle.arm()
+        assert caught.value.result == MavResult.TEMPORARILY_REJECTED
+        assert caught.value.reasons
+
+
+async def test_px4_arms_when_ready_and_disarms() -> None:
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        assert await flight.vehicle.why_not_armable() == []
+        await flight.vehicle.arm()
+        await flight.vehicle.disarm()
+        assert not flight.px4.is_armed
+
+
+async def test_px4_disarm_in_the_air_says_why_not() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        with pytest.raises(CommandRejected, match=r"(?i)disarming denied|not landed"):
+            await flight.vehicle.disarm()
+        assert flight.px4.is_armed
+
+
+async def test_values_from_before_the_link_was_restored_count_no_more(grounded: Flight) -> None:
+    """The vehicle may have rebooted while the link was away for a moment."""
+    vehicle, connection = grounded.vehicle, grounded.vehicle.connection
+    assert vehicle.missing_for_flight() == []
+    connection.link_interrupted(LinkLost("unplugged"))
+    grounded.copter.faults.silent = True
+    await anyio.sleep(0.2)
+    connection.link_restored(0.2)
+    grounded.copter.faults.silent = False
+    assert vehicle.missing_for_flight()[1:] == [
+        "sensors (no SYS_STATUS since the link was restored)",
+        "estimator (no EKF_STATUS_REPORT since the link was restored)",
+        "position (no GLOBAL_POSITION_INT with a fix since the link was restored)",
+    ]
+    await vehicle.wait_ready()
+    await vehicle.arm()
+
+
+async def test_ready_after_the_link_was_restored_without_a_reboot(grounded: Flight) -> None:
+    connection = grounded.vehicle.connection
+    connection.link_interrupted(LinkLost("unplugged"))
+    connection.link_restored(0.2)
+    restored_at = now()
+    await grounded.vehicle.wait_ready()
+    assert grounded.vehicle.position.updated_at >= restored_at
+    assert now() - restored_at < 2.0
+
+
+async def test_state_older_than_five_seconds_is_missing_for_flight(grounded: Flight) -> None:
+    grounded.copter.faults.lose(SysStatus, times=1_000_000)
+    await anyio.sleep(4.5)
+    assert grounded.vehicle.missing_for_flight() == []
+    await anyio.sleep(1.5)
+    assert any("no SYS_STATUS for" in each for each in grounded.vehicle.missing_for_flight())

@@ -1,0 +1,217 @@
+"""An order to arm that was given up: what is watched afterwards, and what is left alone."""
+
+from __future__ import annotations
+
+import asyncio
+
+import anyio
+import pytest
+from flight_harness import Flight, open_flight, open_px4
+
+from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
+from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.mavlink.messages import CommandAck
+from aerokit.sim import SimulatedCopter, SimulatedPx4
+
+LATE_S = 15.0
+
+pytestmark = pytest.mark.anyio
+
+ARM = MavCmd.COMPONENT_ARM_DISARM
+
+
+def ordered(flight: Flight) -> list[float]:
+    """1 for each order to arm that was sent, 0 for each to disarm."""
+    return [each.param1 for each in flight.wire.commands(ARM)]
+
+
+async def test_who_arms_after_it_was_given_up_is_disarmed(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 0]
+    assert not grounded.copter.is_armed
+
+
+async def test_only_what_is_told_after_it_was_given_up_counts(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.lose_ack(ARM)
+    scope = anyio.CancelScope()
+    detach = grounded.vehicle.armed.observe(lambda _, armed: scope.cancel())
+    with scope:
+        await grounded.vehicle.arm()
+    assert scope.cancelled_caught
+    detach()
+    assert grounded.vehicle.is_armed
+    grounded.copter.arming.disarm()  # somebody else, before another heartbeat
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1]
+
+
+@pytest.mark.parametrize("ends", ["cancelled", "unanswered"])
+async def test_who_was_armed_before_is_left_alone(flying: Flight, ends: str) -> None:
+    """It flies: that it is armed is nothing that this order has done."""
+    if ends == "cancelled":
+        with anyio.move_on_after(0.0):
+            await flying.vehicle.arm()
+    else:
+        flying.copter.faults.ignore(ARM)
+        with pytest.raises(CommandTimeout):
+            await flying.vehicle.arm()
+    await anyio.sleep(20.0)
+    assert ordered(flying).count(0) == 0
+
+
+async def test_disarming_goes_on_when_the_time_to_watch_ends(grounded: Flight) -> None:
+    """It armed in the last moment, and the first order to disarm is lost."""
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    told_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    await anyio.sleep(0.7)  # of the second from one heartbeat to the next
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    (order,) = grounded.wire.commands(ARM)
+    await anyio.sleep(LATE_S - 1.0)
+    grounded.copter.faults.commands.clear()
+    grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
+    await anyio.sleep(0.1)
+    grounded.copter.faults.ignore(ARM)
+    await anyio.sleep(1.0)
+    assert grounded.vehicle.is_armed
+    assert ordered(grounded) == [1, 0]
+    grounded.copter.faults.commands.clear()
+    await anyio.sleep(3.0)
+    assert ordered(grounded) == [1, 0, 0]
+    assert not grounded.copter.is_armed
+
+
+async def test_who_cannot_be_disarmed_again_is_told_of(
+    grounded: Flight, caplog: pytest.LogCaptureFixture
+) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    await grounded.vehicle.armed.wait_until(bool, timeout=5)
+    grounded.copter.faults.refuse(ARM, MavResult.FAILED)
+    await anyio.sleep(5.0)
+    (record,) = [each for each in caplog.records if each.levelname == "ERROR"]
+    assert "the vehicle armed after the order was given up, and could not be disarmed" in record.message
+    assert grounded.copter.is_armed
+
+
+async def test_pilot_who_arms_after_his_mode_change_stays_armed(
+    grounded: Flight, caplog: pytest.LogCaptureFixture
+) -> None:
+    """His mode change has ended the call, whose order was lost."""
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    asyncio.get_running_loop().call_later(0.5, grounded.copter.set_mode, CopterMode.STABILIZE)
+    with pytest.raises(OperationRejected, match="mode changed to STABILIZE"):
+        await grounded.vehicle.arm()
+    await anyio.sleep(0.3)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+    assert "nothing shows that this order did it: it is left armed" in caplog.text
+
+
+async def test_pilot_who_arms_later_by_his_sticks_stays_armed(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("STABILIZE")
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.1):
+        await grounded.vehicle.arm()
+    await anyio.sleep(3.0)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+
+
+async def test_order_that_arrives_late_and_is_accepted_is_undone(grounded: Flight) -> None:
+    """The answer tells whose order it was, though it comes seconds later."""
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.1):
+        await grounded.vehicle.arm()
+    (order,) = grounded.wire.commands(ARM)
+    await anyio.sleep(6.0)
+    grounded.copter.faults.commands.clear()
+    grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 0]
+    assert not grounded.copter.is_armed
+
+
+@pytest.mark.parametrize("kind", ["copter", "px4"])
+async def test_arming_is_never_ordered_again_after_a_pilot_disarmed(kind: str) -> None:
+    """He disarms between two HEARTBEATs, which both say disarmed; the answer was lost."""
+    async with open_flight() if kind == "copter" else open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        simulated = flight.copter if isinstance(flight, Flight) else flight.px4
+        beat_at = flight.vehicle.armed.updated_at
+        await flight.vehicle.armed.wait_until(lambda _: flight.vehicle.armed.updated_at > beat_at)
+        simulated.faults.lose_ack(ARM)
+        asyncio.get_running_loop().call_later(0.4, disarm, simulated)
+        with pytest.raises(AerokitError):
+            await flight.vehicle.arm()
+        await anyio.sleep(LATE_S)
+        assert [each.param1 for each in flight.wire.commands(ARM)] == [1]
+        assert not simulated.is_armed
+
+
+def disarm(simulated: SimulatedCopter | SimulatedPx4) -> None:
+    if isinstance(simulated, SimulatedCopter):
+        simulated.arming.disarm()
+    else:
+        simulated.arming.disarm("the pilot")
+
+
+async def test_pilot_who_disarms_at_once_and_arms_later_stays_armed(grounded: Flight) -> None:
+    """Our order was accepted and armed it; no HEARTBEAT told that before he disarmed."""
+    await grounded.vehicle.set_mode("STABILIZE")
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    told_at = grounded.vehicle.armed.updated_at
+    await grounded.vehicle.armed.wait_until(lambda _: grounded.vehicle.armed.updated_at > told_at)
+    asyncio.get_running_loop().call_later(0.3, grounded.copter.arming.disarm)
+    with anyio.move_on_after(0.2):
+        await grounded.vehicle.arm()
+    await anyio.sleep(6.0)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+
+
+async def test_answer_that_names_another_station_proves_nothing(grounded: Flight) -> None:
+    """In MAVLink 1 an answer names nobody: it may be to another station's order."""
+    await grounded.vehicle.set_mode("STABILIZE")
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.1):
+        await grounded.vehicle.arm()
+    await anyio.sleep(6.0)
+    assert grounded.copter.arming.arm()
+    grounded.wire.deliver(FrameEncoder(1, 1).encode(CommandAck(ARM, 0, 0, 0, 0, 0)))
+    await anyio.sleep(LATE_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+
+
+async def test_order_that_arms_after_the_time_to_watch_is_left_to_the_pilot(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    (order,) = grounded.wire.commands(ARM)
+    await anyio.sleep(LATE_S + 2.0)
+    grounded.copter.faults.commands.clear()
+    grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
+    await anyio.sleep(6.0)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]

@@ -1,0 +1,552 @@
+"""Orders that others may follow before they are answered: when they are sent again, and what ends what."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from types import SimpleNamespace
+from typing import Any, cast
+
+import anyio
+import pytest
+from flight_harness import Flight, in_the_air, now
+
+from aerokit import messages as m
+from aerokit.autopilots import Mode, autopilot_for
+from aerokit.connection.cells import Source, StateCell
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    ConnectionClosed,
+    InvalidArgument,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, CommandArbiter
+from aerokit.vehicle.commanding.order import Order, Subject, subjects_of
+from aerokit.vehicle.commanding.posted import MODE_ATTEMPTS
+from aerokit.vehicle.state.telemetry import Telemetry
+
+OWN_MODES_S = 10.0
+
+HEARTBEAT = Source(1, 1, "HEARTBEAT")
+STABILIZE, GUIDED, LOITER = (
+    Mode(name, number) for number, name in ((0, "STABILIZE"), (4, "GUIDED"), (5, "LOITER"))
+)
+ARM, TAKEOFF, SET_MODE = MavCmd.COMPONENT_ARM_DISARM, MavCmd.NAV_TAKEOFF, MavCmd.DO_SET_MODE
+TAKEN, NEWER, TOLD = (
+    "the mode changed to ",
+    "another order was given",
+    "its effect was told",
+)
+
+
+COPTER = autopilot_for(Heartbeat(2, 3, 81, 0, 4, 3))
+
+
+class Stage:
+    """An arbiter, heartbeats at the test's word, and orders that stay posted."""
+
+    def __init__(self, mode: Mode = STABILIZE, armed: bool = False) -> None:
+        self.now, self._open = 0.0, ExitStack()
+        self.mode = StateCell[Mode]("mode", lambda: self.now, "HEARTBEAT")
+        self.armed = StateCell[bool]("armed", lambda: self.now, "HEARTBEAT")
+        self.state = StateCell[int]("system_status", lambda: self.now, "HEARTBEAT")
+        cells = SimpleNamespace(
+            mode=self.mode, armed=self.armed, system_status=self.state, autopilot=COPTER, is_vtol=False
+        )
+        told = cast("Telemetry", cells)
+        self.arbiter = CommandArbiter(lambda: self.now, told)
+        self.tell(mode, armed)
+
+    def tell(self, mode: Mode, armed: bool = False, state: int = MavState.ACTIVE) -> None:
+        self.now += 1.0
+        self.mode.set(mode, HEARTBEAT)
+        self.state.set(state, HEARTBEAT)
+        self.armed.set(armed, HEARTBEAT)
+
+    def post(self, *subjects: Subject, mode: Mode | None = None, armed: bool | None = None) -> Order:
+        modes = () if mode is None else (mode,)
+        return self._open.enter_context(self.arbiter.post(subjects, modes=modes, armed=armed))
+
+
+def end_of(order: Order) -> str:
+    """Why nothing of it is sent again."""
+    if order.has_worked:
+        return TOLD
+    return TAKEN if order.taken_by.startswith(TAKEN) else order.end
+
+
+# ------------------------------------------------------------------------------------------ the rules
+
+
+def test_posted_order_failsafe_becomes_active_ends_it() -> None:
+    stage = Stage(armed=True)
+    mode, arm = stage.post("mode", mode=GUIDED), stage.post("arm", armed=True)
+    stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
+    assert "failsafe" in end_of(mode)
+    assert "failsafe" in end_of(arm)
+    disarm = stage.post("arm", armed=False)
+    stage.tell(STABILIZE, armed=True)
+    stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
+    assert not end_of(disarm)
+
+
+def test_an_effect_is_a_change_to_it() -> None:
+    stage = Stage()
+    order = stage.post("mode", "motion", mode=GUIDED)
+    stage.tell(STABILIZE)
+    assert end_of(order) == ""
+    stage.tell(GUIDED)
+    stage.tell(STABILIZE)
+    assert end_of(order) == TOLD
+    there = Stage(GUIDED).post("mode", "motion", mode=GUIDED)
+    assert end_of(there) == ""
+    stage = Stage()
+    arm, again = stage.post("arm", armed=True), None
+    stage.tell(STABILIZE, True)
+    again = stage.post("arm", armed=True)
+    stage.tell(STABILIZE, True)
+    assert (end_of(arm), end_of(again)) == (TOLD, "")
+
+
+def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
+    stage = Stage(GUIDED, True)
+    motion, disarm = stage.post("motion"), stage.post("arm", armed=False)
+    stage.tell(LOITER, True)
+    stage.tell(GUIDED, True)
+    assert (end_of(motion), end_of(disarm)) == (TAKEN, "")
+
+
+def test_a_mode_that_was_ordered_lately_is_the_programs() -> None:
+    stage = Stage()
+    mode, motion = stage.post("mode", "motion", mode=GUIDED), stage.post("motion")
+    assert (end_of(mode), end_of(motion)) == ("", "")
+    stage.tell(GUIDED)
+    assert end_of(motion) == ""
+    stage.now += OWN_MODES_S
+    late = stage.post("motion")
+    stage.tell(STABILIZE)
+    stage.tell(GUIDED)
+    assert end_of(late) == TAKEN
+    stage = Stage()
+    stage.arbiter.order(GUIDED)
+    of_an_action = stage.post("arm", armed=True)
+    stage.tell(GUIDED)
+    assert end_of(of_an_action) == ""
+
+
+def test_disarming_ends_what_was_posted_about_motion() -> None:
+    stage = Stage(GUIDED, True)
+    motion, mode, arm = stage.post("motion"), stage.post("mode"), stage.post("arm", armed=True)
+    stage.tell(GUIDED, False)
+    stage.tell(GUIDED, True)
+    assert (end_of(motion), end_of(mode), end_of(arm)) == ("the vehicle disarmed", "", TOLD)
+
+
+def test_a_newer_order_ends_those_of_its_subjects() -> None:
+    stage = Stage()
+    going, mode = stage.post("motion"), stage.post("mode", "motion")
+    assert (end_of(going), end_of(mode)) == (NEWER, "")
+    again = stage.post("motion")
+    assert (end_of(mode), end_of(again)) == ("", "")
+    arm = stage.post("arm", armed=True)
+    stage.post("arm", "motion", armed=False)
+    assert (end_of(arm), end_of(again), end_of(mode)) == (NEWER, NEWER, "")
+
+
+def test_actions_and_posted_orders_end_each_other() -> None:
+    stage, dropped = Stage(), list[str]()
+    stage.arbiter.on_steering(lambda: dropped.append("left over"))
+    action = stage.arbiter.order(GUIDED)
+    assert stage.post("arm", armed=True).end == ""
+    assert (end_of(action), len(dropped)) == ("", 1)
+    motion = stage.post("motion")
+    assert (end_of(action), len(dropped)) == ("another order was given", 2)
+    mode = stage.post("mode", mode=LOITER)
+    stage.arbiter.order(LOITER)
+    assert (end_of(motion), end_of(mode)) == (NEWER, NEWER)
+
+
+def test_arming_ends_what_was_posted_of_it_and_the_other_way_round() -> None:
+    stage = Stage()
+    posted = stage.post("arm", armed=True)
+    with stage.arbiter.aside() as order, stage.arbiter.sending(order, armed=True) as sending:
+        assert end_of(posted) == NEWER
+        stage.post("arm", armed=False)
+        assert sending.end == NEWER
+    assert stage.arbiter.arming_orders == 3
+
+
+def test_a_reboot_ends_them() -> None:
+    stage = Stage()
+    order = stage.post("arm", armed=True)
+    stage.arbiter.note_reboot()
+    assert end_of(order) == "the vehicle rebooted"
+
+
+def long(command: int) -> m.CommandLong:
+    return m.CommandLong(1, 0, command, *(0,) * 8)
+
+
+@pytest.mark.parametrize(
+    ("message", "subjects"),
+    [
+        (m.SetMode(1, 1, 5), {"mode", "motion"}),
+        *((long(each), {"mode", "motion"}) for each in (SET_MODE, 20, 21, 84, 85, 185, 252, 300)),
+        *((long(each), {"motion"}) for each in (16, 17, 18, 19, 22, 34, 192, 193)),
+        (long(ARM), {"arm"}),
+        (long(178), set()),
+        (m.CommandInt(1, 0, 6, 192, *(0,) * 9), {"motion"}),
+        (m.SetPositionTargetLocalNed(0, 1, 0, 8, 0x0DC7, *(0,) * 11), {"motion"}),
+        (m.MissionSetCurrent(1, 1, 3), {"motion"}),
+        (m.MissionItemInt(1, 0, 0, 6, 16, 2, 0, 0, 0, 0, 0, 0, 0, 10), {"motion"}),
+        (m.MissionItemInt(1, 0, 0, 6, 16, 0, 1, 0, 0, 0, 0, 0, 0, 10), set()),
+        (m.Heartbeat(2, 3, 0, 0, 3, 3), set()),
+    ],
+)
+def test_what_the_program_sends_by_itself_is_about_something(message: Any, subjects: set[str]) -> None:
+    assert set(subjects_of(message)) == subjects
+
+
+# ------------------------------------------------------------------------------------------ in flight
+
+
+@pytest.mark.anyio
+async def test_mode_arming_and_take_off_without_waiting(grounded: Flight) -> None:
+    """Each goes out at once, while the one before is not answered; lost answers are made good."""
+    vehicle, wire = grounded.vehicle, grounded.wire
+    for each in (SET_MODE, ARM):
+        grounded.copter.faults.lose_ack(each, times=1)
+    guided = vehicle.autopilot.find_mode("GUIDED")
+
+    async def mode() -> None:
+        with vehicle.posted("mode", "motion", modes=(guided,)) as order:
+            await order.command(SET_MODE, *vehicle.autopilot.mode_order(guided).params)
+            await order.until_told(5)
+
+    async def arm() -> None:
+        with vehicle.posted("arm", armed=True) as order:
+            await order.command(ARM, 1)
+            await order.until_told(5)
+
+    async def take_off() -> None:
+        with vehicle.posted("motion") as order:
+            await order.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 5)
+
+    started = now()
+    async with anyio.create_task_group() as tasks:
+        for each_of in (mode, arm, take_off):
+            tasks.start_soon(each_of)
+    sent = [
+        at for each in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(each)
+    ]
+    assert sent == [started] * 3  # once each: HEARTBEAT told what was not answered
+    await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0) > 4.5, timeout=20)
+
+
+@pytest.mark.anyio
+async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
+    vehicle, faults = flying.vehicle, flying.copter.faults
+    faults.ignore(MavCmd.DO_REPOSITION)
+    with vehicle.posted("motion") as order:
+        flying.pilot_takes_over()
+        with pytest.raises(OperationRejected, match=f"not sent again: {TAKEN}"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, frame=6, x=1, y=1, z=20)
+        assert order.end.startswith(TAKEN)
+    await vehicle.set_mode("GUIDED")
+    with vehicle.posted("motion") as order:
+        vehicle.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0x0DC7, *(0,) * 11))
+        with pytest.raises(OperationRejected, match=f"{NEWER}; the rest of the order was not sent"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, frame=6, x=1, y=1, z=20)
+    assert len(flying.wire.commands(MavCmd.DO_REPOSITION)) == 1
+
+
+@pytest.mark.anyio
+async def test_what_is_sent_to_another_system_is_no_order_to_this_one(flying: Flight) -> None:
+    vehicle = flying.vehicle
+    others = (
+        m.CommandLong(vehicle.system_id + 1, 1, MavCmd.NAV_LAND, 0, *(0,) * 7),
+        m.SetMode(vehicle.system_id + 1, 1, 9),
+        m.SetPositionTargetLocalNed(0, vehicle.system_id + 1, 1, 1, 0x0DC7, *(0,) * 11),
+    )
+    with vehicle.posted("motion") as order:
+        for each in others:
+            vehicle.send(each)
+            assert (each.NAME, order.end) == (each.NAME, "")
+        vehicle.send(m.SetPositionTargetLocalNed(0, 0, 0, 1, 0x0DC7, *(0,) * 11))  # to everybody
+        assert order.end == NEWER
+
+
+@pytest.mark.anyio
+async def test_a_set_mode_without_the_flag_for_custom_modes_names_none(flying: Flight) -> None:
+    vehicle = flying.vehicle
+    vehicle.send(m.SetMode(vehicle.system_id, 0, CopterMode.LOITER))
+    flying.copter.set_mode(CopterMode.LOITER)
+    await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
+    assert vehicle.taken_over == ""  # it may be the effect
+    await anyio.sleep(MODE_GRACE_S)
+    flying.copter.set_mode(CopterMode.ALT_HOLD)
+    await vehicle.mode.wait_until(lambda mode: mode.name == "ALT_HOLD", timeout=5)
+    assert vehicle.taken_over == "the mode changed to ALT_HOLD"
+
+
+@pytest.mark.anyio
+async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight) -> None:
+    vehicle = flying.vehicle
+    place: dict[str, Any] = {"frame": 6, "x": 1, "y": 1, "z": 20.0}
+    with vehicle.posted("motion") as order:
+        await order.command(MavCmd.DO_SET_ROI_NONE)
+        flying.pilot_takes_over()
+        await anyio.sleep(2)
+        with pytest.raises(OperationRejected, match=f"{TAKEN}.*; the rest of the order was not sent"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, **place)
+    with vehicle.posted("motion") as order:
+        await order.command(MavCmd.DO_SET_ROI_NONE)
+        await vehicle.set_mode("GUIDED")
+        with pytest.raises(OperationRejected, match=f"{NEWER}; the rest of the order was not sent"):
+            await order.command_int(MavCmd.DO_REPOSITION, -1, **place)
+    assert not flying.wire.commands(MavCmd.DO_REPOSITION)
+
+
+@pytest.mark.anyio
+async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
+    async with in_the_air() as flight:
+        vehicle, errors = flight.vehicle, list[str]()
+
+        async def fly() -> None:
+            try:
+                await vehicle.go_to(vehicle.position.value.offset(north_m=200))
+            except OperationRejected as error:
+                errors.append(str(error))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(fly)
+            await anyio.sleep(3)
+            with vehicle.posted("motion") as order:
+                here = vehicle.position.value
+                x, y = round(here.latitude_deg * 1e7), round(here.longitude_deg * 1e7)
+                await order.command_int(MavCmd.DO_REPOSITION, -1, frame=6, x=x, y=y, z=20)
+        assert len(errors) == 1
+        assert "another order was given" in errors[0]
+        await anyio.sleep(3)
+        assert not flight.wire.mode_orders()
+
+
+@pytest.mark.anyio
+async def test_a_mode_that_was_posted_before_is_not_held_against_a_flight() -> None:
+    """The flight is ordered before HEARTBEAT tells the mode: nobody has taken it over, and it is looked after."""
+    async with in_the_air(latency_s=0.5) as flight:
+        vehicle, told = flight.vehicle, flight.vehicle.telemetry.armed
+        loiter = vehicle.autopilot.find_mode("LOITER")
+
+        async def post() -> None:
+            with vehicle.posted("mode", "motion", modes=(loiter,)) as order:
+                await order.command(SET_MODE, *vehicle.autopilot.mode_order(loiter).params)
+                await order.until_told(5)
+
+        before = told.updated_at
+        await told.wait_until(lambda _: told.updated_at > before, timeout=5)
+        await anyio.sleep(0.45)
+        seen = list[Any]()
+        flight.vehicle.telemetry.mode.observe(lambda _, mode: seen.append(str(mode)))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(post)
+            await anyio.sleep(0.6)
+            await vehicle.go_to(vehicle.position.value.offset(north_m=30))
+        assert seen == ["LOITER", "GUIDED"]
+
+
+@pytest.mark.anyio
+async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    faults.refuse(ARM, MavResult.FAILED, "PreArm: Compass not healthy")
+    with (
+        vehicle.posted("arm", armed=True) as order,
+        pytest.raises(CommandRejected, match="Compass not healthy"),
+    ):
+        await order.command(ARM, 1)
+    faults.refuse(ARM, MavResult.ACCEPTED)
+    with vehicle.posted("arm", armed=True) as order:
+        await order.command(ARM, 1)
+        with pytest.raises(
+            OperationTimeout, match=r"not done within 2 s; the vehicle is in STABILIZE, not armed"
+        ):
+            await order.until_told(2)
+        grounded.copter.send(
+            m.CommandAck(ARM, MavResult.DENIED, 0, 0, 255, vehicle.connection.source_component)
+        )
+        with pytest.raises(CommandRejected, match="DENIED"):  # taken back
+            await order.until_told(2)
+    with pytest.raises(InvalidArgument, match="no subject is named"), vehicle.posted():
+        pass
+    grounded.wire.forget()
+    with pytest.raises(InvalidArgument, match="needs armed=True or armed=False"), vehicle.posted("arm"):
+        pass
+    with pytest.raises(InvalidArgument, match="the block of this order was left"):
+        await order.command(ARM, 1)
+    assert not grounded.wire.commands(ARM)
+
+
+@pytest.mark.anyio
+async def test_a_command_int_may_fall_back_to_command_long(flying: Flight) -> None:
+    flying.copter.faults.refuse(MavCmd.DO_SET_HOME, MavResult.COMMAND_LONG_ONLY)
+    place: dict[str, Any] = {"x": 10_000_000, "y": 20_000_000, "z": 30.0}
+    with pytest.raises(CommandRejected):
+        await flying.vehicle.command_int(MavCmd.DO_SET_HOME, 0, frame=0, **place, or_long=True)
+    first, second = flying.wire.commands(MavCmd.DO_SET_HOME)
+    assert isinstance(first, m.CommandInt)
+    assert isinstance(second, m.CommandLong)
+    assert (second.param5, second.param6, second.param7) == (1.0, 2.0, 30.0)
+    with pytest.raises(InvalidArgument, match="frame = 6 is not allowed with or_long"):
+        await flying.vehicle.command_int(MavCmd.DO_SET_HOME, 0, frame=6, **place, or_long=True)
+
+
+@pytest.mark.anyio
+async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(grounded: Flight) -> None:
+    """`arm()` is watched for 15 s after it was given up: what the program has posted since is meant."""
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    await vehicle.set_mode("GUIDED")
+    faults.ignore(ARM, times=1)
+    with pytest.raises(CommandTimeout):
+        await vehicle.arm()
+    with vehicle.posted("arm", armed=True) as order:
+        await order.command(ARM, 1)
+    await anyio.sleep(5)
+    assert vehicle.is_armed
+
+
+@pytest.mark.anyio
+async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(grounded: Flight) -> None:
+    vehicle, wire, faults = grounded.vehicle, grounded.wire, grounded.copter.faults
+    guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
+    faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
+    with vehicle.posted("mode", modes=(guided,)) as order:
+        with pytest.raises(InvalidArgument, match="mode = LOITER is not allowed"):
+            await order.set_mode(loiter)
+        await order.set_mode(guided)
+    assert (vehicle.mode_name, len(wire.all(m.SetMode)), len(wire.commands(SET_MODE))) == ("GUIDED", 1, 1)
+    faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=2)
+    with vehicle.posted("mode", modes=(loiter,)) as order:
+        await order.set_mode(loiter)
+    assert (vehicle.mode_name, len(wire.commands(SET_MODE))) == ("LOITER", 4)
+    faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED)
+    with vehicle.posted("mode", modes=(guided,)) as order, pytest.raises(CommandRejected):
+        await order.set_mode(guided)
+    assert len(wire.commands(SET_MODE)) == 4 + MODE_ATTEMPTS
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("is_back", [False, True])
+async def test_a_mode_is_not_asked_for_again_into_a_silence_nor_over_a_pilot(is_back: bool) -> None:
+    """That it was too early, the vehicle said before: who has it now only a HEARTBEAT tells."""
+    async with in_the_air() as flight:
+        vehicle, faults = flight.vehicle, flight.copter.faults
+        land = vehicle.autopilot.find_mode("LAND")
+        faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
+        faults.heartbeats_stopped = True
+        await anyio.sleep(8)
+        flight.wire.forget()
+        flight.pilot_takes_over()
+        async with anyio.create_task_group() as tasks:
+
+            async def back() -> None:
+                await anyio.sleep(2)
+                faults.heartbeats_stopped = False
+
+            if is_back:
+                tasks.start_soon(back)
+            with vehicle.posted("mode", "motion", modes=(land,)) as order, pytest.raises(CommandRejected):
+                await order.set_mode(land)
+        assert flight.wire.mode_orders() == [land.custom_mode]
+
+
+@pytest.mark.anyio
+async def test_what_was_ordered_before_a_reboot_is_not_meant_after_it(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    guided = vehicle.autopilot.find_mode("GUIDED")
+    with vehicle.posted("mode", modes=(guided,)) as order:
+        before = order.end
+        await anyio.sleep(60)
+        grounded.copter.reboot(2.0)
+        await anyio.sleep(15)
+        assert (before, order.end) == ("", "the vehicle rebooted")
+
+
+@pytest.mark.anyio
+async def test_a_mode_that_is_told_counts_more_than_a_refusal(grounded: Flight) -> None:
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    guided = vehicle.autopilot.find_mode("GUIDED")
+    faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
+    async with anyio.create_task_group() as tasks:
+        with vehicle.posted("mode", modes=(guided,)) as order:
+            tasks.start_soon(order.set_mode, guided)
+            await anyio.sleep(0.1)
+            grounded.copter.set_mode(guided.custom_mode)
+            await anyio.sleep(8)
+    assert grounded.wire.mode_orders() == [guided.custom_mode]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("ends", ["the order", "the vehicle", "silence"])
+async def test_what_old_firmware_wants_is_not_sent_after_the_end_nor_into_a_silence(
+    grounded: Flight, ends: str
+) -> None:
+    vehicle, faults = grounded.vehicle, grounded.copter.faults
+    guided = vehicle.autopilot.find_mode("GUIDED")
+    faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
+    if ends == "silence":
+        faults.heartbeats_stopped = True
+        await anyio.sleep(8)
+        with pytest.raises(CommandRejected):
+            await vehicle.set_mode("GUIDED")
+    failed: list[Exception] = []
+    posted = ExitStack()
+    order = posted.enter_context(vehicle.posted("mode", modes=(guided,)))
+
+    async def set_mode() -> None:
+        try:
+            await order.set_mode(guided)
+        except (OperationRejected, ConnectionClosed) as error:
+            failed.append(error)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(set_mode)
+        await anyio.sleep(0.1)
+        if ends == "the order":
+            posted.close()
+        elif ends == "the vehicle":
+            vehicle._talk.close()
+        await anyio.sleep(2)
+    assert failed
+    assert not grounded.wire.all(m.SetMode)
+
+
+@pytest.mark.anyio
+async def test_a_mode_is_not_asked_for_again_once_there_is_a_newer_order(grounded: Flight) -> None:
+    vehicle, wire = grounded.vehicle, grounded.wire
+    guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
+    grounded.copter.faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
+
+    async def post() -> None:
+        with vehicle.posted("mode", modes=(guided,)) as order, pytest.raises(CommandRejected):
+            await order.set_mode(guided)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(post)
+        await anyio.sleep(0.3)
+        with vehicle.posted("mode", modes=(loiter,)) as newer:
+            await newer.set_mode(loiter)
+    assert wire.mode_orders() == [guided.custom_mode, loiter.custom_mode]
+    assert vehicle.mode_name == "LOITER"
+
+
+@pytest.mark.parametrize(("waited_s", "end"), [(9.0, ""), (11.0, TAKEN)])
+def test_mode_ordered_ten_seconds_ago_is_not_the_programs_any_more(waited_s: float, end: str) -> None:
+    stage = Stage()
+    stage.post("mode", mode=GUIDED)
+    stage.now += waited_s
+    motion = stage.post("motion")
+    stage.tell(GUIDED)
+    assert end_of(motion) == end

@@ -1,0 +1,54 @@
+"""States are declared once: rates, errors of a declaration, the attribute on both vehicles, the page in docs/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from for_each import for_each
+
+import aerokit
+import aerokit.sync
+from aerokit.mavlink import messages
+from aerokit.mavlink.enums import MavPowerStatus
+from aerokit.vehicle.session.rates import subscription_rate_hz
+from aerokit.vehicle.state.equipment import Power
+from aerokit.vehicle.state.field import By, Told
+from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
+from aerokit.vehicle.state.table import documentation, rendered
+from aerokit.vehicle.state.telemetry import Telemetry
+
+
+def test_rate_of_a_subscription_is_the_default_of_its_message() -> None:
+    assert DEFAULT_RATES_HZ["Attitude"] > 4.0
+    kinds = (messages.Attitude, messages.RawImu, messages.Odometry, messages.Statustext)
+    rates = [subscription_rate_hz(kind) for kind in kinds]
+    assert rates == [DEFAULT_RATES_HZ["Attitude"], 4.0, 4.0, None]
+
+
+def test_power() -> None:
+    telemetry = Telemetry(lambda: 0.0)
+    assert telemetry.power.waits_for == "POWER_STATUS"
+    telemetry.receive(messages.PowerStatus(5012, 0, MavPowerStatus.BRICK_VALID))
+    assert telemetry.power.value == Power(5.012, None, MavPowerStatus.BRICK_VALID)
+
+
+def test_a_declaration_that_cannot_be_right_is_an_error_at_once() -> None:
+    with pytest.raises(ValueError, match="needs a message"):
+        Told[int]()
+    with pytest.raises(ValueError, match="Heartbeet is no message class"):
+        By("Heartbeet", lambda message: 1)
+
+
+@for_each("name", STATES)
+def test_both_vehicles_have_it_and_it_is_documented(name: str) -> None:
+    assert hasattr(aerokit.Vehicle, name)
+    assert hasattr(aerokit.sync.Vehicle, name)
+    assert documentation()[name][1].endswith(".")
+
+
+def test_the_page_is_that_of_the_declarations() -> None:
+    page = Path(__file__).parents[3] / "docs" / "states.md"
+    assert page.read_text(encoding="utf-8") == rendered(), (
+        "python -m aerokit.vehicle.state.table > docs/states.md"
+    )

@@ -1,0 +1,253 @@
+"""Streamed messages are worked out when somebody looks, and nobody can tell."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from aerokit.autopilots import autopilot_for
+from aerokit.connection.bus import Bus
+from aerokit.mavlink import Field, FrameEncoder, Framer, Message, messages
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.message import offset_of
+from aerokit.vehicle.state.field import MESSAGE_IDS, message_type
+from aerokit.vehicle.state.states import LAZY, SOURCES
+from aerokit.vehicle.state.telemetry import Telemetry
+
+HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 3)
+CHANNELS: dict[str, int] = {f"chan{number}_raw": 1500 for number in range(1, 19)}
+ANYTHING: dict[str, Message] = {
+    "SysStatus": messages.SysStatus(1, 1, 1, 100, 12000, 100, 90, 0, 0, 0, 0, 0, 0),
+    "SystemTime": messages.SystemTime(1_700_000_000_000_000, 5),
+    "GpsRawInt": messages.GpsRawInt(0, 3, 473977000, 85456000, 0, 100, 100, 0, 0, 10),
+    "Gps2Raw": messages.Gps2Raw(0, 3, 473977000, 85456000, 0, 100, 100, 0, 0, 10, 0, 0),
+    "Attitude": messages.Attitude(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0),
+    "AttitudeQuaternion": messages.AttitudeQuaternion(0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "LocalPositionNed": messages.LocalPositionNed(0, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3),
+    "GlobalPositionInt": messages.GlobalPositionInt(
+        0, 473977000, 85456000, 498000, 10000, 100, -200, 50, 9000
+    ),
+    "RcChannels": messages.RcChannels(0, 8, **CHANNELS, rssi=200),
+    "ServoOutputRaw": messages.ServoOutputRaw(0, 0, *[1500] * 8),
+    "MissionCurrent": messages.MissionCurrent(2),
+    "VfrHud": messages.VfrHud(3.0, 4.0, 271, 50, 20.0, 0.5),
+    "DistanceSensor": messages.DistanceSensor(0, 10, 5000, 300, 0, 0, 25, 255),
+    "Rangefinder": messages.Rangefinder(3.0, 1.0),
+    "BatteryStatus": messages.BatteryStatus(0, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, 90),
+    "Wind": messages.Wind(10.0, 3.0, 0.0),
+    "WindCov": messages.WindCov(0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "PowerStatus": messages.PowerStatus(5012, 0, 1),
+    "EkfStatusReport": messages.EkfStatusReport(831, 0.1, 0.1, 0.1, 0.1, 0.1),
+    "EstimatorStatus": messages.EstimatorStatus(0, 831, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 1.0, 1.0),
+    "Vibration": messages.Vibration(0, 1.0, 1.0, 1.0, 0, 0, 0),
+}
+
+
+def ones(kind: type[Message]) -> Message:
+    """All fields are 1: plausible for most messages; for others `ANYTHING` has one."""
+    return kind(**{field.name: value_of_ones(field) for field in kind.FIELDS})
+
+
+def value_of_ones(field: Field) -> object:
+    if field.is_text:
+        return "1"
+    values = (1,) * field.array_length
+    return 1 if not values else bytes(values) if field.type == "uint8_t" else values
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def telemetry(clock: Clock) -> Telemetry:
+    return Telemetry(clock, autopilot=autopilot_for(HEARTBEAT))
+
+
+def frame_of(message: Message, at: float = 0.0, component_id: int = 1) -> Frame:
+    return Framer().receive(FrameEncoder(1, component_id).encode(message), at)[0]
+
+
+def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 1) -> None:
+    telemetry.streams[message.ID].take(frame_of(message, at, component_id))
+
+
+@pytest.mark.parametrize("name", LAZY)
+def test_the_table_names_every_cell_that_a_message_changes(telemetry: Telemetry, name: str) -> None:
+    telemetry.receive(ANYTHING.get(name) or ones(message_type(name)))
+    changed = {cell.name for cell in telemetry.cells.values() if cell.is_known}
+    assert changed == {told.name for told, _ in SOURCES[name]}
+
+
+@pytest.mark.parametrize(
+    ("name", "field"), [("ServoOutputRaw", "port"), ("DistanceSensor", "id"), ("BatteryStatus", "id")]
+)
+def test_which_one_of_several_is_read_where_it_is(name: str, field: str) -> None:
+    message = ANYTHING[name]
+    fields = {each.name: getattr(message, each.name) for each in message.FIELDS}
+    body = frame_of(message_type(name)(**{**fields, field: 201})).body
+    assert body[9 + offset_of(message_type(name), field)] == 201
+
+
+def test_what_nobody_looks_at_waits(telemetry: Telemetry, clock: Clock) -> None:
+    stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
+    take(telemetry, messages.Attitude(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0), 100.0)
+    assert not stream.pending, "the first is worked out at once: everybody can see that it is known"
+    take(telemetry, messages.Attitude(0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0), 100.5)
+    take(telemetry, messages.Attitude(0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0), 101.0)
+    clock.now = 103.0
+    assert stream.pending
+    assert telemetry.attitude.age == 2.0
+    assert not stream.pending
+    assert telemetry.attitude.updated_at == 101.0
+    assert telemetry.attitude.value.roll_deg == pytest.approx(17.19, abs=0.01)
+
+
+def test_other_components_say_nothing(telemetry: Telemetry) -> None:
+    take(telemetry, ANYTHING["Attitude"], 100.0, component_id=154)
+    assert not telemetry.attitude.is_known
+
+
+def test_whoever_observes_sees_each(telemetry: Telemetry) -> None:
+    take(telemetry, messages.VfrHud(3.0, 4.0, 10, 50, 20.0, 0.5), 100.0)
+    take(telemetry, messages.VfrHud(3.0, 5.0, 10, 50, 20.0, 0.5), 100.1)
+    seen: list[tuple[float | None, float]] = []
+    end = telemetry.ground_speed_m_s.observe(lambda before, after: seen.append((before, after)))
+    for number in range(3):
+        take(telemetry, messages.VfrHud(3.0, 6.0 + number, 10, 50, 20.0, 0.5), 100.2 + number / 10)
+    end()
+    assert seen == [(5.0, 6.0), (6.0, 7.0), (7.0, 8.0)]
+    take(telemetry, messages.VfrHud(3.0, 9.0, 10, 50, 20.0, 0.5), 100.6)
+    assert telemetry.streams[MESSAGE_IDS["VfrHud"]].pending
+    assert telemetry.ground_speed_m_s.value == 9.0
+
+
+def test_two_batteries_wait_side_by_side(telemetry: Telemetry) -> None:
+    for percent in (90, 80):
+        for number in (0, 1):
+            battery = messages.BatteryStatus(
+                number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent - number
+            )
+            take(telemetry, battery, 100.0 + (90 - percent) / 100)
+    assert [each.remaining_percent for each in telemetry.batteries.value] == [80, 79]
+
+
+def test_a_number_that_is_cut_off_is_number_0(telemetry: Telemetry) -> None:
+    """MAVLink 2 cuts off the zeros at the end of a message."""
+    at = offset_of(messages.ServoOutputRaw, "port")
+    for first, ninth in ((1100, 0), (1200, 1500), (1300, 0)):
+        others = 1500, 1500, 1500, 1500, 1500, 1500, 1500
+        message = messages.ServoOutputRaw(0, 0, first, *others, servo9_raw=ninth)
+        assert (len(frame_of(message).body) > 9 + at) is bool(ninth)
+        take(telemetry, message, 100.0)
+    assert telemetry.servo_outputs.value.outputs_us[0] == 1300
+
+
+def battery(number: int, percent: int) -> Message:
+    return messages.BatteryStatus(number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent)
+
+
+@pytest.mark.parametrize("ends", [0, 1, 2])
+def test_what_came_last_says_how_old_it_is(telemetry: Telemetry, clock: Clock, ends: int) -> None:
+    """One of several that is not told of any more does not make the others old."""
+    take(telemetry, battery(0, 80), 100.0)
+    for at in range(101, 105):
+        for number in range(3):
+            if at == 101 or number != ends:
+                take(telemetry, battery(number, 80), float(at))
+    clock.now = 104.5
+    assert telemetry.batteries.fresh(1.0) == telemetry.batteries.value
+    assert telemetry.batteries.updated_at == 104.0
+    assert [each.id for each in telemetry.batteries.value] == [0, 1, 2]
+
+
+def test_as_many_as_there_are_numbers_wait_side_by_side(telemetry: Telemetry) -> None:
+    for number in (0, *range(256)):
+        take(telemetry, battery(number, number % 100), 100.0)
+    assert [each.remaining_percent for each in telemetry.batteries.value] == [n % 100 for n in range(256)]
+
+
+def test_the_better_of_two_sources_goes_first_whatever_is_looked_at_when(telemetry: Telemetry) -> None:
+    for at in (100.0, 101.0):
+        take(telemetry, ANYTHING["GlobalPositionInt"], at)
+        take(telemetry, ANYTHING["VfrHud"], at + 0.1)
+    assert telemetry.heading_deg.value == 90.0
+    take(telemetry, ANYTHING["VfrHud"], 104.0)
+    assert telemetry.heading_deg.value == 271.0
+
+
+def test_what_nobody_looks_at_is_worked_out_every_five_seconds(telemetry: Telemetry) -> None:
+    streamed = telemetry.streams[messages.GlobalPositionInt.ID]
+    waits = []
+    for number in range(21):
+        take(telemetry, ANYTHING["GlobalPositionInt"], 100.0 + number / 2)
+        waits.append(bool(streamed.pending))
+    assert waits == [number % 10 != 0 for number in range(21)]
+
+
+def test_a_position_without_a_fix_leaves_the_one_before(telemetry: Telemetry) -> None:
+    """Also when nobody looked: it is worked out every few seconds."""
+    place, nowhere = ANYTHING["GlobalPositionInt"], messages.GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 9000)
+    for number in range(50):
+        take(telemetry, place, 100.0 + number / 4)
+    take(telemetry, nowhere, 113.0)
+    position = telemetry.position.value
+    assert position.latitude_deg == pytest.approx(47.3977)
+    assert 112.25 - telemetry.position.updated_at <= 5.0
+
+
+def test_a_reboot_forgets_what_waits(telemetry: Telemetry) -> None:
+    take(telemetry, ANYTHING["Wind"], 100.0)
+    take(telemetry, ANYTHING["Wind"], 100.1)
+    telemetry.forget()
+    assert not telemetry.wind.is_known
+    take(telemetry, ANYTHING["Wind"], 100.2)
+    assert telemetry.wind.updated_at == 100.2
+
+
+def test_other_threads_look_while_frames_come(telemetry: Telemetry) -> None:
+    """A value is always one message's, and never older than one seen before."""
+    wrong: list[object] = []
+    ended = threading.Event()
+
+    def look() -> None:
+        last = 0.0
+        while not ended.is_set():
+            cell = telemetry.attitude
+            if cell.is_known:
+                value = cell.value
+                if value.roll_deg != value.pitch_deg or value.roll_deg < last:
+                    wrong.append(value)
+                last = value.roll_deg
+
+    threads = [threading.Thread(target=look) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for number in range(3000):
+        angle = number / 1000
+        take(telemetry, messages.Attitude(0, angle, angle, 0.0, 0.0, 0.0, 0.0), 100.0 + number / 1000)
+    ended.set()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_what_somebody_else_has_had_decoded_is_not_decoded_again(telemetry: Telemetry) -> None:
+    bus, seen = Bus(), list[Message]()
+    stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
+    bus.attach_lazily(messages.Attitude, stream.take)
+    bus.attach(messages.Attitude, seen.append)
+    for at in (100.0, 100.5):
+        bus.deliver(frame_of(ANYTHING["Attitude"], at))
+    (pending,) = stream.pending.values()
+    assert pending is seen[1]
+    assert telemetry.attitude.value.yaw_deg == pytest.approx(17.19, abs=0.01)
