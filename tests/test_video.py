@@ -141,6 +141,7 @@ async def test_a_stream_that_is_not_there() -> None:
             pass
 
 
+@pytest.mark.exhaustive
 async def test_cancelled_while_opening_it_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("aerokit.video.ENDS_WITHIN_S", 0.1)
     with anyio.move_on_after(0.2) as scope:

@@ -244,8 +244,8 @@ asyncio.run(main())
 @pytest.mark.parametrize(
     ("ending", "code"),
     [
-        ("return", 0),
-        ("raise SystemExit(7)", 7),
+        exhaustive(pytest.param("return", 0)),
+        exhaustive(pytest.param("raise SystemExit(7)", 7)),
         ("import os, signal; os.kill(os.getpid(), signal.SIGINT)", 1),
     ],
     ids=["return", "exit", "interrupt"],

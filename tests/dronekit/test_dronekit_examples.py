@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from exhaustive import sampled
 from pymavlink import mavutil
 from served_copter import complaints, served_copter
 
@@ -90,7 +91,7 @@ def test_example_says_dronekit_only(name: str) -> None:
     assert "from aerokit" not in text
 
 
-@pytest.mark.parametrize("name", EXPECTED)
+@pytest.mark.parametrize("name", sampled(EXPECTED, 3))
 def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     speedup, arguments, expected = EXPECTED[name]
     with served_copter(speedup=speedup, parameters=PARAMETERS.get(name)) as address:

@@ -204,6 +204,7 @@ async def test_a_router_is_killed_and_comes_back() -> None:
                 assert len(vehicle.peers) == 1
 
 
+@pytest.mark.exhaustive
 async def test_a_vehicle_side_is_killed_and_replaced() -> None:
     port = free_port()
     address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"

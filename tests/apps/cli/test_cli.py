@@ -193,6 +193,7 @@ def test_ctrl_c_in_the_air_lands_the_vehicle(tmp_path: Path) -> None:
         assert (copter.is_armed, copter.is_landed) == (False, True)
 
 
+@pytest.mark.exhaustive
 @posix_only
 def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
     with served_copter() as address, in_the_air(address, tmp_path) as process:
@@ -233,6 +234,7 @@ def test_demo_leaves_a_vehicle_that_flies_already_alone(
         assert (pilot.mode_name, pilot.is_armed) == ("BRAKE", True)
 
 
+@pytest.mark.exhaustive
 @posix_only
 def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)

@@ -111,6 +111,10 @@ def test_the_gimbal_points(run: Run, gimbal: SimulatedGimbal) -> None:
     assert code == 0
     assert "pitch -45" in out
     assert " to " in out
+
+
+@pytest.mark.exhaustive
+def test_the_gimbal_goes_back_to_neutral_and_is_released(run: Run, gimbal: SimulatedGimbal) -> None:
     assert run("gimbal", "neutral")[0] == 0
     assert "pitch 0" in run("gimbal", "info")[1]
     assert run("gimbal", "release")[0] == 0
