@@ -14,8 +14,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import aerokit.mavlink.enums as enums
+import aerokit.mavlink.messages as messages
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink import enums, messages
 from aerokit.mavlink.enumeration import make_enum
 from aerokit.mavlink.message import Message
 
