@@ -95,7 +95,10 @@ async def test_a_live_stream_beside_the_vehicles_state() -> None:
         assert frames[0].picture.to_ndarray(format="rgb24").shape == (48, 64, 3)
         stamps = [each.stream_s or 0.0 for each in frames]
         assert all(later > earlier for earlier, later in pairwise(stamps))
-    assert not [each for each in threading.enumerate() if "video" in each.name]
+    for each in threading.enumerate():
+        if "video" in each.name:
+            each.join(100)
+            assert not each.is_alive()
 
 
 async def test_a_file_is_read_to_its_end(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from aerokit import LinkState, open_connection
 from aerokit import messages as m
 from aerokit.connection.cells import StateCell
 from aerokit.connection.connection import Connection
-from aerokit.connection.loop_watch import QUIET_TURNS, asleep_s
+from aerokit.connection.loop_watch import QUIET_TURNS, LoopWatch, asleep_s
 from aerokit.errors import LinkLost, StaleValueError
 from aerokit.events import ComputerSlept, VehicleRebooted, VehicleSilent
 from aerokit.mavlink.encoder import FrameEncoder
@@ -227,3 +227,14 @@ async def test_values_are_older_after_the_computer_slept(
 def test_time_asleep_is_a_clock_of_the_system() -> None:
     before = asleep_s()
     assert asleep_s() - before == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.anyio
+async def test_process_interrupted_between_two_clocks_has_not_slept() -> None:
+    readings, slept = iter([5.0, 4.5, 5.0, 4.5, 5.0, 5.3]), list[float]()
+    watch = LoopWatch(lambda _: None, slept.append, lambda: next(readings))
+    for _ in range(2):
+        watch.arrival(watch._loop.time())
+    assert slept == []
+    watch.arrival(watch._loop.time())
+    assert slept == [pytest.approx(0.3)]
