@@ -12,7 +12,8 @@ from simulated_client import flying_copter, ready_copter
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.sim import SimulatedPx4, SimulatedVehicle
 from aerokit.sim.picture import check_picture, draw_svg, save_picture
-from aerokit.sim.track import Track, TrackPoint, record_track
+from aerokit.sim.track import Track, record_track
+from aerokit.sim.track_points import TrackPoint
 
 SVG = "{http://www.w3.org/2000/svg}"
 

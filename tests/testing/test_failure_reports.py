@@ -10,7 +10,8 @@ import pytest
 from aerokit.logs.flights import read_flight
 from aerokit.position import Position
 from aerokit.sim.picture import draw_svg
-from aerokit.sim.track import Track, TrackPoint
+from aerokit.sim.track import Track
+from aerokit.sim.track_points import TrackPoint
 
 pytest_plugins = ["pytester"]
 

@@ -23,8 +23,6 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 from aerokit._internal.wording import one, shown
 from aerokit.errors import InvalidArgument, LinkOpenError
 
-__all__ = ["check_kind", "check_range", "checked", "checks_arguments"]
-
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 ClassT = TypeVar("ClassT")

@@ -15,8 +15,6 @@ from aerokit.errors import InvalidArgument, LinkOpenError
 if TYPE_CHECKING:
     from types import TracebackType
 
-__all__ = ["ReadOnly", "async_block"]
-
 P = ParamSpec("P")
 
 T = TypeVar("T")

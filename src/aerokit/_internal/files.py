@@ -12,8 +12,6 @@ from aerokit.errors import FileFormatError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["LARGEST_FILE", "PartFile", "read_bounded", "read_text", "too_large", "unpacked", "write_whole"]
-
 LARGEST_FILE = 16 << 20
 """Bytes of the largest file of parameters, metadata, plans or definitions that is read; real ones have 5 MB at most."""
 

@@ -11,8 +11,6 @@ from aerokit.errors import InvalidArgument
 if TYPE_CHECKING:
     from geographiclib.geodesic import Geodesic
 
-__all__ = ["bearing_deg", "check_place", "distance_m", "north_east_m", "offset", "wrap_360", "wrap_longitude"]
-
 
 def distance_m(
     latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float

@@ -11,8 +11,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 
-__all__ = ["complaint", "lazy_exports"]
-
 _OTHERS = ("aero", "engine", "stability")
 """Packages that only the other project has: ``aerokit.aero`` and so on."""
 

@@ -17,9 +17,6 @@ from operator import attrgetter
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, ClassVar
 
-__all__ = ["Snapshot", "plain", "printable"]
-
-
 if TYPE_CHECKING:
     from collections.abc import Callable
     from inspect import Signature

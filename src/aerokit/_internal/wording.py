@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["did_you_mean", "in_words", "one", "shown"]
-
 _LONGEST = 100
 
 

@@ -18,23 +18,6 @@ from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavSta
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
-__all__ = [
-    "BLIMP",
-    "COPTER",
-    "PLANE",
-    "ROVER",
-    "SUB",
-    "TRACKER",
-    "AntennaTracker",
-    "ArduCopter",
-    "ArduPilot",
-    "ArduPlane",
-    "ArduRover",
-    "ArduSub",
-    "Blimp",
-    "ardupilot_for",
-]
-
 COPTER = ModeTable(
     {
         0: "STABILIZE",

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
-__all__ = ["Autopilot", "GimbalRules", "ModeOrder", "Purpose", "Reposition", "SetpointRules", "TakeOff"]
-
 NAN = math.nan
 _BYTEWISE = MavProtocolCapability.PARAM_ENCODE_BYTEWISE.value
 _C_CAST = MavProtocolCapability.PARAM_ENCODE_C_CAST.value

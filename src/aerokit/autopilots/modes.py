@@ -9,8 +9,6 @@ from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavModeFlag
 
-__all__ = ["CUSTOM_MODE_ENABLED", "Mode", "ModeTable", "base_mode_name", "is_armed"]
-
 CUSTOM_MODE_ENABLED = MavModeFlag.CUSTOM_MODE_ENABLED.value
 """``custom_mode`` tells the mode."""
 SAFETY_ARMED = MavModeFlag.SAFETY_ARMED.value

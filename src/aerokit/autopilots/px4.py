@@ -21,8 +21,6 @@ from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PRE
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 
-__all__ = ["Px4", "px4_custom_mode"]
-
 MAIN_POSCTL, MAIN_AUTO, SUB_MISSION = 3, 4, 4
 _E = EstimatorStatusFlags
 ESTIMATES_REQUIRED = ATTITUDE_AND_HEIGHT | _E.VELOCITY_HORIZ.value | _E.VELOCITY_VERT.value

@@ -8,19 +8,6 @@ from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavDataStream, MavSysStatusSensor
 from aerokit.mavlink.messages import INDEX
 
-__all__ = [
-    "ARDUPILOT_GROUPS",
-    "ATTITUDE_AND_HEIGHT",
-    "ESTIMATES",
-    "POS_HORIZ_ABS",
-    "PREARM_CHECK",
-    "SENSORS",
-    "STREAMED",
-    "AutopilotVersion",
-    "names_of",
-    "version_text",
-]
-
 _E, _S = EstimatorStatusFlags, MavSysStatusSensor
 
 PREARM_CHECK = _S.MAV_SYS_STATUS_PREARM_CHECK.value

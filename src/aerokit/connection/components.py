@@ -14,8 +14,6 @@ from aerokit.mavlink.enums import MavAutopilot, MavType
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import AutopilotVersion, Heartbeat
 
-__all__ = ["HardwareId", "found_by", "is_autopilot"]
-
 NO_AUTOPILOTS = frozenset(
     (
         MavType.GCS,

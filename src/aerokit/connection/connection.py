@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
     Tap = Callable[[Frame, Peer], object]
 
-__all__ = ["Connection"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import Exchange
 
-__all__ = ["ExchangeRun", "run_exchange"]
-
 ResultT = TypeVar("ResultT")
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     Tap = Callable[[Frame, Peer], object]
     SentTap = Callable[[bytes], object]
 
-__all__ = ["Recording", "Taps"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_WAITING = 1000

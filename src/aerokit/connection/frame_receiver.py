@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.transport.link import Link, Peer
 
-__all__ = ["MOST_PEERS", "MOST_SENDERS", "MOST_STRANGERS", "Intake", "Peers"]
-
 MOST_PEERS = 256
 """So many that have sent a good frame are remembered."""
 

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Bus
     from aerokit.connection.cells import StateCell
 
-__all__ = ["LinkStateWatch"]
-
 
 class LinkStateWatch:
     """Is told what is heard, and looks from time to time for how long nothing was; times on the loop's clock."""

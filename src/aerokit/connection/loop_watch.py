@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["PERIOD_S", "TERMINAL_IPYTHON", "LoopWatch", "stands_still_between_inputs"]
-
 PERIOD_S = 0.1
 """How often it is looked, by a timer or by what is read."""
 

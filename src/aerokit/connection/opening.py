@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from aerokit.transport import LinkAddress
     from aerokit.transport.sockets import Peers
 
-__all__ = ["ONLOOKER", "no_vehicle_reason", "open_connection"]
-
 CLOSE_TIMEOUT_S = 2.0
 
 ONLOOKER = 254

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from aerokit.events import Event
 
-__all__ = ["BLOCKING_FED_WITHIN_S", "HeartbeatSwitch", "OwnHeartbeat", "ProofOfLife"]
-
 BLOCKING_FED_WITHIN_S = 60.0
 """How long a blocking program may make no call before our heartbeat pauses. Longer than programs sleep in flight."""
 

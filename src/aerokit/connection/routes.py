@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     Source = tuple[int, int]
     BootClock = Callable[[float], float | None]
 
-__all__ = ["MOST_CLAIMS", "MOST_ROUTES", "MOVES_AFTER_S", "Claim", "Routes", "boot_time_ms"]
-
 # Message id → where its time_boot_ms begins in a frame's body: SYSTEM_TIME, ATTITUDE, ATTITUDE_QUATERNION,
 # LOCAL_POSITION_NED, GLOBAL_POSITION_INT.
 _BOOT_TIME_AT = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.mavlink.signing import Refusal, Signing
 
-__all__ = ["SignatureGate", "check_signing"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 

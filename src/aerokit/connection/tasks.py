@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-__all__ = ["Background", "Cancellation", "Deadlines", "to_its_end"]
-
 
 class Background:
     """The tasks of one ``async with`` block. A mistake in one of them goes to ``on_mistake``, not to the block.

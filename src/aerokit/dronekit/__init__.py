@@ -109,7 +109,8 @@ __all__ = [
 
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
-__getattr__, __dir__, _ = lazy_exports(
+_later: list[str]
+__getattr__, __dir__, _later = lazy_exports(
     __name__,
     {
         "aerokit.dronekit.attributes": ("Locations",),

@@ -32,8 +32,6 @@ from aerokit.vehicle.state.movement import place
 if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
 
-__all__ = ["Locations", "VehicleAttributes"]
-
 STATES = ("UNINIT", "BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL", "EMERGENCY", "POWEROFF")
 POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.POS_HORIZ_ABS.value,

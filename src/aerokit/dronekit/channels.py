@@ -18,8 +18,6 @@ from aerokit.mavlink.messages import RcChannels, RcChannelsOverride, RcChannelsR
 if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
-__all__ = ["Channels", "ChannelsOverride"]
-
 FEWEST, MOST = 8, 18
 UNUSED = 0xFFFF
 """In RC_CHANNELS: there is no such channel. In an override: leave the channel as it is."""

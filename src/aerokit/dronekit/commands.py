@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from aerokit.dronekit.values import LocationGlobal
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["Command", "CommandSequence", "WaypointLoader"]
-
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
 """Those of MAVLink 1: ``mission_type``, which came later, is no part of a command's text."""
 PARAMS: list[str] = FIELDS[7:11]

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["Core", "Latest", "Readiness", "VehicleCore", "core_of"]
-
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 """What ``wait_ready(True)`` waits for."""
 

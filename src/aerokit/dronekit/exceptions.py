@@ -8,8 +8,6 @@ from contextlib import contextmanager
 
 from aerokit.errors import AerokitError, FileFormatError, InvalidArgument, OperationTimeout
 
-__all__ = ["APIException", "TimeoutError", "classic_errors"]
-
 
 class APIException(Exception):
     """Any failure of the vehicle or its link; an aerokit error behind it is its `__cause__` or `__context__`."""

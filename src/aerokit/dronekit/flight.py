@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from aerokit.dronekit.line import BackgroundCall
 
-__all__ = ["FlightMethods"]
-
 HOME_TIMEOUT_S = 10.0
 ORDERS_LOOK_S = 0.02
 ARMING = ("disarm", "arm")

@@ -36,21 +36,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Subject
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = [
-    "CurrentCommand",
-    "Maintenance",
-    "change_armed",
-    "change_mode",
-    "check_speed",
-    "checked_place",
-    "flies_to_places_in",
-    "go_to",
-    "mode_name",
-    "mode_named",
-    "refuse",
-    "take_off",
-]
-
 POSITION_ONLY = 0x0DF8
 
 ARMED_IS_TOLD_S = 10.0

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["Gimbal"]
-
 HOME_TIMEOUT_S = 10.0
 MOST_DEG = 360.0
 """What ``vehicle.aio.gimbal`` takes: programs add angles, and mean the same direction."""

@@ -24,17 +24,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.sync.loop_thread import Held, LoopThread
 
-__all__ = [
-    "CHANNELS_OF_MAVLINK_1",
-    "RELEASE_UPPER",
-    "BackgroundCall",
-    "BackgroundCalls",
-    "Line",
-    "OverrideRelease",
-    "Work",
-    "weakly",
-]
-
 logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 of_vehicles: logging.Logger = logging.getLogger("dronekit")

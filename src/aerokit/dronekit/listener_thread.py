@@ -13,8 +13,6 @@ from typing import Any
 
 from aerokit.sync.reply import Reply
 
-__all__ = ["ListenerThread"]
-
 logger: logging.Logger = logging.getLogger("dronekit")
 
 MOST_WAITING = 10_000

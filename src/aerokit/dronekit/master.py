@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.transport.link import Peer
 
-__all__ = ["Inbox", "Master"]
-
 MOST_KEPT = 1000
 OLDEST_S = 5.0
 """A program that asks rarely gets what came lately, not what came when it asked last."""

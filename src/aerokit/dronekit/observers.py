@@ -20,17 +20,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.transport.link import Peer
 
-__all__ = [
-    "EVERY_NAME",
-    "AttributeListener",
-    "HasObservers",
-    "ListenerT",
-    "Listeners",
-    "MessageListeners",
-    "decorator_of",
-    "message_of",
-]
-
 logger: logging.Logger = logging.getLogger("dronekit")
 
 AttributeListener = Callable[[Any, str, Any], object]

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import Found
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
-__all__ = ["ParameterReading", "ParameterValues", "Parameters", "set_parameter"]
-
 VERSION_S = 1.0
 """How long to wait for the vehicle to say whether it has the list as a file."""
 

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["GimbalPrivates", "LocationPrivates", "Python2Mapping", "Shadowable", "VehiclePrivates", "read_of"]
-
 T = TypeVar("T")
 
 SILENCE_S = 5.0

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
     from aerokit.dronekit.sitl import ServedVehicle
 
-__all__ = ["install", "main", "parser", "run_script", "uninstall"]
-
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from importlib.abc import Loader, MetaPathFinder

@@ -22,8 +22,6 @@ from aerokit.sim.server import open_simulator
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["SITL", "ServedVehicle", "parse_home", "serve_for_program", "start_default", "version_list"]
-
 KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover", "sub": "sub"}
 """What dronekit-sitl calls its vehicles, and what they are here."""
 START_TIMEOUT_S = 30.0

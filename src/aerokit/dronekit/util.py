@@ -6,8 +6,6 @@ import logging
 import sys
 from collections.abc import Callable
 
-__all__ = ["ErrprinterHandler", "errprinter", "logger"]
-
 
 def errprinter(*args: object) -> None:
     """Print the arguments to stderr, as ``print`` does."""

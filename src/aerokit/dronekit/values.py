@@ -10,21 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-__all__ = [
-    "Attitude",
-    "Battery",
-    "Capabilities",
-    "GPSInfo",
-    "LocationGlobal",
-    "LocationGlobalRelative",
-    "LocationLocal",
-    "Rangefinder",
-    "SystemStatus",
-    "VehicleMode",
-    "Version",
-    "Wind",
-]
-
 STABLE = 255
 RELEASE_TYPES = ("dev", "alpha", "beta", "rc")
 AUTOPILOTS = {3: "APM:", 12: "PX4"}

@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
     VehicleT = TypeVar("VehicleT", bound="Vehicle", default="Vehicle")
 
-__all__ = ["Vehicle", "connect", "default_still_waiting_callback"]
-
 FIRST_VALUES = ("attitude", "location.global_relative_frame", "heading", "gps_0", "battery")
 
 FIRST_VALUES_S, NO_MORE_S = 1.0, 0.4

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from aerokit.missions.mission import Mission
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["CommonAction", "Crew", "FleetPart"]
-
 Act = "Callable[[Member], Awaitable[Any]]"
 
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.messages import GpsRtcmData
 
-__all__ = ["Actions", "fragments", "rtcm_messages"]
-
 LOOK_S = 0.25
 
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.fleets.members import Member
     from aerokit.fleets.paths import Place
 
-__all__ = ["Around", "DistanceWatch", "altitude_amsl", "is_flying", "position_of"]
-
 OLD_S = 2.0
 """What was told longer ago is not where it is now."""
 

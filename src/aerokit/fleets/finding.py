@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from aerokit.connection.connection import Connection
 
-__all__ = ["find_systems", "telling_who_is_missing"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 SETTLE_S = 2.5

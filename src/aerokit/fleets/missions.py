@@ -21,8 +21,6 @@ from aerokit.fleets.separation import Deconfliction, conflicts_of
 from aerokit.missions.mission import Mission
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
-__all__ = ["Missions"]
-
 
 @checks_arguments
 class Missions(FleetPart):

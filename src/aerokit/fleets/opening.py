@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
-__all__ = ["fleet"]
-
 WhenTooClose = Literal["hold", "tell"]
 """What is done about two members that are too near to each other in flight."""
 Source = str | Link | Connection | Vehicle

@@ -20,8 +20,6 @@ from aerokit.fleets.separation import Deconfliction, Route, in_corridors, in_lay
 from aerokit.position import Position
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
-__all__ = ["Travel", "WayApart"]
-
 WayApart = Literal["layers", "corridors", "refuse"]
 """What is done about ways that cross: heights of their own, times of their own, or nothing is flown."""
 

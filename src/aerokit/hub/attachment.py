@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     Tell = Callable[["Attachment", HubEventKind, str], object]
 
-__all__ = ["Attachment", "check_filters"]
-
 HOLD_ABOVE = {"serial": 2048, "pty": 2048}
 """Bytes that may be on their way out of this machine while more is written: a third of a second of a slow radio."""
 HOLD_ABOVE_OTHERS = 16 * 1024

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
     from aerokit.transport.link import Link, Peer
 
-__all__ = ["Border", "IdentityGuard", "reframed"]
-
 
 def reframed(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
     """The frame with these incompatibility flags and without a signature, as MAVLink 2; sender and number stay.

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from aerokit.hub.values import EndpointStatistics, HubEventKind
     from aerokit.mavlink.dialect import Dialect
 
-__all__ = ["Hub", "shared"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 CLOSE_TIMEOUT_S = 2.0

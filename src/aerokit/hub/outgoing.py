@@ -15,19 +15,6 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.dialect import Dialect
 
-__all__ = [
-    "ANSWERS",
-    "MOST_BYTES",
-    "MOST_FRAMES",
-    "MOST_HZ",
-    "ORDERS_WAIT_S",
-    "Filters",
-    "Held",
-    "HeldFrames",
-    "Kind",
-    "kind_of",
-]
-
 ANSWERS = frozenset(
     (
         "COMMAND_ACK", "PARAM_VALUE", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "MISSION_ACK", "MISSION_COUNT",

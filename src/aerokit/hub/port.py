@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.transport.link import Link, Peer
 
-__all__ = ["JOINED_BYTES", "NEVER", "Port", "Totals"]
-
 JOINED_BYTES = 1200
 """Frames that leave together are written together up to so many bytes, which is a datagram that nobody cuts up."""
 NEVER = 1 << 62

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.frame import Frame
 
-__all__ = ["MOST_PLANS", "Node", "Plan", "Router"]
-
 PortT = TypeVar("PortT")
 
 MOST_PLANS = 4096

@@ -11,17 +11,6 @@ from aerokit.mavlink.enums import MavAutopilot, MavType
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = [
-    "DUPLICATE_WINDOW_S",
-    "LOOP_MEMORY_S",
-    "LOOP_RUN",
-    "MOST_RECENT",
-    "REPEATED_WITHIN_S",
-    "Recent",
-    "Sender",
-    "is_autopilot",
-]
-
 DUPLICATE_WINDOW_S = 2.0
 """A frame with the sender, number and checksum of one that came from elsewhere so short a time ago is the same one."""
 REPEATED_WITHIN_S = 0.5

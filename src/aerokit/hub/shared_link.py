@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
     from aerokit.transport.link import Receiver
 
-__all__ = ["SharedLink"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
 
-__all__ = ["LOOK_EVERY_S", "Switch"]
-
 LOOK_EVERY_S = 0.01
 """So often a link that took no more is asked whether it does again; while none does, ever more rarely."""
 LOOK_AT_LEAST_EVERY_S = 0.08

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-__all__ = ["NOWHERE", "STANDARD_OFFSETS", "Targets"]
-
 STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (0, None): (5,),
     (0, 1): (

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
     from aerokit.transport.sockets import Peers
 
-__all__ = ["Endpoint", "EndpointStatistics", "HubEvent", "HubEventKind"]
-
 
 class Endpoint(Snapshot):
     """One link of a hub, and what may pass.

@@ -23,17 +23,6 @@ from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-__all__ = [
-    "DialectDefinition",
-    "EntryDefinition",
-    "EnumDefinition",
-    "FieldDefinition",
-    "MessageDefinition",
-    "merged_enums",
-    "read_dialect",
-    "read_xml",
-]
-
 _LOWEST, _HIGHEST = -(1 << 63), (1 << 64) - 1
 
 # Names that a message class needs for itself; a private dialect's field of that name gets a trailing underscore.

@@ -23,8 +23,6 @@ from aerokit.mavlink.message import Message
 if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
 
-__all__ = ["STANDARD", "Dialect"]
-
 Row = tuple[int, int, int]
 
 

@@ -12,8 +12,6 @@ from aerokit.mavlink.message import Message
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
 
-__all__ = ["FrameEncoder"]
-
 _HEADER_V2 = Struct("<BBBBBBHB").pack  # without the magic byte
 _MAGIC_V1, _MAGIC_V2 = bytes((MAGIC_V1,)), bytes((MAGIC_V2,))
 _BYTES = tuple(bytes((number,)) for number in range(256))

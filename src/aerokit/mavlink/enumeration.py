@@ -6,8 +6,6 @@ import enum
 from collections.abc import Iterable
 from typing import Any
 
-__all__ = ["make_enum"]
-
 _QUICKLY: Any = getattr(enum, "_simple_enum", None)
 """How the standard library makes its own long enums since Python 3.11: the same enum in half the time."""
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["MAGIC_V1", "MAGIC_V2", "SIGNED", "Frame", "is_whole_frame", "x25", "x25_in_python"]
-
 MAGIC_V1 = 0xFE
 """First byte of a MAVLink 1 frame."""
 

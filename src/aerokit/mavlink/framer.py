@@ -18,8 +18,6 @@ from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame, x25
 from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
 
-__all__ = ["MOST_SOURCES", "Framer"]
-
 MOST_SOURCES = 1024
 """So many senders are counted apart by a framer that shares no `SourceLimit` with others."""
 

@@ -35,18 +35,6 @@ from aerokit.mavlink.definitions import (
 )
 from aerokit.mavlink.rendering import render_enum_row, render_enum_stub, render_message
 
-__all__ = [
-    "definitions",
-    "differences",
-    "fingerprint",
-    "generate",
-    "generated_fingerprint",
-    "read_additions",
-    "with_added_enums",
-    "with_added_messages",
-    "xml_folder",
-]
-
 UNION_FOLDER = Path(__file__).parent / "additions"
 
 FLOORS = ("minimal", "standard", "common")

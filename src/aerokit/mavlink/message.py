@@ -21,8 +21,6 @@ else:  # importing typing_extensions would cost more than everything else here
         return lambda cls: cls
 
 
-__all__ = ["SECRET_FIELDS", "Field", "Message", "field_names", "offset_of"]
-
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
 """What packing a wrong value can raise; the generated classes turn it into InvalidArgument."""
 

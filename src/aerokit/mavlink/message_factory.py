@@ -11,8 +11,6 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from aerokit.errors import InvalidArgument
 
-__all__ = ["MessageFactory"]
-
 if TYPE_CHECKING:  # its own types are stricter than what is taken here
 
     class _MAVLink:

@@ -13,8 +13,6 @@ from collections.abc import Iterable
 from aerokit.mavlink.definitions import EntryDefinition, EnumDefinition, FieldDefinition, MessageDefinition
 from aerokit.mavlink.frame import HEADER_LENGTH
 
-__all__ = ["render_enum_row", "render_enum_stub", "render_message"]
-
 _WIDTH = 110
 _CODES = {
     "int8_t": "b",

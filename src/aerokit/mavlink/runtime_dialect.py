@@ -29,8 +29,6 @@ from aerokit.mavlink.generator import xml_folder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.rendering import render_message
 
-__all__ = ["Read", "class_from_pymavlink", "compile_message", "read_pymavlink_dialect", "read_xml_dialect"]
-
 Read = tuple[str, list[type[Message]], dict[str, type[Any]]]
 """Name, classes, and enums by the standard's spelling."""
 

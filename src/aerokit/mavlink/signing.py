@@ -20,8 +20,6 @@ from aerokit._internal.files import write_whole
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.frame import SIGNATURE_LENGTH, SIGNED, Frame
 
-__all__ = ["Refusal", "Signing", "SigningKey", "TimestampFile", "is_signed_with_a_key", "timestamp_at"]
-
 KEY_LENGTH = 32
 
 TICKS_PER_S = 100_000

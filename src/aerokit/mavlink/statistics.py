@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["FramerStatistics", "SourceLimit", "SourceStatistics"]
-
 _QUIET_S = 10.0
 
 _MOST_UNKNOWN = 64

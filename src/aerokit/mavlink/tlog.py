@@ -13,8 +13,6 @@ from typing import BinaryIO
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 
-__all__ = ["TlogWriter", "read_tlog"]
-
 _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16

@@ -19,33 +19,6 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
 
-__all__ = [
-    "change_speed",
-    "condition_delay",
-    "condition_distance",
-    "condition_yaw",
-    "delay",
-    "delay_until",
-    "enable_fence",
-    "jump",
-    "jump_tag",
-    "jump_to_tag",
-    "land_start",
-    "point_gimbal",
-    "region_of_interest",
-    "region_of_interest_none",
-    "set_camera_trigger_distance",
-    "set_relay",
-    "set_servo",
-    "start_video",
-    "stop_photos",
-    "stop_video",
-    "take_photo",
-    "take_photos",
-    "trigger_camera",
-    "vtol_transition",
-]
-
 _LONGEST_S = 86_400.0 * 365
 
 _SPEEDS = {"air": 0.0, "ground": 1.0, "climb": 2.0, "descent": 3.0}

@@ -23,8 +23,6 @@ from aerokit.missions.item import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["MOST_ITEMS", "check_count", "check_item", "check_items", "check_jumps"]
-
 MOST_ITEMS = 65_535
 """MISSION_COUNT has 16 bits for the number of items."""
 

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from aerokit.missions.item import MissionItem
 
-__all__ = ["Storage", "changed_items", "item_differences", "items_differences", "kept"]
-
 FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 

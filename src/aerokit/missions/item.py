@@ -14,30 +14,6 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Position
 
-__all__ = [
-    "DEFAULT_XY",
-    "DESTINATIONS",
-    "FENCE_COMMANDS",
-    "GLOBAL_FRAMES",
-    "HIGHEST_M",
-    "LOCAL_FRAMES",
-    "NUMBERS",
-    "PLACES",
-    "RALLY_COMMANDS",
-    "Altitudes",
-    "MissionItem",
-    "action",
-    "altitude_and_frame",
-    "canonical_frame",
-    "command_name",
-    "has_place",
-    "heading",
-    "in_range",
-    "place",
-    "whole",
-    "xy_scale",
-]
-
 DEFAULT_XY = 0x7FFFFFFF
 """INT32_MAX in x or y: "not given", as NaN is in the other parameters."""
 

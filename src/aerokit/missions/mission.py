@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-__all__ = ["Mission", "Plan"]
-
 
 class Mission(Snapshot):
     """``Mission([take_off(20), waypoint(47.3, 8.5, altitude_relative_m=20), land()])``.

@@ -21,21 +21,6 @@ if TYPE_CHECKING:
     from aerokit.missions.item import Altitudes, MissionItem
     from aerokit.position import Position
 
-__all__ = [
-    "land",
-    "loiter_time",
-    "loiter_to_altitude",
-    "loiter_turns",
-    "loiter_unlimited",
-    "rally_point",
-    "return_to_launch",
-    "spline_waypoint",
-    "take_off",
-    "vtol_land",
-    "vtol_take_off",
-    "waypoint",
-]
-
 _LONGEST_S = 65_535.0  # ArduPilot has 16 bits for seconds
 _WIDEST_M = 65_535.0  # and for metres
 

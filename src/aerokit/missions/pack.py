@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 
     from aerokit.missions.item import MissionItem
 
-__all__ = [
-    "HEADER",
-    "MAGIC",
-    "NO_CLEAR",
-    "PACKED_NAMES",
-    "PlanHeader",
-    "pack_items",
-    "read_header",
-    "unpack_items",
-]
-
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
 NO_CLEAR = 1  # in options: the items that are there stay, those that come replace some of them

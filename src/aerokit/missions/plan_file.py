@@ -23,8 +23,6 @@ from aerokit.position import Position
 if TYPE_CHECKING:
     import os
 
-__all__ = ["format_plan", "parse_plan", "read_plan_file", "write_plan_file"]
-
 _NUMBERS = {
     "firmware_type": "firmwareType",
     "vehicle_type": "vehicleType",

@@ -26,17 +26,6 @@ from aerokit.missions.wire import from_degrees, in_degrees
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-__all__ = [
-    "LANDING_PATTERNS",
-    "JsonValue",
-    "json_number",
-    "landing_items",
-    "load_json",
-    "merged_entries",
-    "read_entries",
-    "simple_entry",
-]
-
 LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": MavCmd.NAV_VTOL_LAND}
 
 

@@ -24,8 +24,6 @@ from aerokit.position import Position
 if TYPE_CHECKING:
     import os
 
-__all__ = ["format_waypoints", "parse_waypoints", "read_waypoint_file", "write_waypoint_file"]
-
 _COLUMNS = (
     "index",
     "current",

@@ -13,19 +13,6 @@ from aerokit.position import Position
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-__all__ = [
-    "from_degrees",
-    "from_wire",
-    "home_item",
-    "in_degrees",
-    "shift_jumps",
-    "to_wire",
-    "to_wire_float",
-    "with_home",
-    "without_home",
-    "written_out",
-]
-
 
 def to_wire(
     item: MissionItem,

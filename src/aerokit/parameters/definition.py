@@ -23,15 +23,6 @@ from aerokit.parameters.setting import SettingValue, checked_setting, setting_ke
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-__all__ = [
-    "CameraDefinition",
-    "SettingDefinition",
-    "SettingOption",
-    "SettingRange",
-    "load_definition",
-    "parse_definition",
-]
-
 Values = Mapping[str, SettingValue]
 """What is known of a camera's settings, by name."""
 

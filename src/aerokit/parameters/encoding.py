@@ -19,20 +19,6 @@ from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.messages import ParamSet, ParamValue
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 
-__all__ = [
-    "UNKNOWN_INDEX",
-    "from_bits",
-    "from_wire",
-    "number_text",
-    "parameter_of",
-    "parse_number",
-    "set_message",
-    "to_bits",
-    "to_wire",
-    "value_message",
-    "value_of",
-]
-
 UNKNOWN_INDEX = 0xFFFF
 """``param_index`` of a PARAM_VALUE that is not part of the list: ArduPilot and PX4 send it after PARAM_SET."""
 

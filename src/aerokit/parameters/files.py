@@ -18,15 +18,6 @@ from aerokit.parameters.encoding import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable, ParameterValues, plain_values
 
-__all__ = [
-    "FileFormat",
-    "ParameterFile",
-    "parameter_file_text",
-    "parse_parameter_file",
-    "read_parameter_file",
-    "write_parameter_file",
-]
-
 FileFormat = Literal["missionplanner", "mavproxy", "qgroundcontrol"]
 """Whose file it is."""
 

@@ -35,8 +35,6 @@ from aerokit.parameters.encoding import parse_number
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-__all__ = ["Metadata", "ParameterMetadata", "load_metadata", "parse", "parse_metadata"]
-
 _NOTHING: Mapping[float, str] = MappingProxyType({})
 
 _NO_BITS: Mapping[int, str] = MappingProxyType({})

@@ -19,22 +19,6 @@ from aerokit.parameters.encoding import to_bits
 from aerokit.parameters.parameter import NAME_LENGTH, Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable
 
-__all__ = [
-    "HASH_NAME",
-    "HEADER",
-    "MAGIC",
-    "PACK_PATH",
-    "PACK_PATH_WITH_DEFAULTS",
-    "PackEntry",
-    "PackHeader",
-    "pack_parameters",
-    "pack_served",
-    "px4_hash",
-    "read_entry",
-    "read_header",
-    "unpack_parameters",
-]
-
 PACK_PATH = "@PARAM/param.pck"
 """Where vehicles serve and take the file."""
 

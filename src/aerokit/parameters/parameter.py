@@ -11,18 +11,6 @@ from aerokit._internal.values import Snapshot
 from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
 
-__all__ = [
-    "MOST_PARAMETERS",
-    "NAME_LENGTH",
-    "Parameter",
-    "ParameterType",
-    "check_name",
-    "checked_value",
-    "number_of",
-    "same_value",
-    "to_float32",
-]
-
 MOST_PARAMETERS = 8192
 """Names beyond so many that come from the air are not taken for parameters; ArduPilot has 1,500, PX4 2,000."""
 

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from itertools import chain
 
-__all__ = ["GROUPS", "INVERTED", "OLDER", "ONE_WAY", "OTHER_NEW_NAMES", "REPLACED"]
-
 _ALL = ("Copter", "Plane", "Rover", "Sub", "Tracker", "Blimp")
 
 _COPTER = ("Copter",)

@@ -17,17 +17,6 @@ from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
 
-__all__ = [
-    "ParameterRenamedWarning",
-    "Rename",
-    "Renamed",
-    "find_rename",
-    "other_names",
-    "replacement_of",
-    "to_known",
-    "translate_values",
-]
-
 _ALL_CHECKS = 1
 _CHECKS = 0x1FFFFE
 """Bits 1 to 20: every arming check that has a bit of its own."""

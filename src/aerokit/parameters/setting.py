@@ -15,17 +15,6 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters.parameter import ParameterType, checked_value
 
-__all__ = [
-    "LONGEST_VALUE",
-    "Setting",
-    "SettingValue",
-    "checked_setting",
-    "setting_bytes",
-    "setting_key",
-    "setting_value",
-    "settings_equal",
-]
-
 SettingValue = bool | int | float | str | bytes
 """What a setting can be: ``bool`` where a definition says so, ``str`` or ``bytes`` of the custom type."""
 

@@ -11,8 +11,6 @@ from aerokit.errors import ValueUnknownError
 from aerokit.parameters.encoding import number_text
 from aerokit.parameters.parameter import Parameter, ParameterType, same_value
 
-__all__ = ["ParameterDifference", "ParameterTable", "ParameterValues", "diff", "plain_values"]
-
 
 class ParameterTable(Mapping[str, Parameter]):
     """Name → :class:`Parameter`, in the vehicle's order; immutable.

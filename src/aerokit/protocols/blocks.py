@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-__all__ = ["AdaptiveWindow", "BlockRequests", "Reassembly", "WriteBytes"]
-
 OVERTAKEN = 3
 """Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from aerokit.protocols.exchange import RoundTrip
 
-__all__ = ["MessageStream"]
-
 SILENT_MESSAGES = 10
 """So many messages in a row are hardly ever lost: the vehicle has sent all that it was asked for."""
 

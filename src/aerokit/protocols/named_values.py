@@ -22,18 +22,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import TransferOptions
 
-__all__ = [
-    "BY_NAME",
-    "PAUSES",
-    "PROBE",
-    "PROBE_INDEX",
-    "SHORTEST_START_S",
-    "NamedReads",
-    "NamedRequests",
-    "OtherAnswers",
-    "ValueList",
-]
-
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-__all__ = ["RequestWindow"]
-
 KeyT = TypeVar("KeyT", bound=Hashable)
 
 WINDOW = 20

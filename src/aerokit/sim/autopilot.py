@@ -15,8 +15,6 @@ from aerokit.sim.commands import Command, CommandHandler, CommandServer
 from aerokit.sim.file_tree import FileTree
 from aerokit.sim.vehicle import Component, SimulatedVehicle
 
-__all__ = ["SimulatedAutopilot", "VehicleSigning"]
-
 
 class VehicleSigning:
     """What both makes do: take a key by SETUP_SIGNING while disarmed, sign and check on all ports, keep it.

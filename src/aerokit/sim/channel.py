@@ -15,9 +15,6 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import INTEGER_RANGES, Field, Message
 from aerokit.mavlink.signing import Signing
 
-__all__ = ["fitted"]
-
-
 MessageT = TypeVar("MessageT", bound=Message)
 _LARGEST_FLOAT = 3.4028234663852886e38
 

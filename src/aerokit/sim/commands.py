@@ -16,8 +16,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import CommandFault, Faults
 from aerokit.sim.vehicle import sender_of
 
-__all__ = ["Command", "CommandServer", "Commanded", "Progress", "whole"]
-
 
 @dataclass(frozen=True)
 class Command:

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.message import Message
 
-__all__ = ["CommandFault", "Faults"]
-
 
 @dataclass
 class CommandFault:

@@ -7,8 +7,6 @@ from collections.abc import Callable
 
 from typing_extensions import Self
 
-__all__ = ["Entry", "FileFault", "FileTree", "Mount", "OpenFile", "TextMount"]
-
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 28, 30, 39
 """Linux's numbers, which the firmwares send whatever they run on."""

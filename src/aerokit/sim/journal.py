@@ -10,8 +10,6 @@ from aerokit.mavlink.enums import MavCmd, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong
 
-__all__ = ["HeardMessage", "Journal", "SaidText"]
-
 MessageT = TypeVar("MessageT", bound=Message)
 
 

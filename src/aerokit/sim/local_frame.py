@@ -7,9 +7,6 @@ from typing import Any, NamedTuple
 
 from aerokit.errors import InvalidArgument
 
-__all__ = ["HOME", "GlobalPoint", "LocalFrame", "Ned", "true_place"]
-
-
 _METRES_PER_DEGREE_E7 = (
     0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere, the same rounding
 )

@@ -22,8 +22,6 @@ from aerokit.mavlink.messages import (
 from aerokit.sim.channel import Channel
 from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["ArduPilotLogServer", "LogServer", "Px4LogServer", "SimulatedLog"]
-
 _BLOCK = 90
 
 

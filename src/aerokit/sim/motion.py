@@ -14,17 +14,6 @@ from dataclasses import dataclass
 
 from aerokit.sim.local_frame import Ned
 
-__all__ = [
-    "GRAVITY_M_S2",
-    "Motion",
-    "MotionLimits",
-    "Wind",
-    "approach_speed",
-    "euler_from_quaternion",
-    "quaternion_from_euler",
-    "wrap_pi",
-]
-
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Of a rotation about yaw, then pitch, then roll."""

@@ -15,9 +15,6 @@ from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.pack import HEADER, MAGIC, pack_served, read_entry, read_header
 from aerokit.sim.file_tree import EINVAL, ENOENT, FileFault, Mount, OpenFile
 
-__all__ = ["ParameterPackMount", "ParameterRow", "Parameters", "stored"]
-
-
 _VOLATILE = "v"
 
 _RANGES = {

@@ -21,9 +21,6 @@ from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_fl
 from aerokit.sim.recording import Answer, FlightRecording
 from aerokit.sim.vehicle import Component, SimulatedVehicle, sender_of
 
-__all__ = ["RecordedMissions", "RecordedParameters", "RecordedVehicle"]
-
-
 _LIST_INTERVAL_S, _BURST = 0.005, 5
 
 

@@ -16,8 +16,6 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import read_tlog
 
-__all__ = ["LONGEST_GAP_S", "Answer", "FlightRecording", "Plan"]
-
 LONGEST_GAP_S = 60.0
 """A longer silence in a recording is cut to this: it is a pause between flights, or the clock was set."""
 

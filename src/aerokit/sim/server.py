@@ -17,8 +17,6 @@ from aerokit.sim.channel import Channel, SharedHearing, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-__all__ = ["SimulatorServer", "open_simulator", "simulated_link"]
-
 _SHORTEST_WAIT_S = 0.001
 """Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
 _MANY = 10

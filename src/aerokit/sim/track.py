@@ -31,8 +31,6 @@ from aerokit.sim.picture import save_picture
 from aerokit.sim.track_points import Failure, TrackPoint, metres_from
 from aerokit.sim.vehicle import SimulatedVehicle
 
-__all__ = ["Failure", "Track", "TrackPoint", "least_distance_m", "record_track", "true_point"]
-
 _ON_GROUND_M = 0.3
 
 

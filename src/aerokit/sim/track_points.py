@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from aerokit._internal import geo
 from aerokit.position import Position
 
-__all__ = ["Failure", "TrackPoint", "metres_from"]
-
 
 @dataclass(frozen=True)
 class TrackPoint:

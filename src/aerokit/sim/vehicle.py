@@ -22,8 +22,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
 from aerokit.sim.journal import Journal
 
-__all__ = ["TICK_S", "Component", "ExtraComponent", "SimulatedVehicle", "sender_of"]
-
 TICK_S = 0.02
 """Motion, modes and failsafes run at 50 Hz while anything moves."""
 

@@ -34,23 +34,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = [
-    "BlockTwin",
-    "BlockingBlock",
-    "CellTwin",
-    "ChangesTwin",
-    "ConnectionTwin",
-    "GimbalsTwin",
-    "PhotoIntervalTwin",
-    "StreamTwin",
-    "SubscriptionTwin",
-    "TemporarilyTwin",
-    "TransactionTwin",
-    "TwinOf",
-    "VehicleTwin",
-    "opened",
-]
-
 
 class BlockingBlock:
     """A base of what :mod:`aerokit.sync` opens. Nobody else would close it then, so it is closed first."""

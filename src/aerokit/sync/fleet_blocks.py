@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.fleets.fleet import Selection as AsyncSelection
     from aerokit.fleets.members import Member
 
-__all__ = ["FleetTwin", "SelectionTwin", "opened_fleet"]
-
 T = TypeVar("T")
 SelectionT = TypeVar("SelectionT", bound="AsyncSelection")
 FleetT = TypeVar("FleetT", bound="FleetTwin")

@@ -27,20 +27,6 @@ from aerokit.sync.originals import TWINS, Member, Twin, decorators_of, function_
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-__all__ = [
-    "FILE",
-    "FILES",
-    "WIDTH",
-    "arguments_of",
-    "call",
-    "docstring",
-    "forwarded",
-    "function",
-    "generate",
-    "optional",
-    "outer",
-]
-
 WIDTH = 110
 """Of a line; what is written is as `ruff format` would have it."""
 

@@ -24,8 +24,6 @@ from aerokit.sync.reply import Reply
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-__all__ = ["Held", "LoopThread"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, ForwardRef, get_args, get_origin
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-__all__ = ["TWINS", "Member", "Twin", "decorators_of", "function_node", "imports_of", "members_of"]
-
 
 @dataclass(frozen=True)
 class Twin:

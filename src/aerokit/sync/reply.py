@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 if TYPE_CHECKING:
     import concurrent.futures
 
-__all__ = ["Reply", "reply_of"]
-
 T = TypeVar("T")
 
 

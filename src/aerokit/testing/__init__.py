@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from aerokit.sim.journal import Journal as Journal
     from aerokit.sim.track import Track as Track
-    from aerokit.sim.track import TrackPoint as TrackPoint
+    from aerokit.sim.track_points import TrackPoint as TrackPoint
     from aerokit.testing.clock import VIRTUAL_BACKEND as VIRTUAL_BACKEND
     from aerokit.testing.clock import DeadlockError as DeadlockError
     from aerokit.testing.clock import VirtualClockLoop as VirtualClockLoop
@@ -37,7 +37,8 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "aerokit.sim.journal": ("Journal",),
-        "aerokit.sim.track": ("Track", "TrackPoint"),
+        "aerokit.sim.track": ("Track",),
+        "aerokit.sim.track_points": ("TrackPoint",),
         "aerokit.testing.clock": ("DeadlockError", "VIRTUAL_BACKEND", "VirtualClockLoop", "run_virtual"),
         "aerokit.testing.fault_model": ("FaultModel",),
         "aerokit.testing.faults": ("FaultInjector",),

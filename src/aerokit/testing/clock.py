@@ -43,8 +43,6 @@ from typing import Any, TypeVar
 
 import anyio
 
-__all__ = ["PATIENCE_S", "VIRTUAL_BACKEND", "DeadlockError", "VirtualClockLoop", "run_virtual"]
-
 T = TypeVar("T")
 
 PATIENCE_S = 10.0

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from aerokit.testing.flights import Flight
     from aerokit.testing.served import ServedFlight
 
-__all__ = ["what_was_flown"]
-
 _TEXTS = 6
 
 

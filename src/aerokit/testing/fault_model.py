@@ -10,8 +10,6 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 
-__all__ = ["Air", "FaultModel", "FaultyPath", "split_frames"]
-
 _SHARES = ("loss", "duplication", "reordering", "corruption")
 _SECONDS = ("delay_s", "jitter_s", "overtaken_s")
 

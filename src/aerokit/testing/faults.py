@@ -10,11 +10,9 @@ from typing import Any
 from aerokit.errors import InvalidArgument
 from aerokit.sim.faults import Faults
 from aerokit.sim.motion import Wind
-from aerokit.sim.track import TrackPoint, true_point
+from aerokit.sim.track import true_point
+from aerokit.sim.track_points import TrackPoint
 from aerokit.testing.stage import Stagehand
-
-__all__ = ["FaultInjector"]
-
 
 OnStage = Callable[[Callable[[Stagehand], None]], None]
 """Lets a stagehand plan something, as of now."""

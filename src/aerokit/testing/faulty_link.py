@@ -34,8 +34,6 @@ from aerokit.transport.link import (
 )
 from aerokit.transport.outbox import Outbox
 
-__all__ = ["FaultyLink", "StalledLine"]
-
 LIMIT = 256 * 1024
 
 

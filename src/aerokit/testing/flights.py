@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from aerokit.sim.vehicle import SimulatedVehicle
     from aerokit.transport import Link
 
-__all__ = ["Fleet", "Flight", "open_fleet", "open_flight", "repeated"]
-
 T = TypeVar("T")
 _BOOT_TIME_S = 1.0
 

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from types import FrameType
 
-__all__ = ["Interruption"]
-
 _AGAIN_S = 0.001
 _AT_THE_EDGE = ("interruption.py", "served.py")
 

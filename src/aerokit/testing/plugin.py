@@ -25,21 +25,6 @@ if TYPE_CHECKING:
     from aerokit.testing.flights import Fleet, Flight
     from aerokit.testing.served import ServedFlight
 
-__all__ = [
-    "blocking_vehicle",
-    "dronekit",
-    "dronekit_address",
-    "fleet",
-    "flight",
-    "pytest_addoption",
-    "pytest_configure",
-    "pytest_load_initial_conftests",
-    "pytest_pyfunc_call",
-    "pytest_runtest_call",
-    "pytest_runtest_makereport",
-    "served_flight",
-]
-
 _MARKER, _PICTURES = "simulated", "--flight-pictures"
 _OPENED = "_aerokit_opened"
 _TOLD = ("Fleet", "Flight", "ServedFlight")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.sim.journal import Journal
     from aerokit.sim.track import Track
 
-__all__ = ["SPEEDUP", "ServedFlight", "hosted_flight", "serve_flight"]
-
 SPEEDUP = 10.0
 """Simulated seconds in a real one, unless a test says otherwise."""
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from aerokit.sim.server import SimulatorServer
     from aerokit.sim.track import Track
 
-__all__ = ["FlightRecording", "Stagehand"]
-
 _LOOK_S = 0.1
 """How often conditions are looked at, in simulated seconds."""
 

@@ -12,8 +12,6 @@ from aerokit._internal.values import Snapshot
 from aerokit._internal.wording import did_you_mean
 from aerokit.errors import InvalidArgument
 
-__all__ = ["ACCEPTED_FORMS", "AddressError", "LinkAddress", "LinkKind", "host_and_port", "parse_address"]
-
 LinkKind = Literal[
     "udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"
 ]

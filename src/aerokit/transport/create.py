@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from aerokit.transport.sockets import Peers
     from aerokit.transport.zenoh.session import NetworkOptions
 
-__all__ = ["create_link", "network_options"]
-
 
 def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers | None = None) -> Link:
     """The link that a connection string describes; nothing is opened yet.

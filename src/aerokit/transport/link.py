@@ -13,21 +13,6 @@ from typing import Any, Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, LinkError, LinkLost, LinkOpenError
 
-__all__ = [
-    "BaseLink",
-    "BurstListener",
-    "DrainListener",
-    "HelmListener",
-    "Link",
-    "Peer",
-    "PeerKeeper",
-    "PeerListener",
-    "Receiver",
-    "keeps_peers",
-    "link_open_error",
-    "needed",
-]
-
 Peer = Hashable
 """Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
 

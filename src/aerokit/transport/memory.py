@@ -7,8 +7,6 @@ from collections import deque
 
 from aerokit.transport.link import BaseLink, Peer
 
-__all__ = ["MemoryLink", "memory_link_pair"]
-
 
 def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]:
     """Two links, each the other's only peer; both are to be opened on the same event loop.

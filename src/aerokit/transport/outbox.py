@@ -8,8 +8,6 @@ import sys
 from collections import deque
 from collections.abc import Callable
 
-__all__ = ["STALLED_AFTER_S", "WRITE_DEADLINE_S", "Outbox", "unsent_in_kernel"]
-
 WRITE_DEADLINE_S = 1.0
 """What has waited for so long is not written any more: an order that arrives late is worse than none."""
 

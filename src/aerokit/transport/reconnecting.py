@@ -27,8 +27,6 @@ from aerokit.transport.link import (
     keeps_peers,
 )
 
-__all__ = ["FIRST_DELAY_S", "LONGEST_DELAY_S", "Delays", "Interruptible", "ReconnectingLink"]
-
 FIRST_DELAY_S = 0.2
 """Before the first further attempt."""
 

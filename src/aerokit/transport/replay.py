@@ -12,8 +12,6 @@ from aerokit.mavlink.tlog import read_tlog
 from aerokit.transport.address import LinkAddress
 from aerokit.transport.link import BaseLink, Peer
 
-__all__ = ["FRAMES_PER_TURN", "LONGEST_GAP_S", "Replay"]
-
 FRAMES_PER_TURN = 64
 """So many frames are handed over in one go before everybody else on the loop gets a turn."""
 

@@ -24,9 +24,6 @@ from aerokit.transport.address import LinkAddress
 from aerokit.transport.link import LINGER_S, BaseLink, Peer, link_open_error
 from aerokit.transport.outbox import Outbox
 
-__all__ = ["PtyLink", "SerialLink"]
-
-
 if sys.platform == "win32":
     _TermiosError = OSError
 else:

@@ -16,8 +16,6 @@ from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLos
 from aerokit.transport.link import HelmListener, Link, Peer, Receiver, keeps_peers
 from aerokit.transport.reconnecting import Delays, Interruptible
 
-__all__ = ["LinkPeer", "OneOfSeveralListener", "SeveralLinks"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 

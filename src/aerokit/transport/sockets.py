@@ -18,21 +18,6 @@ from typing import Any, NamedTuple
 from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
 
-__all__ = [
-    "AllowedPeers",
-    "Endpoint",
-    "Network",
-    "Peers",
-    "bind_to",
-    "bound_socket",
-    "discard_unsent",
-    "has_more",
-    "is_free",
-    "network_port_error",
-    "resolve",
-    "serial_ports",
-]
-
 
 class Endpoint(NamedTuple):
     """Where to bind, or whom to reach."""

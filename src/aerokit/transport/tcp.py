@@ -16,8 +16,6 @@ from aerokit.transport.link import LINGER_S, BaseLink, Peer, PeerListener
 from aerokit.transport.outbox import Outbox, unsent_in_kernel
 from aerokit.transport.sockets import AllowedPeers, Endpoint, Peers, bound_socket, discard_unsent, resolve
 
-__all__ = ["CONNECT_TIMEOUT_S", "MAX_CLIENTS", "MAX_PENDING_BYTES", "TcpConnect", "TcpListen"]
-
 CONNECT_TIMEOUT_S = 10.0
 """Seconds that `TcpConnect.open` waits for the other side by default."""
 

@@ -19,8 +19,6 @@ from aerokit.transport.address import host_and_port
 from aerokit.transport.link import BaseLink, BurstListener, Peer
 from aerokit.transport.sockets import AllowedPeers, Endpoint, Peers, bind_to, bound_socket, has_more, resolve
 
-__all__ = ["DATAGRAMS_PER_WAKE_UP", "MAX_PEERS", "UdpBroadcast", "UdpConnect", "UdpListen"]
-
 DATAGRAMS_PER_WAKE_UP = 64
 """So many are read in one go before everybody else on the loop gets a turn."""
 

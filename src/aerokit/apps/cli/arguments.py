@@ -20,27 +20,6 @@ from aerokit.transport import parse_address
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = [
-    "EACH_ITS_OWN",
-    "add_baud",
-    "add_vehicle_kind",
-    "address",
-    "address_or_form",
-    "assignment",
-    "count",
-    "directory",
-    "each_with_its_own",
-    "home",
-    "number",
-    "parameter",
-    "picture",
-    "place_of",
-    "system_id",
-    "vehicle_kind",
-    "wind",
-    "writable_file",
-]
-
 EACH_ITS_OWN = "tcpin:127.0.0.1:{5760+10n}"
 """As SITL numbers its instances: 5760, 5770, 5780 and so on."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["add_arguments"]
-
 WHERE = "where the vehicles are: "
 
 

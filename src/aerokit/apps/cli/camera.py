@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.cameras import Camera
     from aerokit.vehicle.camera.capture import Capture
 
-__all__ = ["add_arguments"]
-
-
 MOST = 32_767
 LONGEST_NAME = 200
 

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Iterable
 
-__all__ = ["addresses", "assignments", "kinds", "offer", "parameter_names", "parameters"]
-
 _USUAL = ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14540", "tcp:127.0.0.1:5760")
 
 _DEVICES = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/cu.usb*")

@@ -7,13 +7,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.output import DONE, add_json, need, printable, tell
+from aerokit._internal.values import printable
+from aerokit.apps.cli.output import DONE, add_json, need, tell
 from aerokit.apps.cli.terminal import progress_bar
 
 if TYPE_CHECKING:
     import argparse
-
-__all__ = ["add_arguments"]
 
 _WRITTEN = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 """What ``written`` counts; an ``.mcap`` may get several messages of one entry: itself, and states that it changed."""

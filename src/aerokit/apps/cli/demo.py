@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.apps.cli.own_flight import Purpose
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["add_arguments", "run_demo"]
-
 CORNERS = (("north-west", 1, 0), ("north-east", 1, 1), ("south-east", 0, 1), ("south-west", 0, 0))
 """Of the square: its name, and how many sides north and east of the start it is."""
 READY_TIMEOUT_S = 120.0

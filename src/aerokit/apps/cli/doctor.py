@@ -26,15 +26,6 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Iterator
 
-__all__ = [
-    "USUAL_PORTS",
-    "add_arguments",
-    "check_installation",
-    "check_network_port",
-    "check_serial_port",
-    "run_doctor",
-]
-
 DISTRIBUTION = "aerokit-mavlink"
 
 EXTRAS: dict[str, tuple[str, ...]] = {

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.transport.link import Peer
 
-__all__ = ["BAUD_RATES", "Finding", "Heard", "Level", "LinkExamination", "listen_at", "tell_finding"]
-
 BAUD_RATES = (57600, 115200, 921600, 460800, 230400, 500000, 38400, 19200, 9600)
 """The most usual first."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from aerokit.connection.connection import Connection
 
-__all__ = ["add_arguments", "run_events"]
-
 WAITING = 1000
 """So many events may wait to be printed; of more, the oldest are dropped and counted."""
 SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")

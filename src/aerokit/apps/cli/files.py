@@ -9,8 +9,6 @@ from aerokit.apps.cli.output import DONE, tell, tell_done
 from aerokit.apps.cli.terminal import file_size, progress_bar
 from aerokit.apps.cli.vehicle_command import add_action, connected
 
-__all__ = ["add_arguments"]
-
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """The actions of the command, and their arguments."""

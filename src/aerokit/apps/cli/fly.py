@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["PlanFlight", "add_arguments", "run_fly"]
-
 FAR_M = 1000.0
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.gimbal.device import GimbalInformation
     from aerokit.vehicle.gimbal.gimbal import Gimbal
 
-__all__ = ["add_arguments"]
-
 TOLD_WITHIN_S = 2.0
 
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
 
-__all__ = ["add_arguments"]
-
 _NAMED = re.compile(r"([A-Za-z][\w-]*)=(.+)", re.DOTALL)
 _FILTER = "'GPS_*,HEARTBEAT@NAME'"
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.transport.link import Link
 
-__all__ = ["add_link", "add_seconds", "await_end", "await_vehicle", "opened"]
-
 
 def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
     """Add the address, what belongs to it, and ``--json``; ``default`` says what happens without an address."""

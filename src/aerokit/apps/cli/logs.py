@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from aerokit.vehicle.files.logs import LogEntry
 
-__all__ = ["add_arguments"]
-
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """The actions of the command, and their arguments."""

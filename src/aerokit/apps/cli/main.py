@@ -18,8 +18,6 @@ from aerokit.errors import AerokitError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["complete", "main"]
-
 COMPLETING = "_ARGCOMPLETE"
 """The variable that a shell sets when it asks for completions."""
 

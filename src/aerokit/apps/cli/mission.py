@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.missions import MissionItem, Plan
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["PARTS", "add_arguments", "read_plan", "tell_items", "tell_part", "upload_parts"]
-
 PARTS = ("mission", "fence", "rally")
 
 

@@ -17,8 +17,6 @@ from aerokit.errors import InvalidArgument
 if TYPE_CHECKING:
     import argparse
 
-__all__ = ["add_arguments", "run_monitor"]
-
 END_WITHIN_S = 3.0
 """After a signal: whatever Textual does, the process does not stay and hold its port."""
 

@@ -25,31 +25,6 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = [
-    "DONE",
-    "FAILED",
-    "INTERRUPTED",
-    "NOTHING_HEARD",
-    "NOT_INSTALLED",
-    "REFUSED",
-    "TIMED_OUT",
-    "UNREADABLE",
-    "WRONG_ARGUMENTS",
-    "NotInstalled",
-    "add_force",
-    "add_json",
-    "check_new",
-    "describe",
-    "exit_code",
-    "make_new_recording",
-    "need",
-    "printable",
-    "remove_if_empty",
-    "tell",
-    "tell_done",
-    "tell_error",
-]
-
 
 def add_json(command: argparse._ActionsContainer) -> None:
     """Add ``--json``."""

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     Purpose = Literal["mission", "hold", "land", "return", "take_off", "setpoint"]
 
-__all__ = ["ON_INTERRUPT", "FlightReport", "OwnFlight"]
-
 ON_INTERRUPT: dict[str, str] = {
     "return": "returning to launch",
     "land": "landing here",

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["add_arguments"]
-
-
 FORMATS = ("missionplanner", "mavproxy", "qgroundcontrol")
 
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.transport.link import Peer
 
-__all__ = ["add_arguments", "run_record"]
-
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """The arguments of the command."""

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-__all__ = ["add_arguments"]
-
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """The arguments of the command."""

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.apps.serve import ServeApp
     from aerokit.connection.connection import Connection
 
-__all__ = ["add_arguments", "config_of"]
-
 LOOPBACK = "127.0.0.1"
 
 

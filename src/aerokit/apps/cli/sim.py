@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
     from aerokit.sim.track import Track
 
-__all__ = ["add_arguments", "run_sim", "simulated_fleet", "simulated_vehicle"]
-
 
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """A vehicle of a kind of `aerokit.sim.kinds`, just switched on; ``options`` are its class's.

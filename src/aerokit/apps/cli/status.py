@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.equipment import Battery, GpsReceiver
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["about_vehicle", "add_arguments", "component_line", "link_line", "run_status", "vehicle_lines"]
-
 UNKNOWN = "not told"
 
 NO_KEY = "; its frames are signed and no key was given (--signing-key FILE): it may not listen to us"

@@ -19,16 +19,6 @@ if TYPE_CHECKING:
 
     from aerokit.protocols.exchange import OnProgress, Progress
 
-__all__ = [
-    "Interruptible",
-    "agrees",
-    "file_size",
-    "is_somebody_there",
-    "on_interrupt",
-    "progress_bar",
-    "waiting",
-]
-
 
 def is_somebody_there() -> bool:
     """Whether questions can be asked at all."""

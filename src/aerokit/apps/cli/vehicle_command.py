@@ -25,24 +25,6 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = [
-    "ADDRESS_VARIABLE",
-    "CONNECT_TIMEOUT_S",
-    "ENVIRONMENT",
-    "add_action",
-    "add_place",
-    "add_signing_key",
-    "add_vehicle",
-    "agreed",
-    "check_alone",
-    "connected",
-    "default_address",
-    "key_file",
-    "reached",
-    "signing_of",
-    "vehicle_arguments",
-]
-
 LISTEN_S = 1.5
 """HEARTBEAT comes once a second."""
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["FoxgloveBridge", "foxglove_bridge"]
-
 HIGHEST_RATE_HZ = 100.0
 WAITING_MESSAGES = 512
 """For one viewer; the SDK then drops the oldest, so a slow one sees the newest and keeps nobody waiting."""

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["ARROWS", "UNKNOWN", "Canvas", "link_line", "missing_text", "row", "state_lines"]
-
 UNKNOWN = "—"
 
 OLD_AFTER_S = SILENT_AFTER_S

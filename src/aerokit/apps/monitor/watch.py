@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["Watch"]
-
 MOST_LINES = 500
 MOST_POINTS = 3000
 NEAREST_POINTS_M = 0.5

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from aerokit.errors import LinkLost, LinkOpenError
     from aerokit.transport.link import Peer
 
-__all__ = ["CONNECT_TIMEOUT_S", "PORTS", "BrokerAddress", "BrokerLink", "parse_broker", "publisher_over"]
-
 CONNECT_TIMEOUT_S = 5.0
 
 MOST_WAITING = 32_768

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.apps.network.broker import BrokerAddress
     from aerokit.apps.network.publisher import Publisher
 
-__all__ = ["mqtt_publisher"]
-
 KEEPALIVE_S = 5
 """The broker is asked for a sign of life so often; without one until the next time the line is lost."""
 LOOK_AFTER_S = 1.0

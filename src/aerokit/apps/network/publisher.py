@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-__all__ = ["Publisher"]
-
 
 class Publisher(ABC):
     """Puts bytes under a name on some network: zenoh, MQTT, or what a program brings a client of."""

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from aerokit.apps.network.publisher import Publisher
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["PUBLISHERS", "VERSION", "Publishing", "publisher_for", "publishing"]
-
 PUBLISHERS: dict[str, Callable[[str], AbstractAsyncContextManager[Publisher]]] = {
     "mqtt": mqtt_publisher,
     "mqtts": mqtt_publisher,

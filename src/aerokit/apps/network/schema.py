@@ -18,8 +18,6 @@ from aerokit.mavlink import enums
 from aerokit.vehicle.state.states import States
 from aerokit.vehicle.state.table import documentation
 
-__all__ = ["document", "rendered"]
-
 _ABOUT = (
     "What aerokit publishes of a vehicle (docs/network.md). Units are in the names of fields. null: not known. A reader"
     " must take fields and states that it does not know, for they are added without another version."

@@ -20,8 +20,6 @@ from aerokit.transport.zenoh.session import NetworkOptions, close_session, open_
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-__all__ = ["found", "zenoh_publisher"]
-
 CLOSE_TIMEOUT_S = 2.0
 
 

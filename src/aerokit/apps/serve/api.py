@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from aerokit.missions import Mission
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["Api", "Operation", "document"]
-
 _ABOUT = """State, missions, parameters and orders of vehicles that speak MAVLink (docs/serve.md of aerokit).
 
 Fields have their units in their names; what a vehicle has not told is missing or null, never 0. An order is awaited:

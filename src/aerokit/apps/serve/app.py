@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["ServeApp", "make_app"]
-
 STATIC = Path(__file__).parent / "static"
 KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 

@@ -20,17 +20,6 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = [
-    "MAX_STRANGERS",
-    "PROTOCOL",
-    "REQUEST_TIMEOUT_S",
-    "Guard",
-    "Keys",
-    "check_token",
-    "content_policy",
-    "http_protocol",
-]
-
 PROTOCOL = "aerokit.v1"
 """The WebSocket subprotocol that is spoken."""
 

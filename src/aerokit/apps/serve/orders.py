@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from aerokit.apps.serve.watch import Watch
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["ORDERS", "SET_PARAMETER", "Argument", "Given", "OrderKind", "Orders"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 MOST_RUNNING = 16

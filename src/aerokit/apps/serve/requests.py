@@ -25,17 +25,6 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-__all__ = [
-    "Problem",
-    "body_of",
-    "is_asked",
-    "json_response",
-    "problem_of",
-    "problem_response",
-    "seen_at",
-    "system_id_of",
-]
-
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (InvalidArgument, 400),
     (HeartbeatTimeout, 503),

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.apps.serve.orders import Orders
     from aerokit.apps.serve.watch import Watch
 
-__all__ = ["Stream"]
-
 MOST_SOCKETS = 32
 MOST_VIEWERS = 16
 """Of them, those without the token, where reading is open."""

@@ -20,8 +20,6 @@ from aerokit.vehicle.vehicle import Vehicle, overview
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
 
-__all__ = ["Listener", "Watch"]
-
 Listener = Callable[[dict[str, Any]], object]
 
 MOST_EVENTS = 500

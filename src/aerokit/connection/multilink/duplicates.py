@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from aerokit.connection.multilink.link_choice import Candidate, LinkChoice
     from aerokit.mavlink.frame import Frame
 
-__all__ = ["Copies", "MergedStreams"]
-
 MOST = 4096
 """So many frames are remembered: 10 s of 400 frames a second."""
 

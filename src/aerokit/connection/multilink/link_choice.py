@@ -15,17 +15,6 @@ from aerokit.connection.multilink.vehicle_clock import VehicleClock
 if TYPE_CHECKING:
     from aerokit.connection.components import HardwareId
 
-__all__ = [
-    "PATIENCE_S",
-    "PROOFS",
-    "PROVEN_BY_COPIES",
-    "SILENT_S",
-    "STEADY_S",
-    "UNNAMED_AFTER",
-    "Candidate",
-    "LinkChoice",
-]
-
 SILENT_S = 1.0
 """Of a link over which questions are answered twice a second."""
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.transport.link import Peer
 
-__all__ = ["UNWANTED_HZ", "LinkQuestions"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 ASK_S = 0.5

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
     from aerokit.transport.several import SeveralLinks
 
-__all__ = ["LinkStates", "SeveralRoutes"]
-
 PERIOD_S = 0.95
 """A second, looked at ten times a second."""
 

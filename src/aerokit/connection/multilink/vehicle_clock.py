@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 
-__all__ = ["VehicleClock"]
-
 SAMPLES = 20
 TOLERANCE_S = 0.1
 DRIFT = 0.02

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from aerokit.fleets.policy import FleetResult
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["FlownTrack", "Shows"]
-
 CLOCK_S = 1.0
 """A time since boot that is farther from when it came, by TIMESYNC, is of another clock."""
 

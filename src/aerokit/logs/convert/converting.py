@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.entries import Entry, Log
     from aerokit.protocols.exchange import OnProgress
 
-__all__ = ["FOLDERS", "FORMATS", "LOGS", "Conversion", "convert"]
-
 LOGS: dict[str, type[Log]] = {".tlog": TlogFile, ".bin": BinFile, ".ulg": UlogFile}
 """Suffix of a log → what reads it."""
 

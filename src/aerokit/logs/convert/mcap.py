@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.entries import Entry, Log
 
-__all__ = ["McapFile"]
-
 _MOVES = frozenset(("position", "attitude"))
 
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.entries import Entry, Log
 
-__all__ = ["FLIGHT", "CsvTable", "FlightTable", "MessageTables", "ParquetTable"]
-
 _ROWS = 1 << 15
 _SENDER = (Column("time_utc", "", "time"), Column("system_id", "", "int"), Column("component_id", "", "int"))
 

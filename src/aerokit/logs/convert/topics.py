@@ -22,29 +22,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.condition import StatusText
     from aerokit.vehicle.state.movement import Attitude, Velocity
 
-__all__ = [
-    "FRAME_TRANSFORM",
-    "LOCATION_FIX",
-    "LOG",
-    "MAP_FRAME",
-    "POSE_IN_FRAME",
-    "MapFrame",
-    "Topic",
-    "encoded",
-    "frame_of",
-    "frame_transform",
-    "location_fix",
-    "log_entry",
-    "nanoseconds",
-    "pose_in_frame",
-    "raw_fields",
-    "raw_topic",
-    "raw_topic_name",
-    "state_fields",
-    "state_topic",
-    "vehicle_topic",
-]
-
 MAP_FRAME = "map"
 """The frame of all vehicles: x east, y north, z up, metres; its origin is where the first of them was first heard."""
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.entries import Entry, Log
     from aerokit.position import Position
 
-__all__ = ["GpxFile", "KmlFile", "Waypoint"]
-
 _ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
 _RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
 _TERRAIN = frozenset((MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT))

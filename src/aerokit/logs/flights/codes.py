@@ -8,8 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-__all__ = ["ERRORS", "MODE_REASONS", "readable", "said_by_error"]
-
 MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     1: ("radio control", None, False),
     2: ("ground station", None, False),

@@ -12,8 +12,6 @@ from aerokit._internal import geo
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-__all__ = ["Columns", "Plane"]
-
 _NAN = math.nan
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from aerokit.mavlink.message import Message
 
-__all__ = ["Column", "Entry", "Log", "TlogFile", "unit_suffix"]
-
 _EARLIEST_S = 946_684_800.0
 """The year 2000: what claims to be earlier was written by a clock that was never set."""
 _KINDS = {"float": "float", "double": "float", "uint64_t": "uint"}

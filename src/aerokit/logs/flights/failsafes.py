@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.columns import Columns
     from aerokit.logs.flights.flight import Flight, ModeChange, Said
 
-__all__ = ["KINDS", "Failsafe", "failsafes", "signs_of_texts"]
-
 _TOGETHER_S = 8.0
 """Signs of one kind that follow each other so soon are of one failsafe."""
 _BESIDE_S = 3.0

@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-__all__ = ["Flight", "ModeChange", "ParameterChange", "Said", "Sign", "Waypoint"]
-
-
 _HOME_AFTER_ARMING_S = 2.0
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
-__all__ = ["BinFile", "UlogFile", "close_bin", "opened_bin"]
-
 _MAGIC = b"\xa3\x95"
 
 

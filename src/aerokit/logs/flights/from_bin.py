@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from aerokit.logs.flights.flight import Flight
 
-__all__ = ["read_bin_flight"]
-
 NAN = math.nan
 _CHUNK = 1 << 14
 _NO_PERCENT = 255

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import Flight
     from aerokit.mavlink.message import Message
 
-__all__ = ["read_tlog_flight"]
-
 NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
 _NOWHERE_E7 = 100_000

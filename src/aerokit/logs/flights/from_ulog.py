@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.columns import Columns
     from aerokit.logs.flights.flight import Flight
 
-__all__ = ["read_ulog_flight"]
-
 NAN = math.nan
 _TOPICS = (
     *("vehicle_status", "failsafe_flags", "vehicle_global_position", "vehicle_local_position"),

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from aerokit.protocols.exchange import OnProgress
 
-__all__ = ["LOGS", "check_log_name", "read_flight"]
-
 LOGS: dict[str, Callable[[Flight, int | None, Callable[[int], object]], None]] = {
     ".tlog": read_tlog_flight,
     ".bin": read_bin_flight,

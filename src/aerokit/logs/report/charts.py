@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.columns import Columns
     from aerokit.logs.flights.flight import Flight
 
-__all__ = [
-    "COLOURS",
-    "POINTS",
-    "line",
-    "mode_colours",
-    "over_time",
-    "points",
-    "rows_to_draw",
-    "track_chart",
-    "wanted",
-    "with_margin",
-]
-
 POINTS = 2000
 """So many points of a line are drawn at most."""
 

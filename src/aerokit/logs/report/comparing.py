@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.logs.report.figures import Figures
     from aerokit.logs.report.page import Part
 
-__all__ = ["NAMES", "comparison"]
-
 NAMES = ("A", "B")
 """What the two flights are called in charts and tables."""
 

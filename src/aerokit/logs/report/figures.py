@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.columns import Columns
     from aerokit.logs.flights.flight import Flight
 
-__all__ = [
-    "Figures",
-    "clock",
-    "date",
-    "figures",
-    "length",
-    "metres_from_home",
-    "number",
-    "span",
-    "summary",
-    "time_in_modes",
-]
-
 _STEP_M = 1.0
 """Shorter steps are noise of a vehicle that stands."""
 

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["Chart", "Part", "Section", "Table", "Words", "page"]
-
 
 @dataclass(frozen=True)
 class Words:

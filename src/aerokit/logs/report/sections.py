@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import Flight
     from aerokit.logs.report.page import Part
 
-__all__ = ["SECTIONS", "failsafe_section"]
-
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 _FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
 """GPS_FIX_TYPE, as far as MAVLink, ArduPilot's logs and PX4's have the same numbers."""

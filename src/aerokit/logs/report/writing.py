@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import Flight
     from aerokit.protocols.exchange import OnProgress
 
-__all__ = ["Report", "report_html", "write_report"]
-
 
 class Report(Snapshot):
     """What was written, and the most important of it."""

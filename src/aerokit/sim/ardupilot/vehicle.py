@@ -130,7 +130,7 @@ class ArduPilotVehicle(Host):
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
-        self.frame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
+        self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
         self.missions: MissionServer = MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
@@ -148,7 +148,7 @@ class ArduPilotVehicle(Host):
         self.is_landed: bool = self.motion.is_on_ground
         self.motors: Motors = self.make_motors()
         self.navigation: Navigation = Navigation(self, self.frame)
-        self.arming = self.make_arming()
+        self.arming: ArmingPart = self.make_arming()
         self.accessories: Accessories = Accessories(self)
         self.failsafes: Failsafes = self.FAILSAFES(self)
         self.fence: Fence = self.FENCE(self)

@@ -49,7 +49,7 @@ class SimulatedCamera(CameraBody):
     def listen(self) -> None:
         """Files by MAVFTP, settings by PARAM_EXT."""
         serve_files(self, self.files)
-        self.parameters = CameraParameters(self)
+        self.parameters: CameraParameters = CameraParameters(self)
 
     def commands(self) -> dict[int, CommandHandler]:
         return camera_commands(self)

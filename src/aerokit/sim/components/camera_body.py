@@ -77,7 +77,7 @@ class CameraBody(CameraHost):
         self.shutter_s: float = shutter_s
         self.thermal_celsius: tuple[float, float] | None = thermal_celsius
         self.picture = picture
-        self.capabilities = capabilities | (CameraCapFlags.HAS_VIDEO_STREAM if streams else 0)
+        self.capabilities: int = capabilities | (CameraCapFlags.HAS_VIDEO_STREAM if streams else 0)
         self.capabilities |= CameraCapFlags.HAS_THERMAL_RANGE if thermal_celsius else 0
         self.card: MemoryCard = MemoryCard(capacity_mib)
         self.captures: Captures = Captures(self)

@@ -27,8 +27,6 @@ from aerokit.transport.zenoh.session import (
     payload_of,
 )
 
-__all__ = ["LOST_AFTER_S", "OPEN_TIMEOUT_S", "ZenohConnect"]
-
 OPEN_TIMEOUT_S = 5.0
 """Seconds that `ZenohConnect.open` waits for the vehicle side by default."""
 

@@ -33,19 +33,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-__all__ = [
-    "BEACON_EVERY_S",
-    "FRESH_S",
-    "HELM_KEPT_S",
-    "Ears",
-    "Gate",
-    "Helm",
-    "Judge",
-    "Lateness",
-    "is_read",
-    "refusals_in",
-]
-
 HELM_KEPT_S = 5.0
 """Who has not been heard for so long has the helm no more."""
 

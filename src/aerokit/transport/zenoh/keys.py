@@ -23,8 +23,6 @@ import struct
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 
-__all__ = ["VERSION", "Beacon", "Place", "Stamp", "Told", "Wish", "check_name", "read_sent_at", "sent_at"]
-
 VERSION = 1
 """Of everything here: what bears another one is not listened to."""
 

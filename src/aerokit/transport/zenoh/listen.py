@@ -26,8 +26,6 @@ from aerokit.transport.zenoh.session import (
     payload_of,
 )
 
-__all__ = ["MAX_CLIENTS", "ZenohListen"]
-
 MAX_CLIENTS = 64
 """Further clients are not listened to."""
 

@@ -15,20 +15,6 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.transport.link import BaseLink, needed
 
-__all__ = [
-    "MOST_BYTES",
-    "MOST_WAITING",
-    "Handover",
-    "NetworkLink",
-    "NetworkOptions",
-    "attachment_of",
-    "close_session",
-    "open_session",
-    "opened_in_a_thread",
-    "payload_of",
-    "zenoh_module",
-]
-
 ItemT = TypeVar("ItemT")
 
 MOST_WAITING = 2048

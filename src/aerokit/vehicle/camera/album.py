@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.camera.link import CameraLine
 
-__all__ = ["LONGEST", "Album", "Arrivals"]
-
 LONGEST = 20_000
 """So many captures are kept: the newest."""
 ASKED, ASK_S = 12, 1.0

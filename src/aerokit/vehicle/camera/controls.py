@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.camera.link import CameraLine
 
-__all__ = ["AutoFocus", "LensCalls", "StorageCalls", "TrackingCalls"]
-
 ZOOM, FOCUS = MavCmd.SET_CAMERA_ZOOM, MavCmd.SET_CAMERA_FOCUS
 
 SUBJECTS: dict[int, str] = {ZOOM: "zoom", FOCUS: "focus"}

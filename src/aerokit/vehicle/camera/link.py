@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import Bridge
     from aerokit.vehicle.components.component import Component
 
-__all__ = ["BEHIND", "HEARD_WITHIN_S", "MAYBE_UNKNOWN", "CameraLine", "Questions"]
-
 WANTED_S = 10.0
 """Somebody has looked at a cell: so long its messages are asked for."""
 

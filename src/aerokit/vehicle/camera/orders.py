@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.components.component import Component
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["SENT", "Ordering"]
-
 SENT = 8
 """An order that must not be given twice goes out so often at most, each time because the one before was lost."""
 

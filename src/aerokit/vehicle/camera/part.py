@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.link import CameraLine
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["Begun", "CameraBlock", "CameraPart"]
-
 
 class CameraPart:
     """Some of the calls of a camera. Parts know the line to it, and not each other."""

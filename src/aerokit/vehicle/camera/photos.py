@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.camera.link import CameraLine
 
-__all__ = ["PhotoCalls"]
-
 MOST, MOST_MISSING = 32_767, 3
 MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
 

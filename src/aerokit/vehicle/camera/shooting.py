@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.link import CameraLine
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["PhotoInterval", "Shutter"]
-
 START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
 CONTROL, TRIGGER = MavCmd.DO_DIGICAM_CONTROL, MavCmd.DO_TRIGGER_CONTROL
 TRIGGER_INTERVAL = MavCmd.DO_SET_CAM_TRIGG_INTERVAL

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.camera.link import CameraLine
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["SourceName", "VideoCalls"]
-
 START, STOP = MavCmd.VIDEO_START_CAPTURE, MavCmd.VIDEO_STOP_CAPTURE
 START_S = 5.0
 STATUS_S, STREAMS_S, THERMAL_S = 2.0, 5.0, 1.0

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Subject, Topic
     from aerokit.vehicle.state.telemetry import Telemetry
 
-__all__ = ["FIRST_HEARTBEAT_S", "KNOWN_S", "MODE_GRACE_S", "CommandArbiter", "is_first_told"]
-
 MODE_GRACE_S = 3.0
 """How long HEARTBEAT, at 1 Hz, may lag behind an accepted command that changes the mode."""
 FIRST_HEARTBEAT_S = 1.5

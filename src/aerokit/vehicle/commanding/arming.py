@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["ArmingActions"]
-
 FORCE_REBOOT = 20190226
 SAID_AGAIN_S = 35.0
 """ArduPilot says every 30 s why it would not arm."""

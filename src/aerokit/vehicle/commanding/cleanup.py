@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.sender import OrderSender
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["LATE_S", "Holding", "LateArming", "Leftover"]
-
 logger: logging.Logger = logging.getLogger("aerokit")
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import Talk
     from aerokit.vehicle.state.telemetry import Telemetry
 
-__all__ = ["Bridge", "Part"]
-
 
 class Bridge:
     """The talk with the vehicle, the arbiter of its orders, and what gives orders by them."""

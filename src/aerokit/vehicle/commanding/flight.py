@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["FlightActions", "ModeActions"]
-
 IN_THE_AIR: dict[int | None, str] = {
     MavLandedState.IN_AIR: "in the air",
     MavLandedState.TAKEOFF: "taking off",

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["Health"]
-
 TEXTS_S = 1.0
 """How long texts are collected after the vehicle was asked to run its checks."""
 FRESH_S = 5.0

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["TalkActions", "every_stream"]
-
 EVERY_GROUP = EVERY_COMPONENT = 0
 
 COMES_WITHIN_S = 3.0

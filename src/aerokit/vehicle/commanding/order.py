@@ -18,19 +18,6 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
 
-__all__ = [
-    "ARM_ALONE",
-    "CHANGED_BY_COMMAND",
-    "LOOKING",
-    "OVERRULED",
-    "QUESTIONS",
-    "Order",
-    "SentCommand",
-    "Subject",
-    "Topic",
-    "subjects_of",
-]
-
 Subject = Literal["mode", "motion", "arm"]
 """What an order to the vehicle itself is about."""
 Topic: TypeAlias = Hashable
@@ -149,7 +136,8 @@ class Order:
         minds_mode: bool = True,
         minds_disarming: bool = True,
     ) -> None:
-        self.given_at, self.number = given_at, number
+        self.given_at: float = given_at
+        self.number: int = number
         self.ended_by: tuple[Topic, ...] = tuple(ended_by)
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed

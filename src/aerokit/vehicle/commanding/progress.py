@@ -20,16 +20,6 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.session.session import Talk
 
-__all__ = [
-    "LONGEST_SILENCE_S",
-    "MAX_DISTANCE_M",
-    "OLD_POSITION_S",
-    "Arrivals",
-    "Stillness",
-    "Whereabouts",
-    "await_progress",
-]
-
 TICK_S = 0.25
 """Silence brings no message, so it is looked for this often."""
 

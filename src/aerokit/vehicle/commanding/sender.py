@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["OrderSender"]
-
 FORCE = 21196
 """param2 of COMPONENT_ARM_DISARM: without the checks."""
 TAKEN_BACK = "the vehicle took its acceptance back"

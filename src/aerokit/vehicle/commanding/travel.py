@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["LookActions", "TravelActions"]
-
 POSITION_ONLY = 0x0DF8
 
 RESEND_S = 1.0

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.vehicle.commanding.context import Bridge
 
-__all__ = ["Components"]
-
 DEVICES = (1, 6)
 """Ids of devices that have no component id of their own."""
 TELL_OF_DEVICES = (

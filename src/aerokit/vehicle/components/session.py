@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.commands import CommandSender
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["WEB", "ComponentTalk", "fetch"]
-
 
 class ComponentTalk:
     """The same as the vehicle's talk has for its autopilot, under another component id, and for as long as that."""

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from aerokit.protocols.ftp import FtpMessage
     from aerokit.vehicle.session.transfers import Transfers
 
-__all__ = ["FileChannel", "OpenFile"]
-
 T = TypeVar("T")
 
 REOPENINGS = 3

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import Bridge
 
-__all__ = ["MOST", "Hearing"]
-
 MOST = 32
 """So many gimbals of one vehicle are known; the standard has component ids for seven."""
 OF_GIMBALS = frozenset((154, *range(171, 176)))

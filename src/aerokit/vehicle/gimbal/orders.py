@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import Talk
     from aerokit.vehicle.state.equipment import GimbalAttitude
 
-__all__ = ["CONFIGURE", "LEVEL", "LOCKED", "NAN", "PITCHYAW", "GimbalOrders", "GimbalPart"]
-
 NAN = math.nan
 
 PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.context import Bridge
     from aerokit.vehicle.gimbal.pointing import Wanted
 
-__all__ = ["Looking", "PlaceActions"]
-
 OLD_S = 5.0
 """A place that was told longer ago is none."""
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.gimbal.device import Device
     from aerokit.vehicle.gimbal.orders import GimbalOrders
 
-__all__ = ["Aim", "PointActions", "Rest", "arrive", "direction_to", "straight", "told_often"]
-
 STILL_S, STILL_DEG = 0.4, 0.5
 """What turns by less in so long is taken to stand still: attitudes come five times a second or so."""
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import Talk
     from aerokit.vehicle.session.transfers import Transfers
 
-__all__ = ["PlanContext", "PlanFiles", "PlanMemory"]
-
 FRESH_IDS_S = 2.5
 """MISSION_CURRENT comes at 1 Hz."""
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.session.session import Talk
 
-__all__ = ["MissionEnd", "MissionWatch"]
-
 TWICE_S = 0.3
 """The same item reached again so soon is one message that came twice."""
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from aerokit.protocols.missions import MissionExchange
     from aerokit.vehicle.missions.context import PlanContext
 
-__all__ = ["Plan", "PlanChannel", "PlanTransfer"]
-
 ResultT = TypeVar("ResultT")
 
 SETTLE_S = 0.3

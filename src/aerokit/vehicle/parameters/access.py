@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.store import ParameterCache
     from aerokit.vehicle.session.transfers import Transfers
 
-__all__ = ["CacheChoice", "DownloadMethod", "ParameterAccess", "UploadMethod"]
-
 DownloadMethod = Literal["auto", "ftp", "list"]
 UploadMethod = Literal["auto", "ftp", "set"]
 CacheChoice = bool | str | os.PathLike[str]

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
     from aerokit.vehicle.session.transfers import Transfers
 
-__all__ = ["ParameterCache", "ParameterStore", "default_directory"]
-
 UNDER_WAY_S = 1.0
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import CommandInt, CommandLong
     from aerokit.protocols.command import Standing
 
-__all__ = ["CommandSender"]
-
 UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
 """What firmware says that does not know a command, or not in the form that it had."""
 ROUND_TRIPS = 2

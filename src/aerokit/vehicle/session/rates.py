@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.vehicle.session.commands import CommandSender
 
-__all__ = ["Hearing", "MessageRates"]
-
 WATCH_PERIOD_S = 1.0
 
 WATCH_WINDOW = 5

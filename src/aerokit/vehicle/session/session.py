@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.mavlink.signing import Signing
 
-__all__ = ["Talk", "learn_constants", "set_up_signing"]
-
 SEND_AGAIN_S = 1.0
 """A heartbeat comes each second, and shows whether the key was taken."""
 

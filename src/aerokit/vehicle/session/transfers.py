@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from aerokit.connection.tasks import Background
     from aerokit.protocols.exchange import Exchange
 
-__all__ = ["Talking", "Transfers"]
-
 ResultT = TypeVar("ResultT")
 
 VERSION_TIMEOUT_S = 3.0

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.mavlink.frame import Frame
 
-__all__ = ["LinkWatch", "VehicleWatch"]
-
 REBOOT_STEP_MS = 3000
 """Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
 REBOOT_SEEN_S = 0.2

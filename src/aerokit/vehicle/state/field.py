@@ -21,22 +21,6 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
 
-__all__ = [
-    "I16",
-    "MESSAGE_IDS",
-    "U8",
-    "U16",
-    "By",
-    "Context",
-    "StreamedMessage",
-    "Told",
-    "finite",
-    "member",
-    "message_type",
-    "scaled",
-    "unless",
-]
-
 T = TypeVar("T")
 
 MESSAGE_IDS = {row[0]: message_id for message_id, row in messages.INDEX.items()}

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     from aerokit.connection.cells import StateCell
 
-__all__ = ["DEFAULT_RATES_HZ", "LAZY", "SOURCES", "STATES", "States"]
-
 
 class States:
     """Every cell gives ``.value`` (ValueUnknownError before the first), ``.latest`` (None before), ``.age`` in seconds,

@@ -14,8 +14,6 @@ from aerokit.vehicle.state.field import message_type
 if TYPE_CHECKING:
     from aerokit.vehicle.state.field import Told
 
-__all__ = ["documentation", "rendered"]
-
 HEAD = """# What a vehicle tells
 
 Each is a cell of the vehicle: `vehicle.position.value`, `.latest`, `.age`, `.source`, `.fresh(within=1)`,

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.state.condition import StatusText
 
-__all__ = ["Telemetry"]
-
 BETTER_SOURCE_S = 2.0
 """For so long the second-best source of a value keeps quiet after the best one."""
 MOST_MODE_NAMES = 256

@@ -52,7 +52,8 @@ class PlaneHost(ArduPilotVehicle):
         """The engine runs: from now on it moves, on the ground at first."""
         if self.is_landed:
             self._read_limits()
-            self.is_landed, self._rests_since = False, math.nan
+            self.is_landed: bool = False
+            self._rests_since = math.nan
             self.take_off_yaw = self.wing.yaw
 
 

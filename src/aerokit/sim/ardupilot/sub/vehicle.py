@@ -262,7 +262,7 @@ class SimulatedSub(SubHost):
 
     def reset_controllers(self) -> None:
         """All sticks rest in the middle."""
-        self.display_names = cycle(DISPLAY_VALUES)
+        self.display_names: cycle[str] = cycle(DISPLAY_VALUES)
         for index in range(_STICK_COUNT):
             self.rc[index] = 1500
 
