@@ -7,6 +7,7 @@ from numbers import Real
 from typing import TYPE_CHECKING
 
 from aerokit._internal import geo
+from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Position"]
 
 
+@checks_arguments
 class Position(Snapshot):
     """A place: degrees (WGS 84) and metres; ``Position(47.3977, 8.5456, altitude_relative_m=30)``.
 

@@ -75,7 +75,7 @@ def test_install_makes_every_import_of_programs_work() -> None:
         program,
     )
     assert program["dronekit"] is aerokit.dronekit
-    assert program["connect"] is aerokit.dronekit.vehicle
+    assert program["connect"] is aerokit.dronekit.connect
     assert program["LocationGlobalRelative"] is aerokit.dronekit.LocationGlobalRelative
     assert program["mavutil"].mavlink.MAV_CMD_NAV_WAYPOINT == 16
     assert sys.modules["dronekit.mavlink"] is sys.modules["aerokit.dronekit.mavlink"]

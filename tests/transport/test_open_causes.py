@@ -107,7 +107,7 @@ async def test_a_device_that_vanishes_while_it_is_opened(monkeypatch: pytest.Mon
 PROGRAMS = {
     "sync": "import aerokit.sync\nwith aerokit.sync.connect({address!r}) as vehicle:\n    pass\n",
     "sync connection": "import aerokit.sync\nopened = aerokit.sync.open_connection({address!r})\n",
-    "classic": "import aerokit.dronekit\nvehicle = aerokit.dronekit.vehicle({address!r})\n",
+    "classic": "import aerokit.dronekit\nvehicle = aerokit.dronekit.connect({address!r})\n",
     "async": """
 import asyncio, aerokit
 async def main():
