@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 from for_each import for_each
@@ -124,3 +125,22 @@ def test_a_room_imports_only_from_rooms_below(path: Path) -> None:
         parts = name.split(".")
         if parts[:2] == ["aerokit", "vehicle"] and len(parts) > 2 and parts[2] != own:
             assert height(parts[2]) < height(own), f"vehicle/{own} may not import {name}"
+
+
+def test_no_imports_go_in_circles() -> None:
+    """Types included, and imports inside functions."""
+    trees = {
+        ".".join(("aerokit", *path.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__"): path
+        for path in SOURCE.rglob("*.py")
+    }
+    graph: dict[str, set[str]] = {}
+    for module, path in trees.items():
+        graph[module] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = (f"{node.module}.{alias.name}" for alias in node.names)
+                graph[module] |= {name if name in trees else node.module for name in names}
+            elif isinstance(node, ast.Import):
+                graph[module] |= {alias.name for alias in node.names}
+        graph[module] &= trees.keys() - {module}
+    TopologicalSorter(graph).prepare()
