@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from aerokit.connection.opening import open_connection
 from aerokit.connection.own_heartbeat import OwnHeartbeat
+from aerokit.dronekit.exceptions import APIException
 from aerokit.dronekit.line import Line, OverrideRelease
 from aerokit.dronekit.observers import message_of
 from aerokit.errors import AerokitError, ConnectionClosed, InvalidArgument, LinkOpenError
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.sync.loop_thread import Held
     from aerokit.transport.link import Peer
+
+__all__ = ["APIException", "MAVConnection", "MAVWriter", "mavudpin_multi"]
 
 logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
