@@ -9,7 +9,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import PurePosixPath
 
 from aerokit import Position
-from aerokit._internal.values import plain
+from aerokit._internal.plain import plain
 from aerokit.errors import AerokitError
 from aerokit.mavlink.enums import MavModeFlag, MavState
 from aerokit.mavlink.messages import Heartbeat

@@ -244,7 +244,7 @@ def _check_address(ip: object) -> None:
     try:
         parse_address(ip)
     except InvalidArgument as error:
-        from aerokit.transport.address import AddressError
+        from aerokit.transport.address_error import AddressError
 
         raise AddressError(str(error)) from None
 

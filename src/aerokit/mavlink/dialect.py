@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import IntFlag
 from functools import partial
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import aerokit.mavlink.enums as enums
@@ -21,6 +19,9 @@ from aerokit.mavlink.enumeration import make_enum
 from aerokit.mavlink.message import Message
 
 if TYPE_CHECKING:
+    from pathlib import Path
+    from types import ModuleType
+
     from aerokit.mavlink.frame import Frame
 
 Row = tuple[int, int, int]
@@ -58,7 +59,7 @@ class Dialect:
         """
         from aerokit.mavlink.runtime_dialect import read_xml_dialect
 
-        return Dialect(*read_xml_dialect(Path(path), STANDARD))
+        return Dialect(*read_xml_dialect(path, STANDARD))
 
     @classmethod
     def from_pymavlink(cls, module: str | ModuleType) -> Dialect:

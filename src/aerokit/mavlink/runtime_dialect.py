@@ -41,8 +41,9 @@ class Standard(Protocol):
     def __getitem__(self, message_id: int, /) -> type[Message]: ...
 
 
-def read_xml_dialect(path: Path, standard: Standard) -> Read:
+def read_xml_dialect(path: str | Path, standard: Standard) -> Read:
     """Name, classes and enums of an XML file and of all that it includes; see `Dialect.from_xml`."""
+    path = Path(path)
     dialects = read_dialect(path, [xml_folder()])
     definitions = [message for dialect in dialects for message in dialect.messages]
     return _read(path.stem, definitions, merged_enums(dialects), standard)

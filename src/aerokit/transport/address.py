@@ -6,8 +6,6 @@ import math
 import re
 from typing import Literal, NoReturn
 
-from serial import SerialException
-
 from aerokit._internal.values import Snapshot
 from aerokit._internal.wording import did_you_mean
 from aerokit.errors import InvalidArgument
@@ -387,7 +385,3 @@ def _unquote(text: str) -> str:
 
 def _quote_device(device: str) -> str:
     return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))
-
-
-class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
-    """It names no link. pymavlink takes it for a serial port, so it is an OSError; and it is a ValueError."""

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.async_block import ReadOnly
-from aerokit._internal.values import plain
 from aerokit.mavlink.messages import ParamValue
 from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
@@ -202,7 +201,7 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
             OperationTimeout: it went on as before; the text has what it said.
             BusyError: another vehicle on this connection is just being given a key. Nothing was sent.
         """
-        from aerokit.vehicle.session.session import set_up_signing
+        from aerokit.vehicle.session.signing import set_up_signing
 
         await set_up_signing(self._talk, signing, timeout)
 
@@ -214,8 +213,10 @@ def overview(vehicle: Vehicle) -> dict[str, Any]:
         ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` (``state`` as of
         :class:`aerokit.LinkState`, ``heartbeat_age_s``, and how many frames of the vehicle came and were lost on the
         way, by their numbers) and ``states``: for each state of docs/states.md that the vehicle has told, ``value``
-        (as :func:`aerokit._internal.values.plain` gives it) and ``age_s``, seconds since it was told.
+        (as :func:`aerokit._internal.plain.plain` gives it) and ``age_s``, seconds since it was told.
     """
+    from aerokit._internal.plain import plain
+
     received, lost = vehicle.connection.counts(vehicle.system_id)
     telemetry, link = vehicle.telemetry, vehicle.link_state.latest
     return {

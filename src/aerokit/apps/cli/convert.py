@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit._internal.values import printable
+from aerokit._internal.plain import printable
 from aerokit.apps.cli.output import DONE, add_json, need, tell
 from aerokit.apps.cli.terminal import progress_bar
 

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.values import plain, printable
+from aerokit._internal.plain import plain, printable
 from aerokit.errors import (
     AerokitError,
     FileFormatError,
@@ -41,7 +41,7 @@ def tell(options: argparse.Namespace, kind: str, record: Mapping[str, object], t
     Args:
         options: of the command, which say whether JSON is wanted.
         kind: what it is, ``"parameter"``: the first key of the object, ``{"type": "parameter", …}``.
-        record: its fields as docs/command-line.md lists them; made JSON by :func:`aerokit._internal.values.plain`.
+        record: its fields as docs/command-line.md lists them; made JSON by :func:`aerokit._internal.plain.plain`.
         text: the same for people; None: nothing.
     """
     if options.json:

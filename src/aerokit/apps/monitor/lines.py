@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from aerokit._internal.values import printable
+from aerokit._internal.plain import printable
 from aerokit.events import SILENT_AFTER_S, LinkState
 
 if TYPE_CHECKING:

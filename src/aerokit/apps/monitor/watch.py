@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from aerokit._internal import geo
-from aerokit._internal.values import printable
+from aerokit._internal.plain import printable
 from aerokit._internal.wording import in_words
 from aerokit.events import Event, LinkReport, LoopBlocked, StatusTextReceived
 

@@ -13,7 +13,7 @@ import anyio
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit._internal.values import plain
+from aerokit._internal.plain import plain
 from aerokit.apps.network.mqtt_publisher import mqtt_publisher
 from aerokit.apps.network.zenoh_publisher import zenoh_publisher
 from aerokit.connection.tasks import Background

@@ -103,7 +103,7 @@ def _message(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Of what :func:`aerokit._internal.values.plain` makes of a value of this type."""
+    """Of what :func:`aerokit._internal.plain.plain` makes of a value of this type."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return {"anyOf": [_schema_of(each, values) for each in arguments]}

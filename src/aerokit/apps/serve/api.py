@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from starlette.responses import Response
 
 from aerokit import __version__
-from aerokit._internal.values import plain
+from aerokit._internal.plain import plain
 from aerokit.apps.serve.orders import ORDERS, SET_PARAMETER, Given, OrderKind, Orders
 from aerokit.apps.serve.requests import (
     Problem,

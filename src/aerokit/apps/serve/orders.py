@@ -9,7 +9,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.values import plain
+from aerokit._internal.plain import plain
 from aerokit.apps.serve.requests import Problem, problem_of
 from aerokit.connection.tasks import Background
 from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.values import plain
+from aerokit._internal.plain import plain
 from aerokit.apps.serve.requests import Problem
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import Background

@@ -12,7 +12,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal import geo
-from aerokit._internal.values import Snapshot, plain
+from aerokit._internal.plain import plain
+from aerokit._internal.values import Snapshot
 from aerokit.mavlink.message import SECRET_FIELDS, Message, field_names
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ def raw_fields(message: Message) -> dict[str, Any]:
 
 
 def _plain(value: object) -> Any:
-    """Like `aerokit._internal.values.plain`, and three times as fast for the common field types: a log has millions."""
+    """Like `aerokit._internal.plain.plain`, and three times as fast for the common field types: a log has millions."""
     kind = type(value)
     if kind is int or kind is str or value is None:
         return value
