@@ -111,6 +111,18 @@ def test_an_effect_is_a_change_to_it() -> None:
     assert (end_of(arm), end_of(again)) == (TOLD, "")
 
 
+def test_posted_mode_told_already_leaves_the_late_one_of_the_order_before() -> None:
+    """In GUIDED, LOITER and GUIDED are posted: LOITER is told late, and GUIDED is still to be sent again."""
+    stage = Stage(GUIDED, True)
+    stage.post("mode", "motion", mode=LOITER)
+    again = stage.post("mode", "motion", mode=GUIDED)
+    stage.tell(GUIDED, True)
+    stage.tell(LOITER, True)
+    assert end_of(again) == ""
+    stage.tell(GUIDED, True)
+    assert end_of(again) == TOLD
+
+
 def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
     stage = Stage(GUIDED, True)
     motion, disarm = stage.post("motion"), stage.post("arm", armed=False)

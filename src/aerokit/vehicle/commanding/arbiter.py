@@ -198,6 +198,7 @@ class CommandArbiter:
             ends_flight=self._end_flights(modes) or armed is False,
             minds_mode=armed is not False,
             minds_disarming=subjects[0] == "motion",
+            settles_by_change=True,
         )
         self._register(order, (*subjects, STEERING) if is_steering else subjects)
         self._ordered_since_disarmed.update(subjects)

@@ -114,7 +114,8 @@ class Order:
     ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
     that may still be told because the program had ordered them just before, and until ``settles_at`` in any order;
     until ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a
-    pilot's or a failsafe's doing.
+    pilot's or a failsafe's doing. ``settles_by_change``: being in one of its modes already does not say that the
+    expected ones are over, only a change to it does.
     """
 
     def __init__(
@@ -135,6 +136,7 @@ class Order:
         ends_flight: bool = False,
         minds_mode: bool = True,
         minds_disarming: bool = True,
+        settles_by_change: bool = False,
     ) -> None:
         self.given_at: float = given_at
         self.number: int = number
@@ -174,6 +176,7 @@ class Order:
         self._minds_mode, self._minds_disarming = minds_mode, minds_disarming
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
+        self._settles_by_change = settles_by_change
 
     @property
     def is_newest(self) -> bool:
@@ -219,7 +222,8 @@ class Order:
         is_change = self._mode_now is not None and number != self._mode_now
         self.has_worked = self.has_worked or (is_change and number in self._own)
         if number in self._own:
-            self._allowed -= self._allowed if at >= self._settles_at else self._before
+            if is_change or not self._settles_by_change:
+                self._allowed -= self._allowed if at >= self._settles_at else self._before
         elif number in self._late & self._allowed and at >= self._settles_at:
             self._allowed -= self._before
         elif not self._is_mode_known or at < self._any_until:
