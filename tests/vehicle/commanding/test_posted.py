@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import anyio
 import pytest
-from flight_harness import Flight, in_the_air, now
+from flight_harness import Flight, in_the_air, now, open_flight
 
 from aerokit import messages as m
 from aerokit.autopilots import Mode, autopilot_for
@@ -427,6 +427,38 @@ async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(g
         await order.command(ARM, 1)
     await anyio.sleep(5)
     assert vehicle.is_armed
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("is_posted", [True, False])
+async def test_disarm_before_armed_is_told_leaves_a_pilots_arming(is_posted: bool) -> None:
+    """Armed, then disarmed, is told after the order to disarm; its answer is lost, and a pilot arms."""
+    async with open_flight(latency_s=0.3) as flight:
+        vehicle, armed = flight.vehicle, flight.vehicle.telemetry.armed
+        await vehicle.wait_ready()
+        await vehicle.set_mode("STABILIZE")
+        told_at = armed.updated_at
+        await armed.wait_until(lambda _: armed.updated_at > told_at)
+        flight.copter.faults.lose_ack(ARM, times=2)
+        with anyio.move_on_after(0.55):
+            await vehicle.arm()
+        assert armed.latest is False
+
+        async def disarm() -> None:
+            if is_posted:
+                with vehicle.posted("arm", armed=False) as order:
+                    await order.command(ARM, 0)
+            else:
+                await vehicle.disarm()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(disarm)
+            await armed.wait_until(lambda value: value)
+            await armed.wait_until(lambda value: not value)
+            flight.copter.arming.arm()
+            await anyio.sleep(5)
+        assert [each.param1 for each in flight.wire.commands(ARM)] == [1, 0]
+        assert vehicle.is_armed
 
 
 @pytest.mark.anyio

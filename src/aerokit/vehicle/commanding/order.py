@@ -262,8 +262,8 @@ class Order:
 class SentCommand:
     """One command of an order, from its first sending on: whether it may be sent again.
 
-    It may while what was heard since speaks neither of its effect nor of somebody else's doing. ``modes`` and
-    ``armed`` are effects that HEARTBEAT tells, if they are not there already; ``is_done`` tells any other one.
+    It may while what was heard since speaks neither of its effect nor of somebody else's doing. A change to one of
+    ``modes``, or to ``armed``, is an effect that HEARTBEAT tells; ``is_done`` tells any other one.
     """
 
     def __init__(
@@ -280,9 +280,9 @@ class SentCommand:
         self.told_at: float = -math.inf
         """When HEARTBEAT came last."""
         self._was_told = False
-        is_there = None if mode_now is None else mode_now.custom_mode
-        self._modes = {mode.custom_mode for mode in modes} - {is_there}
-        self._armed = None if armed is armed_now else armed
+        self._mode_now = None if mode_now is None else mode_now.custom_mode
+        self._modes = {mode.custom_mode for mode in modes}
+        self._armed_now = armed_now
         self.arms = armed
         """Whether it arms, or disarms; None: neither."""
         self._is_overruled = False
@@ -308,9 +308,11 @@ class SentCommand:
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""
-        self._was_told = self._was_told or mode.custom_mode in self._modes
+        before, self._mode_now = self._mode_now, mode.custom_mode
+        self._was_told = self._was_told or (self._mode_now != before and self._mode_now in self._modes)
 
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
-        self._was_told = self._was_told or (self._armed is not None and armed is self._armed)
+        before, self._armed_now = self._armed_now, armed
+        self._was_told = self._was_told or (armed is not before and armed is self.arms)
         self.told_at = at
