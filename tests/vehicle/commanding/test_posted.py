@@ -13,6 +13,7 @@ from flight_harness import Flight, in_the_air, now, open_flight
 from aerokit import messages as m
 from aerokit.autopilots import Mode, autopilot_for
 from aerokit.connection.cells import Source, StateCell
+from aerokit.dronekit.flight_orders import change_armed
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -459,6 +460,20 @@ async def test_disarm_before_armed_is_told_leaves_a_pilots_arming(is_posted: boo
             await anyio.sleep(5)
         assert [each.param1 for each in flight.wire.commands(ARM)] == [1, 0]
         assert vehicle.is_armed
+
+
+@pytest.mark.anyio
+async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(ARM)
+    async with anyio.create_task_group() as tasks:
+
+        async def arm() -> None:
+            with pytest.raises(OperationRejected, match=r"the mode changed to .*it may still be carried out"):
+                await change_armed(grounded.vehicle, True)
+
+        tasks.start_soon(arm)
+        await anyio.sleep(0.5)
+        grounded.pilot_takes_over()
 
 
 @pytest.mark.anyio
