@@ -454,3 +454,16 @@ def test_posted_mode_after_an_order_is_the_programs_own() -> None:
     assert not order.has_lost_mode
     stage.tell(LOITER)
     assert order.has_lost_mode
+
+
+# -------------------------------------------------------------------------------- of devices
+
+
+def test_device_order_withdrawn_is_not_the_newest() -> None:
+    """The one before counts again, and only that one."""
+    arbiter = Stage().arbiter
+    first = arbiter.of_device("video", may_be_withdrawn=True)
+    second = arbiter.of_device("video", may_be_withdrawn=True)
+    assert (first.is_newest, second.is_newest) == (False, True)
+    second.withdraw()
+    assert (first.is_newest, second.is_newest) == (True, False)

@@ -83,8 +83,8 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
-        newer = (self.latest(topic) for topic in order.ended_by)
-        return all(each is None or each.number <= order.number for each in newer)
+        newest = (self.latest(topic) for topic in order.ended_by)
+        return not order.is_withdrawn and all(each is None or each.number <= order.number for each in newest)
 
     def _register(self, order: Order, topics: Iterable[Topic]) -> Order:
         for topic in topics:
