@@ -241,6 +241,14 @@ def test_a_mode_is_in_doubt_until_the_answer_is_known(
     assert helm.mode_settles_at == settles_at
 
 
+def test_refused_mode_leaves_the_doubt_about_the_one_before() -> None:
+    arbiter = Stage().arbiter
+    arbiter.doubt_mode()
+    with pytest.raises(CommandRejected), arbiter.changing_mode():
+        raise CommandRejected("no", command=176, result=4)
+    assert arbiter.mode_is_in_doubt
+
+
 def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
     for later, known in ((KNOWN_S, True), (0.1, False)):

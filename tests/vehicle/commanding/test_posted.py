@@ -477,6 +477,24 @@ async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flig
 
 
 @pytest.mark.anyio
+async def test_turning_after_a_given_up_and_a_refused_mode_goes_back_to_guided() -> None:
+    """RTL is in force and not told, LAND is refused: GUIDED as it was told last is no reason to leave it out."""
+    async with in_the_air(latency_s=0.1) as flight:
+        vehicle, faults, armed = flight.vehicle, flight.copter.faults, flight.vehicle.telemetry.armed
+        told_at = armed.updated_at
+        await armed.wait_until(lambda _: armed.updated_at > told_at)
+        faults.lose(m.Heartbeat, times=1)
+        with anyio.move_on_after(0.05):
+            await vehicle.set_mode("RTL")
+        await anyio.sleep(0.1)
+        faults.refuse(SET_MODE, times=1)
+        with pytest.raises(CommandRejected):
+            await vehicle.set_mode("LAND")
+        await vehicle.set_heading((vehicle.heading_deg.value + 90) % 360)
+        assert flight.wire.mode_orders() == [CopterMode.RTL, CopterMode.LAND, CopterMode.GUIDED]
+
+
+@pytest.mark.anyio
 async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(grounded: Flight) -> None:
     vehicle, wire, faults = grounded.vehicle, grounded.wire, grounded.copter.faults
     guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))

@@ -297,12 +297,15 @@ class CommandArbiter:
 
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
-        """Until the vehicle's answer is known, which it is not when this is cancelled or times out, trust no mode."""
-        self.mode_is_in_doubt = True
+        """Until the vehicle's answer is known, which it is not when this is cancelled or times out, trust no mode.
+
+        A refusal leaves the doubt about an order before: that one may still come into force.
+        """
+        was_in_doubt, self.mode_is_in_doubt = self.mode_is_in_doubt, True
         try:
             yield
         except CommandRejected:
-            self.mode_is_in_doubt = False
+            self.mode_is_in_doubt = was_in_doubt
             raise
         except BaseException:
             self.doubt_mode()
