@@ -15,7 +15,7 @@ from aerokit.autopilots import autopilot_for
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, Mode
 from aerokit.dronekit.core import VehicleCore
 from aerokit.dronekit.exceptions import APIException
-from aerokit.errors import CommandRejected, InvalidArgument, OperationTimeout
+from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     MavAutopilot,
@@ -94,7 +94,9 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
         with vehicle.posted(*subjects, armed=value) as order:
             await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
             await order.until_told(ARMED_IS_TOLD_S)
-    except OperationTimeout as error:
+    except CommandRejected:
+        raise
+    except (OperationRejected, OperationTimeout) as error:
         error.args = (f"{error}; it may still be carried out, and nobody watches for that",)
         raise
 

@@ -241,6 +241,14 @@ def test_a_mode_is_in_doubt_until_the_answer_is_known(
     assert helm.mode_settles_at == settles_at
 
 
+def test_refused_mode_leaves_the_doubt_about_the_one_before() -> None:
+    arbiter = Stage().arbiter
+    arbiter.doubt_mode()
+    with pytest.raises(CommandRejected), arbiter.changing_mode():
+        raise CommandRejected("no", command=176, result=4)
+    assert arbiter.mode_is_in_doubt
+
+
 def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
     for later, known in ((KNOWN_S, True), (0.1, False)):
@@ -454,3 +462,16 @@ def test_posted_mode_after_an_order_is_the_programs_own() -> None:
     assert not order.has_lost_mode
     stage.tell(LOITER)
     assert order.has_lost_mode
+
+
+# -------------------------------------------------------------------------------- of devices
+
+
+def test_device_order_withdrawn_is_not_the_newest() -> None:
+    """The one before counts again, and only that one."""
+    arbiter = Stage().arbiter
+    first = arbiter.of_device("video", may_be_withdrawn=True)
+    second = arbiter.of_device("video", may_be_withdrawn=True)
+    assert (first.is_newest, second.is_newest) == (False, True)
+    second.withdraw()
+    assert (first.is_newest, second.is_newest) == (True, False)

@@ -8,11 +8,12 @@ from typing import Any, cast
 
 import anyio
 import pytest
-from flight_harness import Flight, in_the_air, now
+from flight_harness import Flight, in_the_air, now, open_flight
 
 from aerokit import messages as m
 from aerokit.autopilots import Mode, autopilot_for
 from aerokit.connection.cells import Source, StateCell
+from aerokit.dronekit.flight_orders import change_armed
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -109,6 +110,18 @@ def test_an_effect_is_a_change_to_it() -> None:
     again = stage.post("arm", armed=True)
     stage.tell(STABILIZE, True)
     assert (end_of(arm), end_of(again)) == (TOLD, "")
+
+
+def test_posted_mode_told_already_leaves_the_late_one_of_the_order_before() -> None:
+    """In GUIDED, LOITER and GUIDED are posted: LOITER is told late, and GUIDED is still to be sent again."""
+    stage = Stage(GUIDED, True)
+    stage.post("mode", "motion", mode=LOITER)
+    again = stage.post("mode", "motion", mode=GUIDED)
+    stage.tell(GUIDED, True)
+    stage.tell(LOITER, True)
+    assert end_of(again) == ""
+    stage.tell(GUIDED, True)
+    assert end_of(again) == TOLD
 
 
 def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
@@ -415,6 +428,70 @@ async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(g
         await order.command(ARM, 1)
     await anyio.sleep(5)
     assert vehicle.is_armed
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("is_posted", [True, False])
+async def test_disarm_before_armed_is_told_leaves_a_pilots_arming(is_posted: bool) -> None:
+    """Armed, then disarmed, is told after the order to disarm; its answer is lost, and a pilot arms."""
+    async with open_flight(latency_s=0.3) as flight:
+        vehicle, armed = flight.vehicle, flight.vehicle.telemetry.armed
+        await vehicle.wait_ready()
+        await vehicle.set_mode("STABILIZE")
+        told_at = armed.updated_at
+        await armed.wait_until(lambda _: armed.updated_at > told_at)
+        flight.copter.faults.lose_ack(ARM, times=2)
+        with anyio.move_on_after(0.55):
+            await vehicle.arm()
+        assert armed.latest is False
+
+        async def disarm() -> None:
+            if is_posted:
+                with vehicle.posted("arm", armed=False) as order:
+                    await order.command(ARM, 0)
+            else:
+                await vehicle.disarm()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(disarm)
+            await armed.wait_until(lambda value: value)
+            await armed.wait_until(lambda value: not value)
+            flight.copter.arming.arm()
+            await anyio.sleep(5)
+        assert [each.param1 for each in flight.wire.commands(ARM)] == [1, 0]
+        assert vehicle.is_armed
+
+
+@pytest.mark.anyio
+async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flight) -> None:
+    grounded.copter.faults.ignore(ARM)
+    async with anyio.create_task_group() as tasks:
+
+        async def arm() -> None:
+            with pytest.raises(OperationRejected, match=r"the mode changed to .*it may still be carried out"):
+                await change_armed(grounded.vehicle, True)
+
+        tasks.start_soon(arm)
+        await anyio.sleep(0.5)
+        grounded.pilot_takes_over()
+
+
+@pytest.mark.anyio
+async def test_turning_after_a_given_up_and_a_refused_mode_goes_back_to_guided() -> None:
+    """RTL is in force and not told, LAND is refused: GUIDED as it was told last is no reason to leave it out."""
+    async with in_the_air(latency_s=0.1) as flight:
+        vehicle, faults, armed = flight.vehicle, flight.copter.faults, flight.vehicle.telemetry.armed
+        told_at = armed.updated_at
+        await armed.wait_until(lambda _: armed.updated_at > told_at)
+        faults.lose(m.Heartbeat, times=1)
+        with anyio.move_on_after(0.05):
+            await vehicle.set_mode("RTL")
+        await anyio.sleep(0.1)
+        faults.refuse(SET_MODE, times=1)
+        with pytest.raises(CommandRejected):
+            await vehicle.set_mode("LAND")
+        await vehicle.set_heading((vehicle.heading_deg.value + 90) % 360)
+        assert flight.wire.mode_orders() == [CopterMode.RTL, CopterMode.LAND, CopterMode.GUIDED]
 
 
 @pytest.mark.anyio

@@ -83,8 +83,8 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
-        newer = (self.latest(topic) for topic in order.ended_by)
-        return all(each is None or each.number <= order.number for each in newer)
+        newest = (self.latest(topic) for topic in order.ended_by)
+        return not order.is_withdrawn and all(each is None or each.number <= order.number for each in newest)
 
     def _register(self, order: Order, topics: Iterable[Topic]) -> Order:
         for topic in topics:
@@ -198,6 +198,7 @@ class CommandArbiter:
             ends_flight=self._end_flights(modes) or armed is False,
             minds_mode=armed is not False,
             minds_disarming=subjects[0] == "motion",
+            settles_by_change=True,
         )
         self._register(order, (*subjects, STEERING) if is_steering else subjects)
         self._ordered_since_disarmed.update(subjects)
@@ -296,12 +297,15 @@ class CommandArbiter:
 
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
-        """Until the vehicle's answer is known, which it is not when this is cancelled or times out, trust no mode."""
-        self.mode_is_in_doubt = True
+        """Until the vehicle's answer is known, which it is not when this is cancelled or times out, trust no mode.
+
+        A refusal leaves the doubt about an order before: that one may still come into force.
+        """
+        was_in_doubt, self.mode_is_in_doubt = self.mode_is_in_doubt, True
         try:
             yield
         except CommandRejected:
-            self.mode_is_in_doubt = False
+            self.mode_is_in_doubt = was_in_doubt
             raise
         except BaseException:
             self.doubt_mode()

@@ -114,7 +114,8 @@ class Order:
     ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
     that may still be told because the program had ordered them just before, and until ``settles_at`` in any order;
     until ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a
-    pilot's or a failsafe's doing.
+    pilot's or a failsafe's doing. ``settles_by_change``: being in one of its modes already does not say that the
+    expected ones are over, only a change to it does.
     """
 
     def __init__(
@@ -135,6 +136,7 @@ class Order:
         ends_flight: bool = False,
         minds_mode: bool = True,
         minds_disarming: bool = True,
+        settles_by_change: bool = False,
     ) -> None:
         self.given_at: float = given_at
         self.number: int = number
@@ -174,6 +176,7 @@ class Order:
         self._minds_mode, self._minds_disarming = minds_mode, minds_disarming
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
+        self._settles_by_change = settles_by_change
 
     @property
     def is_newest(self) -> bool:
@@ -219,7 +222,8 @@ class Order:
         is_change = self._mode_now is not None and number != self._mode_now
         self.has_worked = self.has_worked or (is_change and number in self._own)
         if number in self._own:
-            self._allowed -= self._allowed if at >= self._settles_at else self._before
+            if is_change or not self._settles_by_change:
+                self._allowed -= self._allowed if at >= self._settles_at else self._before
         elif number in self._late & self._allowed and at >= self._settles_at:
             self._allowed -= self._before
         elif not self._is_mode_known or at < self._any_until:
@@ -258,8 +262,8 @@ class Order:
 class SentCommand:
     """One command of an order, from its first sending on: whether it may be sent again.
 
-    It may while what was heard since speaks neither of its effect nor of somebody else's doing. ``modes`` and
-    ``armed`` are effects that HEARTBEAT tells, if they are not there already; ``is_done`` tells any other one.
+    It may while what was heard since speaks neither of its effect nor of somebody else's doing. A change to one of
+    ``modes``, or to ``armed``, is an effect that HEARTBEAT tells; ``is_done`` tells any other one.
     """
 
     def __init__(
@@ -276,9 +280,9 @@ class SentCommand:
         self.told_at: float = -math.inf
         """When HEARTBEAT came last."""
         self._was_told = False
-        is_there = None if mode_now is None else mode_now.custom_mode
-        self._modes = {mode.custom_mode for mode in modes} - {is_there}
-        self._armed = None if armed is armed_now else armed
+        self._mode_now = None if mode_now is None else mode_now.custom_mode
+        self._modes = {mode.custom_mode for mode in modes}
+        self._armed_now = armed_now
         self.arms = armed
         """Whether it arms, or disarms; None: neither."""
         self._is_overruled = False
@@ -304,9 +308,11 @@ class SentCommand:
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode."""
-        self._was_told = self._was_told or mode.custom_mode in self._modes
+        before, self._mode_now = self._mode_now, mode.custom_mode
+        self._was_told = self._was_told or (self._mode_now != before and self._mode_now in self._modes)
 
     def note_armed(self, armed: bool, at: float) -> None:
         """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
-        self._was_told = self._was_told or (self._armed is not None and armed is self._armed)
+        before, self._armed_now = self._armed_now, armed
+        self._was_told = self._was_told or (armed is not before and armed is self.arms)
         self.told_at = at
