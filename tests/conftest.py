@@ -46,8 +46,8 @@ def what_was_there_before_is_no_garbage(hypothesis_has_begun: None) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are processors: many tests wait for sockets and other processes."""
-    return 1 + (os.cpu_count() or 1)
+    """Twice the number of processors: many tests wait for sockets and other processes."""
+    return 2 * (os.cpu_count() or 1)
 
 
 def pytest_report_header() -> str:
