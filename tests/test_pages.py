@@ -9,8 +9,15 @@ import pytest
 from for_each import for_each
 
 LANGUAGES = {"python", "sh", "text", "json", "json5", "yaml", "toml", "ini", "xml", "powershell", "mermaid"}
+READ_FIRST = ("README.md", "docs/tutorial.md", "docs/how-to/")
 CHAINS = [
-    pytest.param(chain, id=f"{chain[0].page.relative_to(pages.ROOT)}:{chain[0].line}".replace("/", "-"))
+    pytest.param(
+        chain,
+        id=f"{chain[0].page.relative_to(pages.ROOT)}:{chain[0].line}".replace("/", "-"),
+        marks=[]
+        if page.relative_to(pages.ROOT).as_posix().startswith(READ_FIRST)
+        else pytest.mark.exhaustive,
+    )
     for page in pages.pages()
     for chain in pages.chains(page)
 ]

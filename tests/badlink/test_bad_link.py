@@ -48,7 +48,7 @@ def test_a_transfer_ends_with_exact_content_and_leaves_nothing(case: Case, loss:
         assert verdict.error is None
 
 
-@pytest.mark.parametrize("case", sampled(CASES, 6), ids=lambda case: case.name.replace(" ", "-"))
+@pytest.mark.parametrize("case", sampled(CASES, 12), ids=lambda case: case.name.replace(" ", "-"))
 def test_it_takes_at_most_twice_the_ideal_at_5_and_four_times_at_20_percent(case: Case) -> None:
     for loss, most in ((0.05, 2.0), (0.2, 4.0)):
         radio = NARROW.with_loss(loss)

@@ -211,6 +211,7 @@ def test_each_kind_of_listener_keeps_it_when_the_other_is_removed(address: str, 
         assert told.wait(LIMIT_S)
 
 
+@pytest.mark.exhaustive
 def test_a_listener_to_a_parameter_keeps_it(address: str) -> None:
     told = threading.Event()
     vehicle = dronekit.connect(address, wait_ready=["parameters"])

@@ -159,6 +159,7 @@ def test_demo_on_its_own_vehicle(
     assert sum(1 for _ in read_tlog(record)) > 100
 
 
+@pytest.mark.exhaustive
 def test_demo_that_is_refused_says_why(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.refuse(400, text="Arm: Motors not spinning freely")
@@ -220,6 +221,7 @@ def test_a_pilot_who_takes_over_keeps_the_vehicle(mode: str, tmp_path: Path) -> 
         assert pilot.is_armed
 
 
+@pytest.mark.exhaustive
 def test_demo_leaves_a_vehicle_that_flies_already_alone(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -11,7 +11,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from exhaustive import exhaustive
 from served_copter import served
 
 from aerokit.sim import SimulatedCopter
@@ -74,7 +73,8 @@ def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are stopped by signals")
-@pytest.mark.parametrize("cases", [CASES[:1], exhaustive(CASES[1:])], ids=["one", "others"])
+@pytest.mark.exhaustive  # twenty seconds of real time
+@pytest.mark.parametrize("cases", [CASES[:1], CASES[1:]], ids=["one", "others"])
 def test_stopped_program_leaves_the_failsafe_alone(cases: list[tuple[str, str]]) -> None:
     """All of them at once, since they wait for the failsafe most of the time."""
     with ThreadPoolExecutor(len(cases)) as pool:
