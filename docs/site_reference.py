@@ -111,7 +111,11 @@ def _index() -> str:
     rows = [(room.page, room.title, room.about) for room in ROOMS]
     rows += [(page, TITLES[page], about) for page, about in MADE.items()]
     table = "".join(f"| [{title}]({page}.md) | {about} |\n" for page, title, about in rows)
-    return f"# Reference\n\nEvery public name, with all that it inherits.\n\n| | |\n|---|---|\n{table}"
+    text = (
+        "Every public name, with all that it inherits. Import from the packages that these pages name; a module"
+        " that stands on none of them is internal and may change with any version."
+    )
+    return f"# Reference\n\n{text}\n\n| | |\n|---|---|\n{table}"
 
 
 def _page(room: Room, at: dict[str, Room]) -> str:
