@@ -78,7 +78,7 @@ def test_each_call_of_the_twin_is_in_the_table() -> None:
     assert [name for name in calls if name not in set(blocking_names())] == []
 
 
-@pytest.mark.parametrize("name", sampled(blocking_calls(), 8))
+@pytest.mark.parametrize("name", sampled(blocking_calls(), 14))
 def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch: pytest.MonkeyPatch) -> None:
     blocking, stage = stages
     call = CALLS.get(name, Call(cast(Any, blocking_calls()[name])))

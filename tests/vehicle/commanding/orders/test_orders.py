@@ -39,7 +39,7 @@ FEW_ROWS = [
     for marks in [() if each == row.on[place % len(row.on)] else pytest.mark.exhaustive]
 ]
 """Each row on one autopilot by default, on either in turn."""
-OVER_TWO, SEEDS_OVER_TWO = (EVERY_ROW, SEEDS) if IS_SESSION else (sampled(EVERY_ROW[::6], 2), 1)
+OVER_TWO, SEEDS_OVER_TWO = (EVERY_ROW, SEEDS) if IS_SESSION else (sampled(EVERY_ROW[::6], 4), 1)
 """Few of them in the tests, all of them in the session."""
 
 
