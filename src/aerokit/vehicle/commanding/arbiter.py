@@ -6,7 +6,7 @@ import itertools
 import math
 from collections import deque
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import CommandRejected, OperationRejected
 from aerokit.vehicle.commanding.order import OVERRULED, Order, SentCommand
@@ -86,10 +86,8 @@ class CommandArbiter:
         newest = (self.latest(topic) for topic in order.ended_by)
         return not order.is_withdrawn and all(each is None or each.number <= order.number for each in newest)
 
-    def _register(self, order: Order, topics: Iterable[Topic]) -> Order:
-        for topic in topics:
-            self._latest[topic] = order
-        return order
+    def _register(self, order: Order, topics: Iterable[Topic]) -> None:
+        self._latest.update(dict.fromkeys(topics, order))
 
     def overrule(self, topics: Iterable[Topic]) -> None:
         """A newer order about these is given, which nobody waits for: what was posted about them ends."""
@@ -184,17 +182,11 @@ class CommandArbiter:
         now = self._now()
         recent = {mode for at, mode in self._modes_ordered if at > now - OWN_MODES_S}
         self._modes_ordered.extend((now, mode.custom_mode) for mode in modes)
-        order = Order(
-            now,
-            next(self._numbers),
-            self._is_newest,
-            ended_by=subjects[:1],
-            modes=modes,
+        order = self._new(
+            modes,
+            subjects[:1],
+            recent,
             armed=armed,
-            mode_before=self._telemetry.mode.latest,
-            expected=recent,
-            armed_before=self._telemetry.armed.latest,
-            state_before=self._telemetry.system_status.latest,
             ends_flight=self._end_flights(modes) or armed is False,
             minds_mode=armed is not False,
             minds_disarming=subjects[0] == "motion",
@@ -326,19 +318,30 @@ class CommandArbiter:
         is_under_way = before is not None and mode is not None and before.is_own(mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
         expected = before.modes if is_unsettled and before is not None else ()
+        return self._new(
+            modes,
+            ended_by,
+            {each.custom_mode for each in (*expected, *self._posted_modes())},
+            settles_at=self.mode_settles_at,
+            any_until=self._any_mode_until,
+            ends_flight=ends_flight,
+        )
+
+    def _new(
+        self, modes: Collection[Mode], ended_by: Sequence[Topic], expected: Collection[int], **rules: Any
+    ) -> Order:
+        """An order that judges what is told from now on."""
         return Order(
             self._now(),
             next(self._numbers),
             self._is_newest,
             ended_by=ended_by,
             modes=modes,
-            mode_before=mode,
-            expected={each.custom_mode for each in (*expected, *self._posted_modes())},
+            mode_before=self._telemetry.mode.latest,
+            expected=expected,
             armed_before=self._telemetry.armed.latest,
             state_before=self._telemetry.system_status.latest,
-            settles_at=self.mode_settles_at,
-            any_until=self._any_mode_until,
-            ends_flight=ends_flight,
+            **rules,
         )
 
     def _end_flights(self, modes: Collection[Mode]) -> bool:

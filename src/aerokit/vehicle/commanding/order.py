@@ -170,7 +170,6 @@ class Order:
         self._late = set(expected)
         self._allowed = self._before | self._late
         self._own = {mode.custom_mode for mode in modes}
-        self._is_mode_known = mode_before is not None
         self._armed_now = armed_before
         self._state_before, self._ends_flight = state_before, ends_flight
         self._minds_mode, self._minds_disarming = minds_mode, minds_disarming
@@ -218,16 +217,16 @@ class Order:
 
     def note_mode(self, mode: Mode, at: float) -> None:
         """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
-        number = mode.custom_mode
-        is_change = self._mode_now is not None and number != self._mode_now
+        number, is_known = mode.custom_mode, self._mode_now is not None
+        is_change = is_known and number != self._mode_now
         self.has_worked = self.has_worked or (is_change and number in self._own)
         if number in self._own:
             if is_change or not self._settles_by_change:
                 self._allowed -= self._allowed if at >= self._settles_at else self._before
         elif number in self._late & self._allowed and at >= self._settles_at:
             self._allowed -= self._before
-        elif not self._is_mode_known or at < self._any_until:
-            if self._is_mode_known and number not in self._allowed:
+        elif not is_known or at < self._any_until:
+            if is_known and number not in self._allowed:
                 self.unexplained = f"the mode changed to {mode}"
             self._allowed.add(number)
         elif number not in self._allowed and self._minds_mode:
@@ -235,7 +234,7 @@ class Order:
                 self.mode_lost_at = at
             self.has_lost_mode = True
             self.taken_by = self.taken_by or f"the mode changed to {mode}"
-        self._is_mode_known, self._mode_now = True, number
+        self._mode_now = number
 
     def note_state(self, state: int) -> None:
         """Take MAV_STATE. A failsafe that was active when the order was given does not end it: the program knew it.
