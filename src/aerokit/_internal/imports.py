@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 
 _OTHERS = ("aero", "engine", "stability")
@@ -31,19 +31,14 @@ def complaint(folder: str, *, is_ours: bool = True) -> str | None:
 
 
 def lazy_exports(
-    package: str, exports: Mapping[str, str | Iterable[str]]
+    package: str, exports: Mapping[str, tuple[str, ...]]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a package, whose names are imported when they are first used.
 
-    ``exports`` has the names by module, one by one or as a text with spaces between them; a name that its module does
-    not have is the module itself. The package repeats them as ``import name as name`` under TYPE_CHECKING, because type
-    checkers do not run this.
+    ``exports`` has the names by module; a name that its module does not have is the module itself. The package repeats
+    them as ``import name as name`` under TYPE_CHECKING, because type checkers do not run this.
     """
-    homes = {
-        name: module
-        for module, names in exports.items()
-        for name in (names.split() if isinstance(names, str) else names)
-    }
+    homes = {name: module for module, names in exports.items() for name in names}
 
     def find(name: str) -> object:
         if name not in homes:

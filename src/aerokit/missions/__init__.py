@@ -79,22 +79,55 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "aerokit.missions.actions": (
-            "change_speed condition_delay condition_distance condition_yaw delay delay_until "
-            "enable_fence jump jump_tag jump_to_tag land_start point_gimbal region_of_interest "
-            "region_of_interest_none set_camera_trigger_distance set_relay set_servo start_video "
-            "stop_photos stop_video take_photo take_photos trigger_camera vtol_transition"
+            "change_speed",
+            "condition_delay",
+            "condition_distance",
+            "condition_yaw",
+            "delay",
+            "delay_until",
+            "enable_fence",
+            "jump",
+            "jump_tag",
+            "jump_to_tag",
+            "land_start",
+            "point_gimbal",
+            "region_of_interest",
+            "region_of_interest_none",
+            "set_camera_trigger_distance",
+            "set_relay",
+            "set_servo",
+            "start_video",
+            "stop_photos",
+            "stop_video",
+            "take_photo",
+            "take_photos",
+            "trigger_camera",
+            "vtol_transition",
         ),
-        "aerokit.missions.compare": "Storage",
-        "aerokit.missions.fence": "Fence FenceCircle FencePolygon RallyPoints",
-        "aerokit.missions.item": "MissionItem",
-        "aerokit.missions.mission": "Mission Plan",
+        "aerokit.missions.compare": ("Storage",),
+        "aerokit.missions.fence": ("Fence", "FenceCircle", "FencePolygon", "RallyPoints"),
+        "aerokit.missions.item": ("MissionItem",),
+        "aerokit.missions.mission": ("Mission", "Plan"),
         "aerokit.missions.navigation": (
-            "land loiter_time loiter_to_altitude loiter_turns loiter_unlimited rally_point "
-            "return_to_launch spline_waypoint take_off vtol_land vtol_take_off waypoint"
+            "land",
+            "loiter_time",
+            "loiter_to_altitude",
+            "loiter_turns",
+            "loiter_unlimited",
+            "rally_point",
+            "return_to_launch",
+            "spline_waypoint",
+            "take_off",
+            "vtol_land",
+            "vtol_take_off",
+            "waypoint",
         ),
-        "aerokit.missions.plan_file": "format_plan parse_plan read_plan_file write_plan_file",
+        "aerokit.missions.plan_file": ("format_plan", "parse_plan", "read_plan_file", "write_plan_file"),
         "aerokit.missions.waypoint_file": (
-            "format_waypoints parse_waypoints read_waypoint_file write_waypoint_file"
+            "format_waypoints",
+            "parse_waypoints",
+            "read_waypoint_file",
+            "write_waypoint_file",
         ),
     },
 )

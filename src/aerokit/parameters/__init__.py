@@ -54,19 +54,34 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "aerokit.parameters.definition": (
-            "CameraDefinition SettingDefinition SettingOption SettingRange load_definition parse_definition"
+            "CameraDefinition",
+            "SettingDefinition",
+            "SettingOption",
+            "SettingRange",
+            "load_definition",
+            "parse_definition",
         ),
         "aerokit.parameters.files": (
-            "FileFormat ParameterFile parse_parameter_file read_parameter_file write_parameter_file"
+            "FileFormat",
+            "ParameterFile",
+            "parse_parameter_file",
+            "read_parameter_file",
+            "write_parameter_file",
         ),
-        "aerokit.parameters.metadata": "Metadata ParameterMetadata load_metadata parse_metadata",
-        "aerokit.parameters.pack": "pack_parameters unpack_parameters",
-        "aerokit.parameters.parameter": "Parameter ParameterType check_name checked_value",
+        "aerokit.parameters.metadata": ("Metadata", "ParameterMetadata", "load_metadata", "parse_metadata"),
+        "aerokit.parameters.pack": ("pack_parameters", "unpack_parameters"),
+        "aerokit.parameters.parameter": ("Parameter", "ParameterType", "check_name", "checked_value"),
         "aerokit.parameters.renames": (
-            "ParameterRenamedWarning Rename Renamed find_rename other_names replacement_of to_known "
-            "translate_values"
+            "ParameterRenamedWarning",
+            "Rename",
+            "Renamed",
+            "find_rename",
+            "other_names",
+            "replacement_of",
+            "to_known",
+            "translate_values",
         ),
-        "aerokit.parameters.setting": "Setting SettingValue",
-        "aerokit.parameters.table": "ParameterDifference ParameterTable ParameterValues diff",
+        "aerokit.parameters.setting": ("Setting", "SettingValue"),
+        "aerokit.parameters.table": ("ParameterDifference", "ParameterTable", "ParameterValues", "diff"),
     },
 )

@@ -135,7 +135,7 @@ class PostedOrder:
         ):
             while told.updated_at <= answered_at or not self._arbiter.is_known:
                 await news.next(LOOK_S)
-            return not (self.end or self._is_over)
+            return not self.end
         return False
 
     async def until_told(self, timeout: float) -> None:
