@@ -12,6 +12,7 @@ from call_stage import Stage
 from flight_harness import make_parts
 
 from aerokit.connection import loop_watch
+from aerokit.vehicle.session.commands import UNDER_WAY_S
 
 __all__ = ["SETTLED_S", "look", "what_is_left"]
 
@@ -70,7 +71,9 @@ def _all(stage: Stage) -> Iterator[str]:
 
 
 def _is_awaited(vehicle: Any, key: tuple[int, int]) -> bool:
-    return bool(key[0] == vehicle.component_id and vehicle._talk.commands.awaits_answer(key[1]))
+    oldest = vehicle.connection.now() - UNDER_WAY_S
+    expected = vehicle._talk.commands._under_way.get((vehicle.component_id, key[1]), ())
+    return any(at >= oldest for at in expected)
 
 
 def _times(name: str, items: Iterable[object]) -> Iterator[str]:

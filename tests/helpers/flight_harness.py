@@ -193,10 +193,12 @@ class Px4Flight:
 
 
 @asynccontextmanager
-async def open_px4(px4: SimulatedPx4 | None = None, **options: Any) -> AsyncIterator[Px4Flight]:
+async def open_px4(
+    px4: SimulatedPx4 | None = None, *, latency_s: float = 0.0, **options: Any
+) -> AsyncIterator[Px4Flight]:
     """A PX4 that is ready soon, and a vehicle on it; ``options`` are those of `connect`."""
     px4 = SimulatedPx4(boot_time_s=1.0) if px4 is None else px4
-    async with simulated_link(px4) as link:
+    async with simulated_link(px4, latency_s=latency_s) as link:
         wire = Wire(link)
         async with aerokit.connect(wire, **options) as vehicle:
             yield Px4Flight(px4, vehicle, wire)

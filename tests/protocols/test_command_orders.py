@@ -166,7 +166,7 @@ def test_answers_to_an_earlier_command_of_the_same_number_are_not_ours() -> None
     assert machine.deadline == 1.0
     machine.receive(ack(DENIED), 0.2)
     assert not machine.done
-    assert machine.answers_to_come == 0
+    assert machine.answers_to_come == 1
     machine.receive(ack(ACCEPTED), 0.3)
     assert machine.result().result == ACCEPTED
 
@@ -190,10 +190,14 @@ def test_answers_to_come_are_those_to_what_was_sent() -> None:
     assert machine.answers_to_come == 2
     machine.receive(ack(ACCEPTED), 1.2)
     assert machine.answers_to_come == 1
-    alone = order(answers_before_ours=5)
-    for _ in range(3):
-        alone.receive(ack(DENIED), 0.1)
-    assert alone.answers_to_come == 0
+
+
+def test_answers_to_come_are_counted_beside_those_before_ours() -> None:
+    machine = order(answers_before_ours=2, answers_to_each=2)
+    for answers, to_come in [(1, 2), (2, 2), (3, 1)]:
+        machine.receive(ack(ACCEPTED), 0.1)
+        assert (machine.answers, machine.answers_to_come) == (answers, to_come)
+    assert machine.done
 
 
 @pytest.mark.parametrize(("target", "sender", "is_ours"), [(1, 1, True), (1, 154, False), (0, 154, True)])

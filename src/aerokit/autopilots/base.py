@@ -159,6 +159,8 @@ class Autopilot:
     """None: DO_REPOSITION is not known to work."""
     home_is_item_0 = False
     """Whether a mission's item 0 is home."""
+    acks_per_command: ClassVar[Mapping[int, int]] = {}
+    """MAV_CMD to the number of COMMAND_ACKs for one sending, where it is not one."""
     keys_are_taken = ""
     """Where SETUP_SIGNING is obeyed, in words, if that is not everywhere."""
     runs_prearm_checks = False

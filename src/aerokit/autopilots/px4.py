@@ -94,6 +94,8 @@ class Px4(Autopilot):
     keys_are_taken = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
     modes = MODES
     modes_are_numbered = False
+    # The MAVLink module acks with ACCEPTED at once, the commander with the result after it.
+    acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
     setpoints: SetpointRules = SetpointRules(before_mode=True)
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)

@@ -155,7 +155,8 @@ class CommandExchange(Exchange[CommandAck]):
     and is reported to ``on_progress`` (0–100, None when the vehicle does not say). An ack for another ground station
     is not ours, nor is one of another component than the target; nor are the first ``answers_before_ours``: those to
     an earlier command of the same number that was abandoned. If they do not come after all, the command is sent
-    again, and then every ack counts.
+    again, and then every ack counts. ``answers_to_each``: how many acks the vehicle sends for each sending; the first
+    one is the result.
 
     A question (no ``standing``) is sent again every ``attempt_timeout`` seconds. An order is sent again only right
     after the vehicle has told what it does, and only if that speaks neither of the order's effect nor of somebody
@@ -186,6 +187,7 @@ class CommandExchange(Exchange[CommandAck]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         answers_before_ours: int = 0,
+        answers_to_each: int = 1,
         answers_within_s: float = 0.0,
         standing: Standing | None = None,
         is_sent: bool = False,
@@ -207,7 +209,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._own = (own_system, own_component)
         self._attempts, self._attempt_timeout = attempts, attempt_timeout
         self._progress_timeout, self._on_progress = progress_timeout, on_progress
-        self._answers_before_ours = answers_before_ours
+        self._answers_before_ours, self._answers_to_each = answers_before_ours, answers_to_each
         self._standing = standing
         self._is_sent = is_sent
         self._sent = 0
@@ -238,8 +240,15 @@ class CommandExchange(Exchange[CommandAck]):
 
     @property
     def answers_to_come(self) -> int:
-        """How many answers may still be under way, to be ignored by the next command of the same number."""
-        return max(0, self._sent - self._answers)
+        """Number of answers to this command that may still arrive; the next one of the same number must ignore them."""
+        # Once the command was sent again every answer counts as its own, as in receive().
+        earlier = self._answers_before_ours if self._sent == 1 else 0
+        return max(0, self._sent * self._answers_to_each - max(0, self._answers - earlier))
+
+    @property
+    def answers(self) -> int:
+        """Number of answers received, those to earlier commands of the same number included."""
+        return self._answers
 
     def expire(self, now: float) -> None:
         """Send again, or give up after the last attempt or when a command in progress has gone silent."""

@@ -238,3 +238,22 @@ async def test_reboot() -> None:
         assert now() - started < 12.0
         assert flight.px4.uptime < 12.0
         await flight.vehicle.wait_ready()
+
+
+@pytest.mark.parametrize("second_result", [MavResult.ACCEPTED, MavResult.TEMPORARILY_REJECTED])
+async def test_second_ack_of_cancelled_mode_is_not_taken_for_next(
+    monkeypatch: pytest.MonkeyPatch, second_result: MavResult
+) -> None:
+    """PX4 acks DO_SET_MODE twice. Both acks of a cancelled RTL arrive while a lost LAND waits for its own."""
+    async with open_px4(latency_s=0.2) as flight:
+        await flight.take_off()
+        vehicle = flight.vehicle
+        if second_result != MavResult.ACCEPTED:
+            monkeypatch.setattr(flight.px4, "change_mode", lambda _: False)
+        with anyio.move_on_after(0.25):
+            await vehicle.set_mode("RTL")
+        monkeypatch.undo()
+        flight.px4.faults.ignore(MavCmd.DO_SET_MODE, times=1)
+        await vehicle.land(timeout=60.0)
+        modes = [each for each in flight.wire.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)]
+        assert [int(each.param3) for each in modes] == [5, 6, 6]

@@ -14,7 +14,7 @@ from aerokit.mavlink.messages import CommandAck
 from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
     from aerokit.connection.connection import Connection
     from aerokit.mavlink.messages import CommandInt, CommandLong
@@ -48,10 +48,12 @@ class CommandSender:
         component_id: int,
         describe: Callable[[], str],
         round_trip_s: Callable[[], float | None] = lambda: None,
+        acks_per_command: Mapping[int, int] = {},
     ) -> None:
         self._connection = connection
         self._system_id, self._component_id = system_id, component_id
         self._describe, self._round_trip_s = describe, round_trip_s
+        self._acks_per_command = acks_per_command
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         self._standings: dict[_Key, Standing | None] = {}
@@ -139,7 +141,7 @@ class CommandSender:
         """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
         target = self._component_id if component_id is None else component_id
         self._connection.send(command_long(self._system_id, target, command, params))
-        self._expect_answers((target, command), 1)
+        self._expect_answers((target, command), self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
         """Whether it answers us, and not another ground station; targets are 0 in MAVLink 1 and old firmwares."""
@@ -170,11 +172,6 @@ class CommandSender:
         """The vehicle has rebooted: what it knows may be other commands."""
         self._results.clear()
 
-    def awaits_answer(self, command: int) -> bool:
-        """Whether an answer of the autopilot to what was sent unconfirmed may still come."""
-        oldest = self._connection.now() - UNDER_WAY_S
-        return any(at >= oldest for at in self._under_way.get((self._component_id, command), ()))
-
     async def _run(
         self,
         message: CommandLong | CommandInt,
@@ -196,6 +193,10 @@ class CommandSender:
                 raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
             if standing is not None and standing.end != end and not is_sent:  # while it waited
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {standing.end}")
+            answers_to_each = self._acks_of(message.command)
+            earlier = self._take_answers_under_way(key)
+            if is_sent:
+                del earlier[-answers_to_each:]
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
@@ -205,7 +206,8 @@ class CommandSender:
                 answers_within_s=self._answers_within_s(),
                 progress_timeout=progress_timeout,
                 on_progress=on_progress,
-                answers_before_ours=max(0, self._take_answers_under_way(key) - is_sent),
+                answers_before_ours=len(earlier),
+                answers_to_each=answers_to_each,
                 standing=standing,
                 is_sent=is_sent,
             )
@@ -217,7 +219,7 @@ class CommandSender:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
             finally:
                 del self._runs[key], self._standings[key]
-                self._expect_answers(key, exchange.answers_to_come)
+                self._expect_answers(key, exchange.answers_to_come, earlier[exchange.answers :])
 
     def _make_way(self, key: _Key) -> None:
         """An order that has ended keeps no newer one waiting for its answer."""
@@ -230,14 +232,17 @@ class CommandSender:
         """A stalled link that comes back has a round trip of all the time it was away: that is no reason to wait."""
         return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), LONGEST_ATTEMPT_S)
 
-    def _expect_answers(self, key: _Key, count: int) -> None:
-        """Remember that answers may come which nobody waits for."""
-        if count:
-            self._under_way.setdefault(key, []).extend([self._connection.now()] * count)
+    def _acks_of(self, command: int) -> int:
+        return self._acks_per_command.get(command, 1)
 
-    def _take_answers_under_way(self, key: _Key) -> int:
+    def _expect_answers(self, key: _Key, count: int, earlier: Sequence[float] = ()) -> None:
+        """Remember answers that may still arrive, so that the next command of this key ignores them."""
+        if expected := [*earlier, *[self._connection.now()] * count]:
+            self._under_way.setdefault(key, []).extend(expected)
+
+    def _take_answers_under_way(self, key: _Key) -> list[float]:
         oldest = self._connection.now() - UNDER_WAY_S
-        return sum(at >= oldest for at in self._under_way.pop(key, ()))
+        return [at for at in self._under_way.pop(key, ()) if at >= oldest]
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):

@@ -126,7 +126,12 @@ class Talk:
             "link_quality", connection.now, "second of traffic"
         )
         self.commands: CommandSender = CommandSender(
-            connection, system_id, component_id, self.describe_link, lambda: self.link_watch.round_trip_s
+            connection,
+            system_id,
+            component_id,
+            self.describe_link,
+            lambda: self.link_watch.round_trip_s,
+            self.autopilot.acks_per_command,
         )
         self.rates: MessageRates = MessageRates(
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
