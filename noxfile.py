@@ -1,4 +1,4 @@
-"""Sessions: tests (each Python that is there), lint, types, docs, release, bench and bench_…, demo, long ones.
+"""Sessions: tests (for each installed Python), lint, types, docs, release, benchmarks, demo, and long ones.
 
 `nox -l` lists them.
 """
@@ -19,14 +19,14 @@ PYTHONS = [f"3.{minor}" for minor in range(10, 15)]
 
 @nox.session(python=[version for version in PYTHONS if shutil.which(f"python{version}")] or None)
 def tests(session: nox.Session) -> None:
-    """Run the tests, on stock asyncio and on uvloop."""
+    """Run the tests, with asyncio's loop and with uvloop."""
     session.install("-e", ".[test]")
     session.run("pytest", *session.posargs)
 
 
 @nox.session
 def exhaustive(session: nox.Session) -> None:
-    """Run the rows of long tables, and the slow tests, that `pytest` leaves out; three minutes."""
+    """Run the rows of long tables, and the slow tests, that `pytest` skips; three minutes."""
     session.install("-e", ".[test]")
     session.run("pytest", "-q", "-m", "exhaustive", *session.posargs)
 
@@ -46,7 +46,7 @@ MEETS_OTHERS = (
     "tests/parameters",
     "tests/testing/test_clock.py",
 )
-"""The tests of what uses other packages: anyio and its threads, serial ports, geodesy, dialects of pymavlink."""
+"""Tests of code that uses other packages: anyio and its threads, serial ports, geodesy, pymavlink's dialects."""
 OF_EXTRAS = (
     "tests/logs/convert",
     "tests/logs/flights",
@@ -61,7 +61,7 @@ OF_EXTRAS = (
 
 @nox.session
 def lowest(session: nox.Session) -> None:
-    """Run the tests that meet other packages with the lowest versions that pyproject.toml declares."""
+    """Run the tests of code that uses other packages with the lowest versions in pyproject.toml."""
     session.install("uv>=0.5")
     session.run("uv", "pip", "install", "-q", "--resolution", "lowest-direct", "-e", ".[test]")
     session.run("pytest", "-q", *(session.posargs or (*MEETS_OTHERS, *OF_EXTRAS)))
@@ -69,14 +69,14 @@ def lowest(session: nox.Session) -> None:
 
 @nox.session
 def beside_trio(session: nox.Session) -> None:
-    """Run them with trio and sniffio installed: anyio does not take asyncio for granted then."""
+    """Run these tests with trio and sniffio installed, because anyio then has to detect asyncio."""
     session.install("-e", ".[test]", "trio", "sniffio")
     session.run("pytest", "-q", *(session.posargs or MEETS_OTHERS))
 
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Style, format, import direction, and generated code that is what the generator makes."""
+    """Check style, format, import directions, and that generated code is up to date."""
     session.install("-e", ".[dev]")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
@@ -87,16 +87,16 @@ def lint(session: nox.Session) -> None:
 
 @nox.session
 def types(session: nox.Session) -> None:
-    """mypy --strict and pyright, over sources, tests, examples and benchmarks."""
+    """Run mypy --strict and pyright on sources, tests, examples and benchmarks."""
     session.install("-e", ".[dev]")
     session.run("mypy")
     session.run("pyright", "--pythonpath", f"{session.bin}/python")
-    session.run("pyright", "--ignoreexternal", "--verifytypes", "aerokit")  # of the python in the path
+    session.run("pyright", "--ignoreexternal", "--verifytypes", "aerokit")  # with the Python on the path
 
 
 @nox.session
 def docs(session: nox.Session) -> None:
-    """Build the documentation into `site/`; a warning is an error. `-- serve` shows it while it is written."""
+    """Build the documentation into `site/`, with warnings as errors. `-- serve` shows it while you write."""
     session.install("-e", ".[docs]")
     quiet = {"NO_MKDOCS_2_WARNING": "1"}
     session.run("mkdocs", *(session.posargs or ("build", "--strict")), env=quiet)
@@ -104,21 +104,21 @@ def docs(session: nox.Session) -> None:
 
 @nox.session
 def pictures(session: nox.Session) -> None:
-    """Draw the pictures of the documentation anew: `nox -s pictures -- [NAME …]`."""
+    """Draw the pictures of the documentation again: `nox -s pictures -- [NAME …]`."""
     session.install("-e", ".[all]")
     session.run("python", "docs/pictures.py", *session.posargs)
 
 
 @nox.session
 def bench(session: nox.Session) -> None:
-    """Measure beside pymavlink and MAVSDK, print the table, write bench.json."""
+    """Measure against pymavlink and MAVSDK, print the table, write bench.json."""
     session.install("-e", ".", "mavsdk>=4")
     session.run("python", "benchmarks/run.py", *session.posargs)
 
 
 @nox.session
 def bench_transfers(session: nox.Session) -> None:
-    """Measure transfers over bad radios beside pymavlink, MAVSDK and DroneKit; an hour. Writes bench-transfers.json."""
+    """Measure transfers over bad radios against pymavlink, MAVSDK, DroneKit; an hour. Writes bench-transfers.json."""
     session.install("-e", ".", "mavsdk>=4", "dronekit==2.9.2", "future")
     session.run("python", "benchmarks/transfers.py", *session.posargs)
 
@@ -132,7 +132,7 @@ def bench_dronekit(session: nox.Session) -> None:
         "dronekit": ("dronekit==2.9.2", "future"),
         "dronekit2": ("dronekit2==3.0.0",),
     }.items():
-        folder = Path(session.create_tmp()) / name  # both are imported by the same name
+        folder = Path(session.create_tmp()) / name  # both have the same import name
         session.run("python", "-m", "venv", str(folder))
         pythons[name] = str(folder / "bin" / "python")
         session.run(pythons[name], "-m", "pip", "install", "-q", "fastcrc", *packages, external=True)
@@ -149,7 +149,7 @@ def bench_scale(session: nox.Session) -> None:
 
 @nox.session
 def bench_hub(session: nox.Session) -> None:
-    """Measure what a frame costs on its way through a hub, beside MAVProxy, ten minutes. Writes bench-hub.json."""
+    """Measure the cost of a frame through a hub, against MAVProxy; ten minutes. Writes bench-hub.json."""
     session.install("-e", ".", "MAVProxy", "setuptools", "future")
     session.run("python", "benchmarks/hub.py", *session.posargs)
 
@@ -163,9 +163,9 @@ def bench_fleet(session: nox.Session) -> None:
 
 @nox.session
 def fuzz(session: nox.Session) -> None:
-    """Fuzz what takes bytes from outside, a quarter of an hour; `-- --runs 100000 address plan` for some of it, longer.
+    """Fuzz all parsers of external bytes, a quarter of an hour; `-- --runs 100000 address plan` for some, longer.
 
-    With atheris, which follows what code an input reaches, where it installs.
+    Uses atheris, which is coverage-guided, where it can be installed.
     """
     session.install("-e", ".[test]")
     session.install("-q", "atheris", success_codes=[0, 1, 2])
@@ -174,24 +174,24 @@ def fuzz(session: nox.Session) -> None:
 
 @nox.session
 def badlinks(session: nox.Session) -> None:
-    """Judge every transfer over bad radios, 200 seeds of each, and print the table; half an hour and more."""
+    """Judge every transfer over bad radios, with 200 seeds of each, and print the table; half an hour or more."""
     session.install("-e", ".[test]")
     session.run("python", "tests/badlink/survey.py", *session.posargs, env={"PYTHONPATH": "tests/helpers"})
 
 
 @nox.session
 def soak(session: nox.Session) -> None:
-    """Fly, lose the radio, reboot, unplug and plug in again for an hour; nothing may grow: `nox -s soak -- MINUTES`."""
+    """Fly, lose the radio, reboot and replug for an hour, and check that nothing grows: `nox -s soak -- MINUTES`."""
     session.install("-e", ".[test]")
     minutes = session.posargs[0] if session.posargs else "60"
-    # pytest would keep what is logged, which grows
+    # pytest would keep log records, which grow
     options = ("-q", "-n", "0", "-p", "no:logging", "-m", "")
     session.run("pytest", *options, "tests/soak", env={"AEROKIT_SOAK_MINUTES": minutes})
 
 
 @nox.session
 def mutants(session: nox.Session) -> None:
-    """Change one thing at a time: does a test notice? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`; an hour."""
+    """Mutate the sources, and check that tests fail: `nox -s mutants -- [PATH …] [--sample N] [--seed S]`; an hour."""
     session.install("-e", ".[test]", "coverage>=7.6", "cosmic-ray>=8.3")
     session.run("nice", "python", "tests/mutants/mutate.py", *session.posargs, external=True)
 
@@ -201,14 +201,12 @@ def orders(session: nox.Session) -> None:
     """Fly the order table of docs/reliability.md with many seeds of each row (100): `nox -s orders -- 300`."""
     session.install("-e", ".[test]")
     seeds = session.posargs[0] if session.posargs else "100"
-    session.run(
-        "pytest", "-q", "-m", "", "tests/vehicle/commanding/orders", env={"AEROKIT_ORDER_SEEDS": seeds}
-    )
+    session.run("pytest", "-q", "-m", "", "tests/vehicle/commanding/orders", env={"AEROKIT_ORDER_SEEDS": seeds})
 
 
 @nox.session
 def cancel(session: nox.Session) -> None:
-    """Cancel every public coroutine at every await, not only at a few; a minute."""
+    """Cancel every public coroutine at every await, rather than at some; a minute."""
     session.install("-e", ".[test]")
     session.run(
         "pytest",
@@ -222,7 +220,7 @@ def cancel(session: nox.Session) -> None:
 
 @nox.session(name="dronekit")
 def dronekit_itself(session: nox.Session) -> None:
-    """Have DroneKit 2.9.2 itself play the scenarios of its behaviour that the tests hold aerokit.dronekit to."""
+    """Run the scenarios of aerokit.dronekit's tests with DroneKit 2.9.2 itself."""
     session.install("-e", ".[test]", "dronekit==2.9.2", "future")
     python = {"AEROKIT_DRONEKIT_PYTHON": f"{session.bin}/python"}
     session.run("pytest", "-q", "tests/dronekit/test_dronekit_behaviour.py", *session.posargs, env=python)
@@ -238,11 +236,9 @@ def clients(session: nox.Session) -> None:
 
 @nox.session
 def browser(session: nox.Session) -> None:
-    """Fly by the page of `aerokit serve`, and open a report, in headless Chromium (or AEROKIT_CHROMIUM)."""
+    """Fly with the page of `aerokit serve`, and open a report, in headless Chromium (or AEROKIT_CHROMIUM)."""
     session.install("-e", ".[test]", "playwright>=1.45")
-    session.run(
-        "pytest", "-q", "-n", "0", "tests/browser", "tests/logs/report/test_report.py", *session.posargs
-    )
+    session.run("pytest", "-q", "-n", "0", "tests/browser", "tests/logs/report/test_report.py", *session.posargs)
 
 
 @nox.session
@@ -254,9 +250,9 @@ def demo(session: nox.Session) -> None:
 
 @nox.session
 def release(session: nox.Session) -> None:
-    """Build the wheel and the sdist into `dist/`, check them, and fly the demo from the wheel in an empty environment.
+    """Build wheel and sdist into `dist/`, check them, and fly the demo from the wheel in an empty environment.
 
-    Publishing is a step of its own, by hand: `twine upload dist/*`.
+    Publishing is a separate, manual step: `twine upload dist/*`.
     """
     session.install("build>=1.2", "twine>=6")
     shutil.rmtree("dist", ignore_errors=True)
@@ -269,15 +265,11 @@ def release(session: nox.Session) -> None:
     aerokit = str(empty / "bin" / "aerokit")
     installed = f"aerokit-mavlink @ {wheel.resolve().as_uri()}"
     session.run(str(empty / "bin" / "pip"), "install", "-q", installed, external=True)
-    with session.chdir(empty):  # nothing of the clone is in reach there
+    with session.chdir(empty):  # where the clone is not importable
         session.run(aerokit, "--version", external=True)
         session.run(aerokit, "demo", "--speedup", "20", external=True)
-        session.run(
-            aerokit, "report", "demo.tlog", external=True, success_codes=[7]
-        )  # it says what is missing
-        session.run(
-            str(empty / "bin" / "pip"), "install", "-q", installed.replace(" @", "[all] @"), external=True
-        )
+        session.run(aerokit, "report", "demo.tlog", external=True, success_codes=[7])  # it names the missing package
+        session.run(str(empty / "bin" / "pip"), "install", "-q", installed.replace(" @", "[all] @"), external=True)
         session.run(aerokit, "report", "demo.tlog", external=True)
         session.run(aerokit, "convert", "demo.tlog", "flight.gpx", external=True)
         session.run(aerokit, "serve", "--help", external=True, silent=True)

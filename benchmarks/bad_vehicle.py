@@ -1,9 +1,9 @@
-"""A simulated copter behind a bad radio, in a process of its own: who ``transfers.py`` makes all libraries talk to.
+"""A simulated copter behind a lossy link, in a process of its own: the vehicle of ``transfers.py``.
 
     python benchmarks/bad_vehicle.py TASK PORT LOSS SEED DELAY_S SIZE
 
-It sends to this UDP port of this machine. Each frame is lost with the same probability in both directions. It says
-``ready``, and on a line ``dump FOLDER`` it writes what it holds: ``vehicle-parameters.json``, ``vehicle.json`` (its
+It sends to this UDP port of this machine. Each frame is lost with the same probability in both directions. It prints
+``ready``, and on a line ``dump FOLDER`` it writes its contents: ``vehicle-parameters.json``, ``vehicle.json`` (its
 mission, without home) and ``vehicle.bin`` (the uploaded file). It ends when it is terminated.
 """
 
@@ -23,7 +23,7 @@ from aerokit.transport import create_link
 
 __all__ = ["main"]
 
-FEW_PARAMETERS = 100
+QUICK_PARAMETERS = 100
 """DroneKit fetches all of them before it does anything else."""
 
 
@@ -49,9 +49,7 @@ async def _serve(radio: FaultyLink, copter: SimulatedCopter) -> None:
 
 
 def _copter(task: str, size: int) -> SimulatedCopter:
-    copter = SimulatedCopter(
-        boot_time_s=0.0, parameter_count=None if task == "parameters" else FEW_PARAMETERS
-    )
+    copter = SimulatedCopter(boot_time_s=0.0, parameter_count=None if task == "parameters" else QUICK_PARAMETERS)
     while task == "parameters" and len(copter.parameters) < PARAMETERS:
         copter.parameters.add(f"BENCH_{len(copter.parameters)}", 0.5)
     if task == "mission_download":
@@ -65,9 +63,7 @@ def _copter(task: str, size: int) -> SimulatedCopter:
 def _dump(copter: SimulatedCopter, folder: Path) -> None:
     values = {name: copter.parameters[name] for name in copter.parameters}
     (folder / "vehicle-parameters.json").write_text(json.dumps(values))
-    (folder / "vehicle.json").write_text(
-        json.dumps([as_numbers(item) for item in copter.missions.items(0)[1:]])
-    )
+    (folder / "vehicle.json").write_text(json.dumps([as_numbers(item) for item in copter.missions.items(0)[1:]]))
     if UPLOAD_PATH in copter.files:
         (folder / "vehicle.bin").write_bytes(copter.files.get(UPLOAD_PATH))
 

@@ -1,9 +1,9 @@
-"""What all clients of ``transfers.py`` share: one task from the command line, timed, its outcome as JSON.
+"""Shared code of the clients of ``transfers.py``: one task from the command line, timed, its result as JSON.
 
     python benchmarks/client_….py TASK WAY PORT SIZE FOLDER
 
-``WAY`` chooses among the ways that a library has. What was downloaded is left in FOLDER (``out.json``, ``out.bin``),
-what is to be uploaded is there (``in.bin``).
+``WAY`` selects one of the methods that a library has. Downloads are written to FOLDER (``out.json``, ``out.bin``);
+uploads are read from there (``in.bin``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Task", "run"]
 
 
 class Task:
-    """What to do, and how long it took."""
+    """One task and its duration."""
 
     def __init__(self, name: str, way: str, port: int, size: int, folder: Path) -> None:
         self.name, self.way, self.port, self.size, self.folder = name, way, port, size, folder
@@ -30,7 +30,7 @@ class Task:
 
     @property
     def seconds(self) -> float:
-        """From `begin` to `end`; to now while there was no end."""
+        """Seconds from `begin` to `end`; until now while it has not ended."""
         return time.perf_counter() - self._began_at if self._seconds is None else self._seconds
 
     def begin(self) -> None:
@@ -43,7 +43,7 @@ class Task:
 
 
 def run(perform: Callable[[Task], Any]) -> None:
-    """Do the task of the command line with one library; the last line of standard output says what came of it."""
+    """Run the task of the command line with one library; the last line of standard output is the result."""
     name, way, port, size, folder = sys.argv[1:]
     task = Task(name, way, int(port), int(size), Path(folder))
     outcome: dict[str, Any] = {}

@@ -1,9 +1,9 @@
-"""One script for DroneKit, dronekit2 and aerokit's ``aerokit.dronekit``: the client of ``dronekit_compare.py``.
+"""One script for DroneKit, dronekit2 and ``aerokit.dronekit``: the client of ``dronekit_compare.py``.
 
     python benchmarks/client_classic.py MODULE '{"task": "cpu", "address": "udpin:127.0.0.1:14550"}'
 
-MODULE is ``dronekit`` or ``aerokit.dronekit``. It says ``connecting`` and ``connected`` at these moments; its last
-line is what it found, as JSON.
+MODULE is ``dronekit`` or ``aerokit.dronekit``. It prints ``connecting`` and ``connected``; its last line is the
+result as JSON.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ READS = (
     "location.local_frame", "is_armable", "ekf_ok", "last_heartbeat", "rangefinder", "channels", "gimbal",
 )  # fmt: skip
 """The attributes that are read."""
+# Attributes that the usual program listens to, besides the message HEARTBEAT.
 USUAL = (
     "mode", "armed", "attitude", "location.global_relative_frame", "heading", "battery", "gps_0",
 )  # fmt: skip
-"""What the usual program listens to, besides the message HEARTBEAT."""
 
 Found = dict[str, Any]
 
@@ -84,7 +84,7 @@ def cpu(dronekit: Any, address: str, listeners: str, settle_s: float, window_s: 
 
 
 def latency(dronekit: Any, address: str, settle_s: float, window_s: float) -> Found:
-    """When listeners were called, by the system's monotonic clock in ns, and with the value of which round."""
+    """Record when listeners were called, by the system's monotonic clock in ns, and the round number of the value."""
     from dronekit_traffic import keys_of
 
     vehicle = _connected(dronekit, address)
@@ -113,7 +113,7 @@ def reads(dronekit: Any, address: str, names: list[str], settle_s: float) -> Fou
 
 
 def only_import(dronekit: Any) -> Found:
-    """Nothing: the time of the import is told in any case."""
+    """Do nothing: the import time is reported in any case."""
     return {}
 
 

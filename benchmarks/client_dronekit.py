@@ -1,7 +1,7 @@
-"""DroneKit 2.9.2's side of ``transfers.py``, with the alias that it needs since Python 3.10.
+"""The DroneKit 2.9.2 client of ``transfers.py``, with the alias that it needs since Python 3.10.
 
-It has no files. Parameters come with its ``connect``: their time counts from its request for them on, not from the
-first wait for a heartbeat. Missions begin when it says that it is ready, as its guide has it.
+DroneKit has no files. It downloads parameters in its ``connect``: their time counts from its request, not from the
+first wait for a heartbeat. Missions start when it reports that it is ready, as its guide describes.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ def perform(task: Task) -> Any:
 
 
 def _upload(vehicle: Any, task: Task) -> None:
-    command_of: Any = importlib.import_module("dronekit").Command
+    follow_up_command: Any = importlib.import_module("dronekit").Command
     commands = vehicle.commands
     commands.clear()
     for command, frame, p1, p2, p3, p4, x, y, z in [mission_items(1)[0], *mission_items(task.size)]:
-        commands.add(command_of(0, 0, 0, frame, command, 0, 1, p1, p2, p3, p4, x * 1e-7, y * 1e-7, z))
+        commands.add(follow_up_command(0, 0, 0, frame, command, 0, 1, p1, p2, p3, p4, x * 1e-7, y * 1e-7, z))
     commands.upload(timeout=LIMIT_S)
 
 

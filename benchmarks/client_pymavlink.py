@@ -1,8 +1,9 @@
-"""pymavlink's side of ``transfers.py``: ``mavparm``-like list and ``mavftp``, ``mavwp`` with an item loop.
+"""The pymavlink client of ``transfers.py``: ``mavparm``-like list, ``mavftp``, and ``mavwp`` with an item loop.
 
-What the library leaves to its user is written as MAVProxy has it, only more eager: after half a second of silence all
-missing parameters are asked for, after a second an item is asked for again. ``mavftp`` gets blocks of 239
-bytes; its default is 80. While items are uploaded the vehicle repeats its requests.
+Code that the library leaves to its user follows MAVProxy, with shorter delays: after half a second of silence all
+missing parameters are requested, after a second an item is requested again. ``mavftp`` uses blocks of 239 bytes; its
+default is
+80. While items are uploaded the vehicle repeats its requests.
 """
 
 from __future__ import annotations

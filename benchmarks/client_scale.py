@@ -1,11 +1,11 @@
-"""What each further vehicle costs a client: processor time and memory with 1 to 500 of them.
+"""Cost of each further vehicle for a client: processor time and memory with 1 to 500 of them.
 
     python benchmarks/client_scale.py
 
-Every vehicle sends what a client watches at 4 Hz, from a recorded flight, in real time; the frames are made beforehand
-and handed to the connections in this process, so that only clients and loop are measured. System ids end at 255: more
-vehicles are on several connections. ``fleet_…``: the same clients as one fleet, whose events are read; they are
-disarmed, so that the watch of distances has nobody to compare.
+Every vehicle sends the states that a client observes at 4 Hz, from a recorded flight, in real time. The frames are
+prepared in advance and passed to the connections in this process, so that only clients and loop are measured. System
+ids end at 255: more vehicles are on several connections. ``fleet_…``: the same clients as one fleet, whose events are
+read; they are disarmed, so that the distance monitor has nothing to compare.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ COUNTS = (1, 10, 50, 100, 200, 500)
 ON_A_LINK = 250
 LINEAR = 0.8
 """One of many takes at most 1/0.8 of what one of ten takes."""
-MOST_MIB = 0.15
+MAX_MIB = 0.15
+# Seconds in which every vehicle sends once.
 TURN_S = 0.25
-"""All vehicles are heard in each."""
 HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 4, 3)
 
 Turn = list[list[bytes]]
@@ -48,7 +48,7 @@ Turn = list[list[bytes]]
 
 
 def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> list[Row]:
-    """For each count the share of a core that one vehicle takes, beside one of ten; and the memory of one."""
+    """Return for each count the share of a core per vehicle, compared with one of ten, and the memory of one."""
     found = {
         count: statistics.median(asyncio.run(_share_of_each(count, turns)) for _ in range(rounds))
         for count in sorted({10, *counts})
@@ -63,7 +63,7 @@ def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> li
         table.append({**shown, "note": f"{each:.3f} % of a core each, {each * count:.1f} % together"})
     table += _fleet_rows(counts, turns, rounds)
     mib = asyncio.run(_mebibytes_of_each(max(counts)))
-    shown = row("client_memory", mib, MOST_MIB, "the most allowed", unit="MiB", ratio=MOST_MIB / mib, aim=1.0)
+    shown = row("client_memory", mib, MAX_MIB, "the most allowed", unit="MiB", ratio=MAX_MIB / mib, aim=1.0)
     return [
         *table,
         {**shown, "note": f"{mib:.3f} MiB for each of {max(counts)} clients, heard of for a turn"},
@@ -71,11 +71,9 @@ def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> li
 
 
 def _fleet_rows(counts: Sequence[int], turns: int, rounds: int) -> list[Row]:
-    """For each count the share of a core that one member of a fleet takes, beside one of ten."""
+    """Return for each count the share of a core per fleet member, compared with one of ten."""
     found = {
-        count: statistics.median(
-            asyncio.run(_share_of_each(count, turns, is_fleet=True)) for _ in range(rounds)
-        )
+        count: statistics.median(asyncio.run(_share_of_each(count, turns, is_fleet=True)) for _ in range(rounds))
         for count in sorted({10, *counts})
     }
     table: list[Row] = []
@@ -85,9 +83,7 @@ def _fleet_rows(counts: Sequence[int], turns: int, rounds: int) -> list[Row]:
             f"fleet_{count}", each, of_ten, "one of ten",
             unit="% of a core each", ratio=of_ten / each, aim=LINEAR if count >= 10 else 0.0,
         )  # fmt: skip
-        table.append(
-            {**shown, "note": f"as one fleet: {each:.3f} % of a core each, {each * count:.1f} % together"}
-        )
+        table.append({**shown, "note": f"as one fleet: {each:.3f} % of a core each, {each * count:.1f} % together"})
     return table
 
 
@@ -97,7 +93,7 @@ async def _share_of_each(count: int, turns: int, *, is_fleet: bool = False) -> f
         fleet = await _connected(stack, count, turns)
         if is_fleet:
             names = {f"member {number}": each for number, each in enumerate(fleet.vehicles)}
-            one = await stack.enter_async_context(aerokit.fleet(names, min_distance_m=5.0, too_close="tell"))
+            one = await stack.enter_async_context(aerokit.fleet(names, min_distance_m=5.0, on_too_close="report"))
             stack.enter_context(one.events(capacity=10_000))
         fleet.feed_turn()
         await asyncio.sleep(TURN_S)
@@ -135,7 +131,7 @@ class _Fleet:
                 connection.bytes_received(datagram, None)
 
     def forget(self) -> None:
-        """What was not fed counts as nobody's memory."""
+        """Exclude memory that was not used."""
         self._turns.clear()
 
     def check(self) -> None:
@@ -152,13 +148,11 @@ async def _connected(stack: AsyncExitStack, count: int, turns: int) -> _Fleet:
     vehicles = []
     for number, encoder in enumerate(encoders):
         connection = connections[number // ON_A_LINK]
-        for _ in range(5):  # what is read in turn after turn counts as having waited
+        for _ in range(5):  # Read repeatedly, so that it counts as having waited.
             await asyncio.sleep(0)
         connection.bytes_received(encoder.encode(HEARTBEAT), None)
         system_id = 1 + number % ON_A_LINK
-        vehicles.append(
-            await stack.enter_async_context(aerokit.connect(connection, system_id=system_id, rates={}))
-        )
+        vehicles.append(await stack.enter_async_context(aerokit.connect(connection, system_id=system_id, rates={})))
     return _Fleet(vehicles, connections, _made(encoders, turns + 1))
 
 

@@ -33,11 +33,11 @@ __all__ = ["rows"]
 
 COMMAND = 181  # MAV_CMD_DO_SET_RELAY
 RESPONDER = Path(__file__).with_name("responder.py")
+# Number of round trips before the first measured one.
 TRIPS_BEFORE = 50
-"""So many trips are made before the first one that counts."""
 
 Block = Callable[[int], Awaitable[list[float]]]
-"""Makes so many round trips and tells how long each took, in microseconds."""
+"""Makes this many round trips and returns their durations in microseconds."""
 
 
 def rows(rounds: int = 60, trips: int = 60) -> list[Row]:
@@ -72,14 +72,12 @@ def _rows(taken: dict[str, list[float]]) -> list[Row]:
     ]
     if "mavsdk" in taken:
         name = "MAVSDK asyncio, action.set_relay"
-        found.append(
-            faster_is_better("command_rtt_mavsdk", own, taken["mavsdk"], name, unit="µs", aim=1 / 0.6)
-        )
+        found.append(faster_is_better("command_rtt_mavsdk", own, taken["mavsdk"], name, unit="µs", aim=1 / 0.6))
     return found
 
 
 async def _in_turns(blocks: dict[str, Block], rounds: int, trips: int) -> dict[str, list[float]]:
-    """How long each trip took; turns are short, so that other load on the machine hits all alike."""
+    """Return the durations; turns are short, so that other load on the machine affects all alike."""
     for block in blocks.values():
         await block(TRIPS_BEFORE)
     taken: dict[str, list[float]] = {name: [] for name in blocks}

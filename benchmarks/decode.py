@@ -32,7 +32,8 @@ RECORDINGS = {
     if (folder / f"{name}.tlog").exists()
 }
 """Flights by name: whole ones where they are at hand, and the short ones that the project carries. What PX4 sends is
-signed, with a key or without."""
+signed, with a key or without.
+"""
 _HEADER = Struct("<BBBxBHI").unpack_from
 _CHECKSUM = Struct("<H").unpack_from
 CHUNK = 1024
@@ -40,12 +41,13 @@ PART = 1000
 
 
 def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list[dict[str, Any]]:
-    """What nobody wants (``decode_skip``), and what is delivered as its typed message (``decode_typed``).
+    """Measure frames without a subscriber (``decode_skip``) and frames delivered as typed messages
+    (``decode_typed``).
 
-    These are fed frame by frame, as the recording has them and UDP brings them; ``…_stream`` are fed the same bytes in
-    pieces of 1 kB, as TCP and serial ports bring them. The first recording has the plain names, the others have their
-    own at the end. ``decode_floor`` is ``decode_skip`` beside the least that pure Python can do: take the header apart,
-    compare the checksum, nothing else; ``decode_floor_typed`` the same with the payload unpacked.
+    These are fed frame by frame, as recorded and as UDP delivers them; ``…_stream`` are fed the same bytes in pieces
+    of 1 kB, as TCP and serial ports deliver them. The first recording has the plain names, the others have their own
+    suffix. ``decode_floor`` compares ``decode_skip`` with the minimum in pure Python: parse the header and compare
+    the checksum; ``decode_floor_typed`` the same with the payload unpacked.
     """
     table: list[dict[str, Any]] = []
     for which, name in enumerate(recordings):
@@ -53,9 +55,7 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
         parts = [frames[begin : begin + PART] for begin in range(0, len(frames), PART)]
         end = f"_{name}" if which else ""
         pieces = [(len(part), part) for part in parts]
-        skip, typed, least, unpacked, peer = _rates(
-            (_skip, _typed, _least, _unpacked, _pymavlink), pieces, rounds
-        )
+        skip, typed, least, unpacked, peer = _rates((_skip, _typed, _least, _unpacked, _pymavlink), pieces, rounds)
         table.append(_row("decode_skip" + end, skip, peer, 10.0))
         table.append(_row("decode_typed" + end, typed, peer, 6.0))
         if which:
@@ -70,7 +70,7 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
 
 
 def frames_of(path: Path) -> list[bytes]:
-    """The frames of a recording whose messages both sides know: of others nobody can check anything."""
+    """Return the frames of a recording whose messages both sides know; others cannot be compared."""
     frames = [raw for _, raw in read_tlog(path)]
     ids = [int.from_bytes(raw[7:10], "little") if raw[0] == MAGIC_V2 else raw[5] for raw in frames]
     known = STANDARD.rows.keys() & ardupilotmega.mavlink_map.keys()
@@ -160,7 +160,7 @@ def _unpacked(chunks: list[bytes]) -> int:
 
 @cache
 def _payload(message_id: int) -> tuple[Callable[[bytes, int], tuple[Any, ...]], int]:
-    """What unpacks all fields of a message, and how long header and payload must be for it."""
+    """Return the unpacker of all fields of a message, and the required lengths of header and payload."""
     fields = ardupilotmega.mavlink_map[message_id].unpacker
     return fields.unpack_from, 9 + fields.size
 

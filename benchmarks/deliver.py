@@ -2,11 +2,11 @@
 
     python benchmarks/deliver.py
 
-``deliver_telemetry``: a vehicle's telemetry is attached. Datagram by datagram: framed, checked, decoded where a state
-cell wants the message, and kept in the cells with units converted. ``deliver_async_for``: a program subscribes to every
-kind of message and reads them by ``async for``, in pieces of 1 kB, as TCP and serial ports bring them and as busy UDP
-ports do; after each piece the loop takes a turn. pymavlink's counterpart is what ``recv_match`` does with bytes it has
-read: ``parse_buffer`` and ``post_message``, which keeps the latest message of each type.
+``deliver_telemetry``: a vehicle's telemetry is attached. Each datagram is framed, checked, decoded where a state cell
+needs the message, and stored in the cells with units converted. ``deliver_async_for``: a program subscribes to all
+messages and reads them by ``async for``, in pieces of 1 kB, as TCP, serial ports and busy UDP ports deliver them; the
+loop runs once after each piece. pymavlink's counterpart is the work of ``recv_match`` on received bytes:
+``parse_buffer`` and ``post_message``, which keeps the latest message of each type.
 """
 
 from __future__ import annotations
@@ -43,9 +43,7 @@ def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
     telemetry, peer = anyio.run(_in_turns, _telemetry, frames, frames, rounds)
     read, peer_of_read = anyio.run(_in_turns, _async_for, frames, pieces, rounds)
     return [
-        row(
-            "deliver_telemetry", telemetry, peer, peer_name, unit="frames/s", ratio=telemetry / peer, aim=2.0
-        ),
+        row("deliver_telemetry", telemetry, peer, peer_name, unit="frames/s", ratio=telemetry / peer, aim=2.0),
         row(
             "deliver_async_for",
             read,
@@ -103,7 +101,7 @@ async def _telemetry(frames: list[bytes], pieces: list[bytes]) -> float:
     async with aerokit.open_connection(link) as connection:
         for raw in frames:
             connection.bytes_received(raw, None)
-            if AUTOPILOT in connection.heard:
+            if AUTOPILOT in connection.heartbeats:
                 break
         async with aerokit.connect(connection, rates={}) as vehicle:
             rate = _rate(len(frames), pieces, lambda raw: connection.bytes_received(raw, None))
@@ -131,7 +129,7 @@ def _rate(count: int, pieces: list[bytes], feed: Callable[[bytes], None]) -> flo
 
 
 class FedLink(BaseLink):
-    """A link whose bytes the benchmark brings; what is sent is thrown away."""
+    """A link fed with bytes by the benchmark; sent bytes are discarded."""
 
     async def _connect(self) -> None:
         pass
@@ -140,7 +138,7 @@ class FedLink(BaseLink):
         pass
 
     def write(self, data: bytes, peer: object = None) -> None:
-        """Nobody is there."""
+        """Discard the bytes."""
 
 
 if __name__ == "__main__":

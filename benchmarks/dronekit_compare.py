@@ -1,12 +1,12 @@
-"""DroneKit programs on aerokit beside DroneKit 2.9.2 itself and dronekit2 3.0: one script, one vehicle, in turns.
+"""DroneKit programs on aerokit, DroneKit 2.9.2 and dronekit2 3.0: one script, one vehicle, in turns.
 
     python benchmarks/dronekit_compare.py                    # everything, half an hour; writes bench-dronekit.json
     python benchmarks/dronekit_compare.py cpu latency        # these parts only: cpu, reads, latency, connect, import
-    python benchmarks/dronekit_compare.py --quick            # a moment of each: does it run? The figures mean little
+    python benchmarks/dronekit_compare.py --quick            # a short check that it runs; the figures mean little
 
 Each measurement has a client process (``client_classic.py``) and a vehicle process (``dronekit_vehicle.py``) of its
-own. AEROKIT_DRONEKIT_PYTHON and AEROKIT_DRONEKIT2_PYTHON name the interpreters that have the peers, which cannot be
-installed together; a peer that is not installed is left out.
+own. AEROKIT_DRONEKIT_PYTHON and AEROKIT_DRONEKIT2_PYTHON name the interpreters with the peers, which cannot be
+installed together; a peer that is not installed is omitted.
 """
 
 from __future__ import annotations
@@ -33,14 +33,12 @@ PARTS: dict[str, Callable[[Sequence[Library], Plan], list[Row]]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what was asked for, print it, write it."""
+    """Measure the requested parts, print and write the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--only", default="", metavar="TEXT", help="only cases with this in their name")
     parser.add_argument("--rounds", type=int, default=5, help="so many turns of each")
-    parser.add_argument(
-        "--peer", action="append", metavar="NAME", help="dronekit, dronekit2; both by default"
-    )
+    parser.add_argument("--peer", action="append", metavar="NAME", help="dronekit, dronekit2; both by default")
     parser.add_argument("--quick", action="store_true", help="a moment of each: does it run?")
     parser.add_argument("--output", type=Path, default=Path("bench-dronekit.json"))
     options = parser.parse_args(arguments)

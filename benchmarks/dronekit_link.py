@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 __all__ = ["Link", "make_link"]
 
 HOST = "127.0.0.1"
-MOST_UNSENT = 65536
+MAX_UNSENT = 65536
 
 
 class Link:
@@ -35,16 +35,16 @@ class Link:
 
     @property
     def is_writable(self) -> bool:
-        """Whether more may be sent at once."""
+        """Return True if more can be sent at once."""
         return not self.wants_to_write
 
     @property
     def wants_to_write(self) -> bool:
-        """Whether something waits until the other side takes it."""
+        """Return True while bytes wait for the other side."""
         return False
 
     def wait_for_peer(self) -> None:
-        """Until there is somebody to send to."""
+        """Wait until there is a peer to send to."""
 
     def send(self, data: bytes) -> None:
         """Send it, when the link lets it through."""
@@ -56,7 +56,7 @@ class Link:
         self._leaving.append((self._free_at + self._delay, data))
 
     def release_due(self) -> float:
-        """Let out what has been under way for long enough; when the next is due."""
+        """Send delayed bytes that are due; return when the next ones are."""
         now = time.monotonic()
         while self._leaving and self._leaving[0][0] <= now:
             self._write(self._leaving.popleft()[1])
@@ -66,7 +66,7 @@ class Link:
         )
 
     def read(self) -> None:
-        """Take what has come; it is received after its delay."""
+        """Read what has arrived; it counts as received after its delay."""
         data = self._read()
         for message in self._parser.parse_buffer(data) or ():
             self._coming.append((time.monotonic() + self._delay, message))
@@ -94,7 +94,7 @@ class UdpLink(Link):
         self._peer = (HOST, port)
 
     def _write(self, data: bytes) -> None:
-        with contextlib.suppress(ConnectionError):  # nobody listens yet
+        with contextlib.suppress(ConnectionError):  # There is no peer yet.
             self.socket.sendto(data, self._peer)
 
     def _read(self) -> bytes:
@@ -132,7 +132,7 @@ class TcpLink(Link):
         return super().release_due()
 
     def _write(self, data: bytes) -> None:
-        if len(self._unsent) < MOST_UNSENT:
+        if len(self._unsent) < MAX_UNSENT:
             self._unsent += data
         try:
             self._unsent = self._unsent[self.socket.send(self._unsent) :]

@@ -1,4 +1,4 @@
-"""When a vehicle sends what it streams: as ArduCopter does, or evenly."""
+"""Timing of a vehicle's streams: like ArduCopter, or evenly."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["bursts", "wait_until"]
 
 BURST = 10
 """ArduCopter 4.7 sends all that is due in bursts of this size over UDP, a message a datagram,"""
-BURSTS_APART_S = 0.0055
+BURST_INTERVAL_S = 0.0055
 """so far from one to the next,"""
 SPACING_US = (31, 12, 82, 15, 40, 10, 69, 22, 133, 16, 37, 9, 60, 14, 100, 25)
 """with so much from one message to the next in a burst (observed: median 31 to 40, a tenth above 130)."""
@@ -19,14 +19,14 @@ ROUND = 25
 
 
 def bursts(rate: float, *, evenly: bool) -> Iterator[tuple[float, list[float]]]:
-    """Seconds from one burst's beginning to the next one's, and when in the burst each of its messages is sent."""
+    """Return the seconds between bursts, and the time of each message in a burst."""
     if evenly:
         while True:
             yield 1 / rate, [0.0]
     period = ROUND / rate
     spacing = cycle(SPACING_US)
     sizes = [BURST] * (ROUND // BURST) + [ROUND % BURST]
-    apart = min(BURSTS_APART_S, period / len(sizes))
+    apart = min(BURST_INTERVAL_S, period / len(sizes))
     while True:
         for number, size in enumerate(sizes):
             offset, offsets = 0.0, []
@@ -38,6 +38,6 @@ def bursts(rate: float, *, evenly: bool) -> Iterator[tuple[float, list[float]]]:
 
 
 def wait_until(when: float) -> None:
-    """Of the clock ``time.monotonic``; too short to sleep."""
+    """Wait until this time of ``time.monotonic``; too short to sleep."""
     while time.monotonic() < when:
         pass

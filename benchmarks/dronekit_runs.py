@@ -1,4 +1,4 @@
-"""One run: a vehicle process, a client process with one of the libraries, and what the client found."""
+"""One run: a vehicle process, a client process with one of the libraries, and the client's result."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIMIT_S = 180.0
 
 @dataclass(frozen=True)
 class Library:
-    """Who is measured: its name, the module to import, the interpreter that has it."""
+    """A library to measure: its name, the module to import, its interpreter."""
 
     name: str
     title: str
@@ -32,24 +32,22 @@ class Library:
 
 LIBRARIES = (
     Library("aerokit", "aerokit", "aerokit.dronekit", sys.executable),
-    Library(
-        "dronekit", "DroneKit 2.9.2", "dronekit", os.environ.get("AEROKIT_DRONEKIT_PYTHON", sys.executable)
-    ),
-    Library(
-        "dronekit2", "dronekit2 3.0", "dronekit", os.environ.get("AEROKIT_DRONEKIT2_PYTHON", sys.executable)
-    ),
+    Library("dronekit", "DroneKit 2.9.2", "dronekit", os.environ.get("AEROKIT_DRONEKIT_PYTHON", sys.executable)),
+    Library("dronekit2", "dronekit2 3.0", "dronekit", os.environ.get("AEROKIT_DRONEKIT2_PYTHON", sys.executable)),
 )
 
 
 def compile_aerokit() -> None:
-    """As the installer of the peers has done with them: an edited source would be compiled in what is measured."""
+    """Compile aerokit as the peers' installer has compiled them; otherwise an edited source is compiled in the
+    measurement.
+    """
     import aerokit
 
     compileall.compile_dir(Path(aerokit.__file__).parent, quiet=1)
 
 
 def installed(library: Library) -> bool:
-    """Whether its interpreter has it: both peers are imported by the same name."""
+    """Return True if its interpreter has it: both peers have the same import name."""
     if library.name == "aerokit":
         return True
     code = f"import importlib.metadata; importlib.metadata.version({library.name!r})"
@@ -63,9 +61,9 @@ def run(
     *,
     rate: str | None = None,
 ) -> dict[str, Any]:
-    """Do a task with a library, against such a vehicle; ``rate`` is what it streams once the client is connected.
+    """Run a task with a library, against such a vehicle; ``rate`` is its message rate once the client is connected.
 
-    Returns what the client found, and ``stamps`` of the vehicle when it was to stream. RuntimeError when it failed.
+    Returns the client's result, and ``stamps`` of the vehicle if it streamed. Raises RuntimeError if it failed.
     """
     if vehicle is None:
         with _client(library, task) as client:
@@ -81,10 +79,8 @@ def run(
         return found
 
 
-def _found(
-    client: subprocess.Popen[str], server: subprocess.Popen[str] | None, rate: str | None
-) -> dict[str, Any]:
-    """What the client says at its end; the vehicle is told where it stands."""
+def _found(client: subprocess.Popen[str], server: subprocess.Popen[str] | None, rate: str | None) -> dict[str, Any]:
+    """Return the client's result; inform the vehicle about its progress."""
     while True:
         line = _line(client).strip()
         if line == "connecting" and server is not None:
@@ -115,9 +111,7 @@ def _vehicle(options: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
 @contextmanager
 def _process(command: list[str]) -> Iterator[subprocess.Popen[str]]:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    )
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
     try:
         yield process
     finally:

@@ -1,4 +1,4 @@
-"""What the scripted vehicle answers: parameters, files by MAVFTP, requests for streams and messages."""
+"""Services of the scripted vehicle: parameters, files by MAVFTP, requests for streams and messages."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Services:
     # --------------------------------------------------------------------------- parameters
 
     def _on_list(self, request: Any) -> None:
-        """A list that is asked for again begins anew."""
+        """Restart the list if it is requested again."""
         self._list += 1
         self._send_parameters(time.monotonic(), self._list, 0.0)
 
@@ -140,7 +140,7 @@ class Services:
             reply.send(NAK, 0, bytes([NOT_FOUND]))
             return
         self._file = _packed_parameters(self._parameters, with_defaults="withdefaults=1" in query)
-        reply.send(ACK, 0, struct.pack("<I", 1 << 20))  # ArduPilot does not know the size beforehand
+        reply.send(ACK, 0, struct.pack("<I", 1 << 20))  # ArduPilot does not know the size in advance.
 
     def _send_burst(self, when: float, number: int, reply: _Reply, offset: int, size: int) -> None:
         if number != self._burst:
@@ -164,9 +164,7 @@ class Services:
 class _Reply:
     """An answer to one FILE_TRANSFER_PROTOCOL."""
 
-    def __init__(
-        self, vehicle: Vehicle, request: Any, sequence: int, session: int, opcode: int, version: int
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, request: Any, sequence: int, session: int, opcode: int, version: int) -> None:
         self._vehicle, self._session, self._request_opcode = vehicle, session, opcode
         self._to = request.get_srcSystem(), request.get_srcComponent()
         self.sequence = sequence

@@ -1,4 +1,4 @@
-"""What is measured, case by case, and the rows that come of it."""
+"""The measured cases, and the rows of their results."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from table import Row
 
 __all__ = ["Plan", "connect_rows", "cpu_rows", "import_rows", "latency_rows", "read_rows"]
 
-LEAST_NS = 1000.0
+MIN_NS = 1000.0
 """An attribute is to be read in less."""
+# A vehicle sends heartbeats each second, so the time to connect depends on the phase.
 CONNECT_PHASES_S = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""A vehicle sends heartbeats each second, and nobody knows when he connects to it."""
 SLOW_LINK = 5760.0
 """Bytes a second of a radio of 57,600 baud."""
 RATES = ("100", "500", "2000", "max")
@@ -35,24 +35,24 @@ ATTRIBUTE_OF = {
     "SYS_STATUS": "battery",
 }
 
+# Name of the library → measured values, turn by turn.
 Values = dict[str, list[float]]
-"""Name of the library → what was measured, turn by turn."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How much of it."""
+    """Extent of the measurement."""
 
     rounds: int
     quick: bool = False
     only: str = ""
 
     def wants(self, case: str) -> bool:
-        """Whether a case was asked for."""
+        """Return True if a case was requested."""
         return self.only in case
 
     def window(self, seconds: float) -> float:
-        """How long to look."""
+        """Return the duration of a measurement."""
         return QUICK_S if self.quick else seconds
 
 
@@ -62,15 +62,10 @@ class Plan:
 def cpu_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
     """Microseconds of processor time a message, which are milliseconds for 1,000: a quarter is aimed at."""
     cases = [
-        ("usual", transport, version, rate)
-        for transport in ("udp", "tcp")
-        for version in (2, 1)
-        for rate in RATES
+        ("usual", transport, version, rate) for transport in ("udp", "tcp") for version in (2, 1) for rate in RATES
     ]
     cases += [("usual", "udp", 2, "500 evenly")]
-    cases += [
-        (listeners, "udp", 2, rate) for listeners in ("none", "every_message") for rate in ("500", "max")
-    ]
+    cases += [(listeners, "udp", 2, rate) for listeners in ("none", "every_message") for rate in ("500", "max")]
     rows: list[Row] = []
     for listeners, transport, version, rate in cases[::9] if plan.quick else cases:
         case = f"dronekit_cpu_{listeners}_{transport}_v{version}_{rate.replace(' ', '_')}"
@@ -84,9 +79,7 @@ def cpu_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
             "window_s": plan.window(WINDOW_S[rate.split()[0]]),
         }
 
-        def measure(
-            library: Library, _: int, vehicle: Any = vehicle, task: Any = task, rate: str = rate
-        ) -> float:
+        def measure(library: Library, _: int, vehicle: Any = vehicle, task: Any = task, rate: str = rate) -> float:
             return _microseconds(run(library, vehicle, task, rate=rate))
 
         values = _in_turns(libraries, plan, case, measure)
@@ -111,9 +104,7 @@ def read_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
     taken: dict[str, Values] = {name: {each.name: [] for each in libraries} for name in names}
 
     def read(library: Library, _: int) -> float:
-        found = run(
-            library, {"rate": 50.0}, {"task": "reads", "names": names, "settle_s": plan.window(SETTLE_S)}
-        )
+        found = run(library, {"rate": 50.0}, {"task": "reads", "names": names, "settle_s": plan.window(SETTLE_S)})
         for name, nanoseconds in found["ns"].items():
             taken[name][library.name].append(nanoseconds)
         return float(max(found["ns"].values()))
@@ -122,7 +113,7 @@ def read_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
     rows: list[Row] = []
     for name in names:
         for row in _rows(libraries, f"dronekit_read_{name}", taken[name], unit="ns", aim=1.0):
-            rows.append({**row, "aim": round(row["peer"] / LEAST_NS, 3)})
+            rows.append({**row, "aim": round(row["peer"] / MIN_NS, 3)})
     return rows
 
 
@@ -162,9 +153,7 @@ def latency_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
 def _delays(found: dict[str, Any]) -> list[float]:
     sent = {(ATTRIBUTE_OF[kind], number): at for kind, number, at in found["stamps"] if kind in ATTRIBUTE_OF}
-    delays = [
-        (at - sent[name, number]) / 1000 for at, name, number in found["noted"] if (name, number) in sent
-    ]
+    delays = [(at - sent[name, number]) / 1000 for at, name, number in found["noted"] if (name, number) in sent]
     if not delays:
         raise RuntimeError("no listener was called")
     return delays
@@ -231,9 +220,7 @@ def import_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 # -------------------------------------------------------------------------------------------- turns
 
 
-def _in_turns(
-    libraries: Sequence[Library], plan: Plan, case: str, measure: Callable[[Library, int], float]
-) -> Values:
+def _in_turns(libraries: Sequence[Library], plan: Plan, case: str, measure: Callable[[Library, int], float]) -> Values:
     values: Values = {each.name: [] for each in libraries}
     order = list(libraries)
     for turn in range(plan.rounds):

@@ -1,9 +1,9 @@
-"""What a vehicle of ``dronekit_vehicle.py`` says: the messages of ArduCopter's streams in their proportions.
+"""Messages of ``dronekit_vehicle.py``: those of ArduCopter's streams in their proportions.
 
-Asked for all streams at one rate, ArduCopter 4.7 sends each of these messages at that rate, in this order, and a
-HEARTBEAT each second, which is each fourth round at the usual 4 Hz (in a recorded flight: 24 kinds, 1,206 of each, 127
-heartbeats at 10 Hz). Fields have numbers in them, so that MAVLink 2 cuts nothing off. Every round has a number, which
-attribute listeners can read from attitude, position, GPS and battery.
+With all streams requested at one rate, ArduCopter 4.7 sends each of these messages at that rate, in this order, and a
+HEARTBEAT each second, which is each fourth round at the usual 4 Hz (in a recorded flight: 24 kinds, 1,206 of each,
+127 heartbeats at 10 Hz). Fields have non-zero numbers, so that MAVLink 2 truncates nothing. Every round has a number,
+which attribute listeners can read from attitude, position, GPS and battery.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 __all__ = ["ROUNDS", "Numbering", "heartbeat", "keys_of", "packed", "rounds"]
 
+# The round number wraps after this many.
 ROUNDS = 1024
-"""After so many it begins anew."""
 HEARTBEAT_EVERY = 4
 KINDS = (
     "SYS_STATUS", "POWER_STATUS", "MEMINFO", "MISSION_CURRENT", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT",
@@ -30,8 +30,8 @@ ARMED_IN_GUIDED = {
     "type": 2, "autopilot": 3, "base_mode": 217, "custom_mode": 4, "system_status": 4, "mavlink_version": 3,
 }  # fmt: skip
 LATITUDE, LONGITUDE = -353632610, 1491652299
+# Step of the roll angle per round; exact in 32-bit floats.
 ANGLE_STEP = 2.0**-12
-"""Of the roll angle from one round to the next: no 32-bit float rounds it."""
 FULL_MV, CURRENT_CA, LEVEL = 10000, 1500, 87
 
 Frame = tuple[bytes, str, int]
@@ -50,7 +50,7 @@ def rounds(version: int) -> list[Frame]:
 
 
 def keys_of(name: str, value: Any) -> int | None:
-    """The number of the round that an attribute's value came in; None when it does not tell."""
+    """Return the round number encoded in an attribute's value; None if it has none."""
     number: float
     if name == "attitude":
         number = value.roll / ANGLE_STEP
@@ -118,7 +118,7 @@ def _anything(kind: str, length: int) -> Any:
 
 
 def _values(kind: str, number: int) -> dict[str, Any]:
-    """What a round has of its own: a flight in a circle, and its number where listeners see it."""
+    """Return the values of a round: a flight in a circle, and the round number where listeners read it."""
     turn = math.tau * number / ROUNDS
     values: dict[str, dict[str, Any]] = {
         "ATTITUDE": {"roll": number * ANGLE_STEP, "pitch": math.sin(turn) / 4, "yaw": turn - math.pi},

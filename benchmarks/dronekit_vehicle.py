@@ -1,11 +1,12 @@
-"""A scripted vehicle in a process of its own, which all three libraries of ``dronekit_compare.py`` talk to.
+"""A scripted vehicle in a process of its own, for all three libraries of ``dronekit_compare.py``.
 
     python benchmarks/dronekit_vehicle.py '{"transport": "udp", "port": 14550, "version": 2}'
 
-It is nobody's: frames are packed and read by pymavlink, and sent from a blocking loop. It says ``ready``, and begins
-when a client has connected, over UDP when it gets a line ``go``. It takes more lines: ``rate 500`` (messages a second;
-``rate 500 evenly``: not in bursts; ``rate max``: as fast as it can) and ``stamps``, answered by a line of JSON: name
-of the message, number of its round, CLOCK_MONOTONIC in ns when it was sent. It ends when it is terminated.
+It belongs to none of them: frames are packed and parsed by pymavlink, and sent from a blocking loop. It prints
+``ready``, and starts when a client has connected, over UDP when it receives a line ``go``. Further lines: ``rate
+500`` (messages a second; ``rate 500 evenly``: not in bursts; ``rate max``: as fast as possible) and ``stamps``,
+answered by a line of JSON: name of the message, number of its round, CLOCK_MONOTONIC in ns when it was sent. It ends
+when it is terminated.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ __all__ = ["Options", "Vehicle"]
 STREAM_KINDS_AT_ONCE = 25
 PIECE = 1400
 """Bytes in one go where a stream of bytes is sent as fast as possible."""
+# Number of datagrams sent in a row before other work.
 AT_ONCE = 16
-"""So many datagrams are sent in a row before anything else is looked at."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What it is like."""
+    """Properties of the vehicle."""
 
     transport: str = "udp"
     port: int = 14550
     version: int = 2
     rate: float = 0.0
-    """Messages a second that it streams by itself; 0: what it is asked for by REQUEST_DATA_STREAM."""
+    """Messages a second that it streams by itself; 0: as requested by REQUEST_DATA_STREAM."""
     parameters: int = 20
     list_rate: float = 1400.0
     """Parameters a second."""
@@ -76,10 +77,10 @@ class Vehicle:
         self._lines = open(0, "rb", buffering=0)  # noqa: SIM115 - select sees nothing that a buffer has
 
     def run(self) -> None:
-        """Live until the process is ended; a line on standard output says that it has begun."""
+        """Run until the process is ended; prints a line when it has started."""
         print("ready", flush=True)
         if not self.link.is_stream:
-            self._lines.readline()  # "go": somebody listens now
+            self._lines.readline()  # "go": a client listens now.
         self.link.wait_for_peer()
         self.at(time.monotonic() + self.options.heartbeat_after, self._send_heartbeats)
         self.set_rate(self._rate)
@@ -100,12 +101,12 @@ class Vehicle:
         self.link.send(self._numbering.numbered(frame))
 
     def stream(self, hertz: float) -> None:
-        """Send every message of the streams so many times a second."""
+        """Send every message of the streams this many times a second."""
         if self.options.rate == 0:
             self.set_rate(hertz * STREAM_KINDS_AT_ONCE)
 
     def set_rate(self, rate: float, *, evenly: bool = False) -> None:
-        """Stream so many messages a second from now on, in ArduCopter's bursts or one by one."""
+        """Stream this many messages a second from now on, in ArduCopter's bursts or evenly."""
         self._rate = rate
         self._streams += 1
         if 0 < rate < math.inf:
@@ -126,14 +127,14 @@ class Vehicle:
         raw, kind, number = self._frames[self._position]
         self._position = (self._position + 1) % len(self._frames)
         if kind == "HEARTBEAT" and self.options.rate == 0:
-            return  # they come each second, whatever the streams
+            return  # They are sent each second, whatever the streams.
         numbered = self._numbering.numbered(raw)
         if self._rate < math.inf:
             self.stamps.append((kind, number, time.monotonic_ns()))
         self.link.send(numbered)
 
     def _send_much(self) -> None:
-        """As much as goes out now."""
+        """Send as much as possible now."""
         if not self.link.is_stream:
             for _ in range(AT_ONCE):
                 self._send_next()
@@ -155,7 +156,7 @@ class Vehicle:
             heapq.heappop(self._due)[2]()
 
     def _wait(self) -> None:
-        """Until something is due or comes in; not at all while as much as possible is sent."""
+        """Wait until something is due or arrives; not at all at the maximum rate."""
         until = self.link.release_due()
         if self._due:
             until = min(until, self._due[0][0])

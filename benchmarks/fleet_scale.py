@@ -107,7 +107,7 @@ async def _look(ports: Sequence[int], on_each: int, seconds: float) -> dict[str,
     addresses = {f"network{port - FIRST_PORT}": f"udpin:127.0.0.1:{port}" for port in ports}
     started = time.perf_counter()
     async with aerokit.fleet(
-        addresses, count=on_each * len(ports), timeout=60, rates=RATES, min_distance_m=0.5, too_close="tell"
+        addresses, count=on_each * len(ports), timeout=60, rates=RATES, min_distance_m=0.5, on_too_close="report"
     ) as fleet:
         opened_s = time.perf_counter() - started
         await asyncio.sleep(WARM_UP_S)
@@ -134,9 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--networks", type=int, default=10, help="each with a UDP port of its own (10)")
     parser.add_argument("--seconds", type=float, default=30.0, help="how long is looked (30)")
     parser.add_argument("--serve", type=int, nargs="+", metavar="PORT", help=argparse.SUPPRESS)
-    parser.add_argument(
-        "--output", type=Path, default=Path("bench-fleet.json"), help="default: bench-fleet.json"
-    )
+    parser.add_argument("--output", type=Path, default=Path("bench-fleet.json"), help="default: bench-fleet.json")
     return parser
 
 

@@ -1,18 +1,17 @@
-"""What a frame costs on its way through a hub, beside MAVProxy's ``--out``; writes it to ``bench-hub.json``.
+"""Cost of a frame through a hub, compared with MAVProxy's ``--out``; writes ``bench-hub.json``.
 
     python benchmarks/hub.py                          # everything, some minutes
-    python benchmarks/hub.py out_4                    # these only
-    python benchmarks/hub.py --quick                  # few frames: does it run? The figures mean little
+    python benchmarks/hub.py out_4 # these only
+    python benchmarks/hub.py --quick                  # a short check that it runs; the figures mean little
 
 A vehicle sends over UDP on 127.0.0.1 to a process of its own, ``aerokit hub udpin:… udpout:… …`` or ``mavproxy.py
---master udpin:… --out udpout:… …``, which passes every frame on to 1, 4 or 16 others. ``out_N``: frames that came in,
-and went to all of them, in a second of its processor time, while a recorded ArduCopter is sent at 600 frames a second,
-in pieces of ten; both take turns, neither may lose any, and MAVProxy has no modules and logs to nowhere.
-``latency_…``: time from sending to receiving at the first of four, of frames that come one by one, 100 a second: median
-and 99th percentile.
+--master udpin:… --out udpout:… …``, which passes every frame on to 1, 4 or 16 others. ``out_N``: frames received, and
+passed to all of them, per second of its processor time, while a recorded ArduCopter is sent at 600 frames a second,
+in pieces of ten; both take turns, neither may lose any, and MAVProxy has no modules and no log. ``latency_…``: time
+from sending to receiving at the first of four, of single frames, 100 a second: median and 99th percentile.
 
-MAVProxy is that of ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else of this one; without it there are no rows. Where
-``$AEROKIT_MAVLINK_ROUTERD`` names a mavlink-routerd, which is C++, there is another row for it, without an aim.
+MAVProxy is taken from ``$AEROKIT_MAVPROXY_PYTHON``'s environment, else from this one; without it there are no rows.
+If ``$AEROKIT_MAVLINK_ROUTERD`` names a mavlink-routerd (C++), there is another row for it, without a target.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from pathlib import Path
 import table
 from table import Row, row
 
-from aerokit.hub.targets import Targets
+from aerokit.hub.message_rules import TargetFields
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
@@ -54,7 +53,7 @@ HEARTBEAT = FrameEncoder(1, 1).encode(Heartbeat(2, 3, 81, 0, 3))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what was asked for, print it, write it."""
+    """Measure the requested parts, print and write the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
     parser.add_argument("--quick", action="store_true", help="few frames: does it run?")
@@ -95,14 +94,12 @@ def _throughput(count: int, quick: bool) -> list[Row]:
     own, rows = medians.pop("aerokit"), []
     for name, peer in medians.items():
         what, text, aim = _PEERS[name]
-        rows.append(
-            row(f"out_{count}{what}", own, peer, text, unit="frames/CPU-s", ratio=own / peer, aim=aim)
-        )
+        rows.append(row(f"out_{count}{what}", own, peer, text, unit="frames/CPU-s", ratio=own / peer, aim=aim))
     return rows
 
 
+# Suffix of a row's name, name of the peer, and target.
 _PEERS = {"mavproxy": ("", "MAVProxy --out", 10.0), "routerd": ("_routerd", "mavlink-router", 0.0)}
-"""What is put behind a row's name, what the peer is called, and the aim."""
 
 
 def _present(*, with_routerd: bool = True) -> list[str]:
@@ -125,10 +122,8 @@ def _frames_per_second(
     return frames / used
 
 
-def _send(
-    frames: Sequence[bytes], sender: socket.socket, receivers: list[socket.socket], counts: list[int]
-) -> None:
-    """Send frames in pieces, and count what comes, until all have come or nothing comes any more."""
+def _send(frames: Sequence[bytes], sender: socket.socket, receivers: list[socket.socket], counts: list[int]) -> None:
+    """Send frames in pieces, and count those received, until all or no more arrive."""
     began = time.perf_counter()
     for sent in range(0, len(frames), PIECE):
         for raw in frames[sent : sent + PIECE]:
@@ -144,11 +139,11 @@ def _send(
 
 
 def _recorded(count: int) -> list[bytes]:
-    """Frames of a recorded copter that are for everybody, numbered anew as often as they are flown through."""
+    """Yield the broadcast frames of a recorded copter, renumbered each time the flight is repeated."""
     path = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
-    targets = Targets(STANDARD)
+    targets = TargetFields(STANDARD)
     frames = [Frame.parse(raw) for _, raw in read_tlog(path) if raw[0] == MAGIC_V2 and raw[5:7] == b"\1\1"]
-    bodies = [each.body for each in frames if targets.of(each) == (0, 0) and not each.body[1]]
+    bodies = [each.body for each in frames if targets.target_of(each) == (0, 0) and not each.body[1]]
     numbered = []
     for number in range(count):
         body = bodies[number % len(bodies)]
@@ -209,9 +204,7 @@ def _delays(sender: socket.socket, receiver: socket.socket, count: int) -> list[
 
 
 @contextmanager
-def _hub(
-    name: str, count: int
-) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket, list[socket.socket]]]:
+def _hub(name: str, count: int) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket, list[socket.socket]]]:
     """A process that passes frames on, a socket to send to it, and those it sends to."""
     receivers = [_bound() for _ in range(count)]
     with _bound() as probe:

@@ -2,8 +2,8 @@
 
     python benchmarks/import_time.py
 
-What is measured is the time inside the process, in milliseconds, without the start of the interpreter; byte code is
-on disk, as it is for everyone from the second run on.
+Measures the time inside the process, in milliseconds, without the start of the interpreter; byte code is on disk, as
+on every machine from the second run on.
 """
 
 from __future__ import annotations

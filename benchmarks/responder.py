@@ -1,10 +1,10 @@
-"""A vehicle that does nothing but answer commands, in a process of its own, so that it is not what is measured.
+"""A vehicle that only answers commands, in a process of its own, so that it is not measured.
 
     python benchmarks/responder.py PORT ...
 
 It sends a heartbeat to each of these UDP ports of this machine four times a second, and answers each COMMAND_LONG
-with an ACCEPTED COMMAND_ACK whose bytes were made beforehand. Asked for a message that connecting programs want to
-know (MAV_CMD_REQUEST_MESSAGE), it sends that one too. It ends when it is terminated.
+with an ACCEPTED COMMAND_ACK prepared in advance. On MAV_CMD_REQUEST_MESSAGE for a message that connecting programs
+need, it sends that one as well. It ends when it is terminated.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from aerokit.mavlink import FrameEncoder, Message, messages
 
 MAGIC_V2 = 0xFD
 COMMAND_LONG, REQUEST_MESSAGE = 76, 512
-HEARTBEAT_PERIOD_S = 0.25
+HEARTBEAT_INTERVAL_S = 0.25
 SYSTEM_ID, COMPONENT_ID = 1, 1
 
 Address = tuple[str, int]
 
-TOLD_ON_REQUEST: dict[int, Callable[[], Message]] = {
+SENT_ON_REQUEST: dict[int, Callable[[], Message]] = {
     148: lambda: messages.AutopilotVersion(0, 0x04070000, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 1),
     242: lambda: messages.HomePosition(0, 0, 0, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0),
     49: lambda: messages.GpsGlobalOrigin(0, 0, 0),
@@ -54,20 +54,20 @@ class Responder:
     def __init__(self, ports: list[int]) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
-        self._socket.settimeout(HEARTBEAT_PERIOD_S)
+        self._socket.settimeout(HEARTBEAT_INTERVAL_S)
         self._peers: dict[Address, Peer] = {("127.0.0.1", port): Peer() for port in ports}
 
     def run(self) -> None:
-        """Answer until the process is ended; a line on standard output says that it has begun."""
+        """Answer until the process is ended; prints a line when it has started."""
         print("ready", flush=True)
         due = time.monotonic()
         while True:
             if time.monotonic() >= due:
-                due = time.monotonic() + HEARTBEAT_PERIOD_S
+                due = time.monotonic() + HEARTBEAT_INTERVAL_S
                 self._send_heartbeats()
             try:
                 data, address = self._socket.recvfrom(4096)
-            except (TimeoutError, ConnectionError):  # nobody asks, or nobody listens yet
+            except (TimeoutError, ConnectionError):  # There is no request, or no peer yet.
                 continue
             self._answer(data, address)
 
@@ -89,7 +89,7 @@ class Responder:
             self._tell(int(struct.unpack_from("<f", data, 10)[0]), peer, address)
 
     def _tell(self, message_id: int, peer: Peer, address: Address) -> None:
-        make = TOLD_ON_REQUEST.get(message_id)
+        make = SENT_ON_REQUEST.get(message_id)
         if make is not None:
             self._socket.sendto(peer.next_frame(("told", message_id), make), address)
 

@@ -1,11 +1,11 @@
-"""The whole table, side by side with pymavlink and MAVSDK; writes it to ``bench.json``.
+"""The whole table, side by side with pymavlink and MAVSDK; writes ``bench.json``.
 
     python benchmarks/run.py                          # everything, about a minute
     python benchmarks/run.py import decode_skip       # these rows only
-    python benchmarks/run.py --quick                  # a few rounds: does it run? The figures mean little
+    python benchmarks/run.py --quick                  # a short check that it runs; the figures mean little
 
-Figures are medians of interleaved rounds; only the ratios mean something on another machine. What is missed is said
-loudly, but is no failure: the exit code is 0.
+Figures are medians of interleaved rounds; only the ratios are comparable between machines. A missed target is printed
+prominently, but is no failure: the exit code is 0.
 """
 
 from __future__ import annotations
@@ -34,9 +34,7 @@ MEASURES: dict[tuple[str, ...], Measure] = {
         *("decode_skip_stream", "decode_typed_stream"),
         *(f"decode_{kind}_{name}" for name in DECODE[1:] for kind in ("skip", "typed")),
     ): lambda quick: decode.rows(1, [SHORT, "quad_short"]) if quick else decode.rows(),
-    ("deliver_telemetry", "deliver_async_for"): lambda quick: (
-        deliver.rows(1, SHORT) if quick else deliver.rows()
-    ),
+    ("deliver_telemetry", "deliver_async_for"): lambda quick: deliver.rows(1, SHORT) if quick else deliver.rows(),
     ("command_rtt_pymavlink", "command_rtt_mavsdk"): lambda quick: (
         command_rtt.rows(1, 20) if quick else command_rtt.rows()
     ),
@@ -48,7 +46,7 @@ NAMES = tuple(name for names in MEASURES for name in names)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what was asked for, print it, write it."""
+    """Measure the requested rows, print and write the results."""
     parser = _parser()
     options = parser.parse_args(arguments)
     wanted = options.names or NAMES

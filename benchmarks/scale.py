@@ -1,11 +1,11 @@
-"""How much of a core a hundred simulated vehicles take, and how long a flight takes on virtual time.
+"""Share of a core for a hundred simulated vehicles, and duration of a flight on virtual time.
 
     python benchmarks/scale.py                        # everything, four minutes; writes bench-scale.json
     python benchmarks/scale.py copter_hundred         # these only
-    python benchmarks/scale.py --quick                # few and short: does it run? The figures mean little
+    python benchmarks/scale.py --quick                # a short check that it runs; the figures mean little
 
-``…_hundred``: 100 vehicles that hover and a client of each, all on one link in memory in one process, in real time,
-with what a client watches at 4 Hz; processor time as a share of one core, and how much of it the vehicles took.
+``…_hundred``: 100 hovering vehicles and a client of each, all on one link in memory in one process, in real time,
+with the states that a client observes at 4 Hz; processor time as a share of one core, and the vehicles' part of it.
 ``…_flight``: wall time of ten minutes on virtual time, client included: arming, take-off, a mission, the ground.
 ``clients``: 1 to 500 clients without simulated vehicles, see ``client_scale.py``.
 """
@@ -45,7 +45,7 @@ LEG_M = 100.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what was asked for, print it, write it."""
+    """Measure the requested rows, print and write the results."""
     parser = _parser()
     options = parser.parse_args(arguments)
     wanted = options.names or NAMES
@@ -84,7 +84,7 @@ def _hundred(name: str, kind: str, count: int, rounds: int) -> Row:
 
 
 async def _shares(kind: str, count: int, rounds: int, window_s: float) -> list[tuple[float, float]]:
-    """Of some windows of time: processor time per second, of everything and of the vehicles."""
+    """Return processor time per second, in total and of the vehicles, for several windows of time."""
     near, far = memory_link_pair()
     server = _Watched([_hovering(kind, number) for number in range(1, count + 1)], far)
     async with AsyncExitStack() as stack:
@@ -113,14 +113,14 @@ class _Watched(SimulatorServer):
 
     spent_s = 0.0
 
-    def _run_on(self, now: float) -> None:
+    def _run_ahead(self, now: float) -> None:
         started = time.thread_time()
-        super()._run_on(now)
+        super()._run_ahead(now)
         self.spent_s += time.thread_time() - started
 
-    def hear(self, data: bytes, peer: Any, port: Any) -> None:
+    def on_bytes(self, data: bytes, peer: Any, port: Any) -> None:
         started = time.thread_time()
-        super().hear(data, peer, port)
+        super().on_bytes(data, peer, port)
         self.spent_s += time.thread_time() - started
 
 
@@ -129,7 +129,8 @@ def _hovering(kind: str, system_id: int) -> SimulatedVehicle:
     vehicle = _made(kind, system_id)
     target = (system_id, 1)
     encoder = FrameEncoder(255, 190)
-    height_m = 10.0 if kind == "copter" else 500.0  # PX4 wants it above the sea; home is at 489 m
+    # PX4 takes altitudes above mean sea level; home is at 489 m.
+    height_m = 10.0 if kind == "copter" else 500.0
 
     def order(command: int, *params: float) -> None:
         numbers = (*params, *(0.0,) * (7 - len(params)))
@@ -195,9 +196,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
     parser.add_argument("--quick", action="store_true", help="few and short: does it run?")
-    parser.add_argument(
-        "--output", type=Path, default=Path("bench-scale.json"), help="default: bench-scale.json"
-    )
+    parser.add_argument("--output", type=Path, default=Path("bench-scale.json"), help="default: bench-scale.json")
     return parser
 
 

@@ -24,9 +24,7 @@ def faster_is_better(
     return row(name, own, other, peer_name, unit=unit, ratio=other / own, aim=aim)
 
 
-def row(
-    name: str, aerokit: float, peer: float, peer_name: str, *, unit: str, ratio: float, aim: float
-) -> Row:
+def row(name: str, aerokit: float, peer: float, peer_name: str, *, unit: str, ratio: float, aim: float) -> Row:
     """One row, rounded for people."""
     return {
         "name": name,
@@ -40,7 +38,7 @@ def row(
 
 
 def is_missed(row: Row) -> bool:
-    """Whether the ratio is below what was aimed at."""
+    """Return True if the ratio is below the target."""
     return bool(row["ratio"] < row["aim"])
 
 
@@ -49,8 +47,7 @@ def printed(rows: Sequence[Row]) -> str:
     lines = [HEADINGS, *(_cells(each) for each in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
     return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
     )
 
 

@@ -1,12 +1,13 @@
-"""Parameters, missions and files through a bad radio: aerokit, pymavlink, MAVSDK and DroneKit against one vehicle.
+"""Parameters, missions and files through a lossy link: aerokit, pymavlink, MAVSDK and DroneKit against one vehicle.
 
     python benchmarks/transfers.py                        # everything, half an hour; writes bench-transfers.json
     python benchmarks/transfers.py parameters --loss 0.2  # these tasks, this loss
-    python benchmarks/transfers.py --quick                # small and without loss: does it run?
+    python benchmarks/transfers.py --quick                # small and without loss: a check that it runs
 
-Each transfer has a client process and a vehicle process of its own (``bad_vehicle.py``), so that nobody inherits
-anything; the same seed loses the same frames for everybody, counted from the first. Time counts from the call of an
-already connected client to its return, and what came over is compared with what should have. Medians over the seeds.
+Each transfer has a client process and a vehicle process of its own (``bad_vehicle.py``), so that nothing is
+inherited; the same seed loses the same frames for every library, counted from the first. Time counts from the call of
+a connected client to its return, and the transferred content is compared with the expected one. Medians over the
+seeds.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ TASKS = tuple(CONTENDERS)
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one contender, one task and one loss: the seconds of each seed, and what failed."""
+    """Result of one library, one task and one loss rate: the seconds of each seed, and failures."""
 
     task: str
     loss: float
@@ -121,10 +122,8 @@ def measure(
     libraries: Sequence[str] | None = None,
     report: Callable[[str], object] = lambda text: None,
 ) -> list[Outcome]:
-    """Everybody does everything, in turns; who is not installed is left out."""
-    installed = [
-        name for name in libraries or ("aerokit", "pymavlink", "mavsdk", "dronekit") if _is_installed(name)
-    ]
+    """Run all tasks with all libraries, in turns; libraries that are not installed are omitted."""
+    installed = [name for name in libraries or ("aerokit", "pymavlink", "mavsdk", "dronekit") if _is_installed(name)]
     outcomes = []
     for task in tasks:
         for loss in losses:
@@ -132,14 +131,12 @@ def measure(
                 if contender.library in installed:
                     outcome = _outcome(task, loss, contender, seeds, sizes, delay_s)
                     outcomes.append(outcome)
-                    report(
-                        f"{task}, {loss:.0%} loss, {contender.name}: {outcome} {'; '.join(outcome.failures)}"
-                    )
+                    report(f"{task}, {loss:.0%} loss, {contender.name}: {outcome} {'; '.join(outcome.failures)}")
     return outcomes
 
 
 def as_rows(outcomes: Sequence[Outcome]) -> list[Row]:
-    """Aerokit beside each of the others; who failed is taken to have needed all the time there was."""
+    """Return aerokit compared with each of the others; a failure counts as the maximum time."""
     found = []
     for own in outcomes:
         if own.contender is not AEROKIT:
@@ -157,11 +154,7 @@ def printed(outcomes: Sequence[Outcome]) -> str:
         names = [contender.name for contender in CONTENDERS[task]]
         lines += ["", f"| {task.replace('_', ' ')} | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
         for loss in dict.fromkeys(each.loss for each in outcomes):
-            cells = {
-                str(each.contender.name): str(each)
-                for each in outcomes
-                if (each.task, each.loss) == (task, loss)
-            }
+            cells = {str(each.contender.name): str(each) for each in outcomes if (each.task, each.loss) == (task, loss)}
             if cells:
                 lines.append(f"| {loss:.0%} loss | {' | '.join(cells.get(name, '–') for name in names)} |")
     return "\n".join(lines)
@@ -197,7 +190,7 @@ def _outcome(
 
 
 class _FailedError(Exception):
-    """It did not end, or not with what it should have."""
+    """The transfer did not end, or its content is wrong."""
 
 
 def _transfer(
@@ -217,9 +210,7 @@ def _transfer(
 
 def _run_client(command: list[str], folder: Path) -> float:
     try:
-        done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S + CONNECT_S
-        )
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=LIMIT_S + CONNECT_S)
     except subprocess.TimeoutExpired:
         raise _FailedError(f"not finished after {LIMIT_S:.0f} s") from None
     try:
@@ -234,7 +225,7 @@ def _run_client(command: list[str], folder: Path) -> float:
 
 
 def _check(task: str, contender: Contender, sizes: Sizes, folder: Path) -> None:
-    """What came over is what it should be."""
+    """Compare the transferred content with the expected one."""
     if task == "parameters":
         expected = json.loads((folder / "vehicle-parameters.json").read_text())
         _check_parameters(json.loads((folder / "out.json").read_text()), expected)
@@ -251,9 +242,7 @@ def _check_parameters(found: dict[str, float], expected: dict[str, float]) -> No
     if set(found) != set(expected):
         raise _FailedError(f"{len(set(expected) - set(found))} of {len(expected)} parameters are missing")
     wrong = [
-        name
-        for name, value in expected.items()
-        if not math.isclose(found[name], value, rel_tol=1e-6, abs_tol=1e-6)
+        name for name, value in expected.items() if not math.isclose(found[name], value, rel_tol=1e-6, abs_tol=1e-6)
     ]
     if wrong:
         raise _FailedError(f"{len(wrong)} parameters have wrong values: {wrong[:3]}")
@@ -307,14 +296,12 @@ def _free_port() -> int:
 
 def _is_installed(library: str) -> bool:
     python = DRONEKIT if library == "dronekit" else sys.executable
-    shim = (
-        "import collections, collections.abc; collections.MutableMapping = collections.abc.MutableMapping; "
-    )
+    shim = "import collections, collections.abc; collections.MutableMapping = collections.abc.MutableMapping; "
     return subprocess.run([python, "-c", f"{shim}import {library}"], capture_output=True).returncode == 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure what was asked for, print it, write it."""
+    """Measure the requested parts, print and write the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=", ".join(TASKS))
     parser.add_argument("--loss", type=float, action="append", help="share of frames lost each way, 0 to 1")

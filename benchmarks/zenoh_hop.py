@@ -1,11 +1,11 @@
-"""What a hop over a zenoh network costs beside UDP: round trips of a frame between two processes on this machine.
+"""Cost of a hop over a zenoh network compared with UDP: round trips of a frame between two processes on this machine.
 
     python benchmarks/zenoh_hop.py            # a minute; writes bench-zenoh.json
-    python benchmarks/zenoh_hop.py --quick    # does it run? The figures mean little
+    python benchmarks/zenoh_hop.py --quick    # a short check that it runs; the figures mean little
 
-``udp``: ``udpout:`` to ``udpin:``. ``zenoh``: a client connected to a vehicle side. ``zenoh_router``: both are clients
-of a router, a third process. Each frame goes out, is echoed, and is waited for: a PING of MAVLink, 50 times a second,
-and then 1000 in a burst, of which it is told how many came back. Processor time is that of the program that asks.
+``udp``: ``udpout:`` to ``udpin:``. ``zenoh``: a client connected to a vehicle side. ``zenoh_router``: both are
+clients of a router, a third process. Each frame is sent, echoed and awaited: a PING of MAVLink, 50 times a second,
+and then 1000 in a burst, of which the returned ones are counted. Processor time is that of the requesting program.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ sys.stdin.read()
 """
 
 
-class Ears:
-    """Counts what comes back, and wakes who waits for it."""
+class EchoReceiver:
+    """Counts echoes, and wakes the waiter."""
 
     def __init__(self) -> None:
         self.heard = 0
@@ -74,9 +74,7 @@ class Ears:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--output", type=Path, default=Path("bench-zenoh.json"))
     options = parser.parse_args(arguments)
@@ -105,9 +103,9 @@ def _measured(name: str, count: int) -> dict[str, float]:
 
 
 async def _ask(address: str, count: int) -> dict[str, float]:
-    link, ears, encoder = create_link(address), Ears(), FrameEncoder(255, 190)
+    link, ears, encoder = create_link(address), EchoReceiver(), FrameEncoder(255, 190)
     await link.open(ears)
-    link.write(encoder.encode(Ping(0, 0, 0, 0)))  # what is imported for the first one
+    link.write(encoder.encode(Ping(0, 0, 0, 0)))  # Import everything before the first measured frame.
     with contextlib.suppress(asyncio.TimeoutError):
         await asyncio.wait_for(ears.came.wait(), 2)
     round_trips: list[float] = []

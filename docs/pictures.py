@@ -1,8 +1,8 @@
-"""Draws docs/images: the flights of the demonstration and of the examples, and what the demonstration says.
+"""Draws docs/images: the true tracks of the demonstration and the examples, and the terminal of the demonstration.
 
 python docs/pictures.py [NAME …]        or: nox -s pictures
 
-Flights are on virtual time, or on a socket for programs that block; the pictures are of where the vehicle truly was.
+Flights run on virtual time, or on a socket for blocking programs.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Any
 from terminal_picture import draw_terminal
 
 from aerokit.sim import HOME, SimulatedCamera, SimulatedCopter, simulated_link
-from aerokit.sim.picture import save_picture
-from aerokit.sim.track import Track, record_track
 from aerokit.testing import run_virtual, serve_flight
+from aerokit.testing.picture import save_picture
+from aerokit.testing.track import Track, record_track
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
-MOST_POINTS = 400
-"""Of a track in a picture: more cannot be seen."""
+MAX_POINTS = 400
+"""Points of a track in a picture; more would not be visible."""
 SPEEDUP = 20.0
 
 ON_VIRTUAL_TIME: dict[str, list[Any]] = {
@@ -37,7 +37,7 @@ ON_VIRTUAL_TIME: dict[str, list[Any]] = {
     "survey_photos": [],
     "two_vehicles": [],
 }
-"""Example: what its ``main`` takes behind the address."""
+"""Example name: arguments of ``main`` after the address."""
 ON_A_SOCKET: dict[str, list[str]] = {
     "blocking_hello": ["{address}"],
     "blocking_messages": ["{address}"],
@@ -45,11 +45,11 @@ ON_A_SOCKET: dict[str, list[str]] = {
     "dronekit/basic_mission": ["--connect", "{address}"],
     "dronekit/guided_velocity_and_yaw": ["--seconds", "0.2", "--altitude", "5", "--connect", "{address}"],
 }
-"""Example: its arguments."""
+"""Example name: arguments of the program."""
 
 
 def main(names: list[str]) -> None:
-    """Draw the pictures of these names, or all."""
+    """Draw the named pictures, or all."""
     makers: dict[str, Callable[[], None]] = {"demo": draw_demo}
     makers |= {name: partial(fly_on_virtual_time, name) for name in ON_VIRTUAL_TIME}
     makers |= {name: partial(fly_on_a_socket, name) for name in ON_A_SOCKET}
@@ -58,20 +58,20 @@ def main(names: list[str]) -> None:
 
 
 def draw_demo() -> None:
-    """``aerokit demo`` as a picture of its flight, and of the terminal."""
+    """Draw the flight and the terminal of ``aerokit demo``."""
     with tempfile.TemporaryDirectory() as folder, serve_flight(speedup=5.0) as flight:
-        told = run([sys.executable, "-m", "aerokit", "demo", "--connect", flight.address], folder)
+        output = run([sys.executable, "-m", "aerokit", "demo", "--connect", flight.address], folder)
         draw([flight.track], "demo")
-    lines = [line for line in told.splitlines() if not line.startswith("connecting")]
+    lines = [line for line in output.splitlines() if not line.startswith("connecting")]
     (IMAGES / "terminal.svg").write_text(draw_terminal("aerokit demo", lines), encoding="utf-8")
 
 
 def fly_on_virtual_time(name: str) -> None:
-    """An example with a coroutine ``main``."""
+    """Draw an example with a coroutine ``main``."""
     example = runpy.run_path(str(ROOT / "examples" / f"{name}.py"))
     has_camera = name == "survey_photos"
     latitude_deg, longitude_deg, altitude_m = HOME
-    flown = [
+    copters = [
         SimulatedCopter(
             system_id=number,
             boot_time_s=0.0,
@@ -80,10 +80,10 @@ def fly_on_virtual_time(name: str) -> None:
         )
         for number in ((1, 2) if name == "two_vehicles" else (1,))
     ]
-    tracks = [record_track(copter) for copter in flown]
+    tracks = [record_track(copter) for copter in copters]
 
     async def fly() -> None:
-        async with simulated_link(flown) as link:
+        async with simulated_link(copters) as link:
             with tempfile.TemporaryDirectory() as folder:
                 await example["main"](link, *([folder] if has_camera else ON_VIRTUAL_TIME[name]))
 
@@ -92,7 +92,7 @@ def fly_on_virtual_time(name: str) -> None:
 
 
 def fly_on_a_socket(name: str) -> None:
-    """An example that is a program."""
+    """Draw an example that runs as a program."""
     is_classic = name.startswith("dronekit/")
     runner = ["-m", "aerokit.dronekit"] if is_classic else []
     with tempfile.TemporaryDirectory() as folder, serve_flight(speedup=SPEEDUP) as flight:
@@ -102,16 +102,16 @@ def fly_on_a_socket(name: str) -> None:
 
 
 def run(command: list[str], folder: str) -> str:
-    """What a program prints."""
+    """Run a program and return its output."""
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 def draw(tracks: list[Track], name: str) -> None:
-    """From above and in height; of as many points as can be seen."""
+    """Save a picture of tracks, from above and in height."""
     thin = []
     for track in tracks:
         points = list(track)
-        step = max(1, len(points) // MOST_POINTS)
+        step = max(1, len(points) // MAX_POINTS)
         thin.append(Track(track.home, points[::step] + points[-1:], name=track.name))
     save_picture(thin, IMAGES / f"{name}.svg")
 

@@ -1,6 +1,6 @@
-"""What MkDocs does beyond the pages of docs/: the navigation, the start page, examples, and links that leave docs/.
+"""MkDocs hook: navigation, generated pages, and links that leave docs/.
 
-A hook (https://www.mkdocs.org/user-guide/configuration/#hooks) of mkdocs.yml. The pages stay as GitHub shows them.
+See https://www.mkdocs.org/user-guide/configuration/#hooks. The files in docs/ also work on GitHub.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from posixpath import dirname, join, normpath, relpath
 from typing import TYPE_CHECKING, Any
 
 from mkdocs.structure.files import File, Files
-from site_reference import HOMES, MADE, ROOMS, reference_pages
+from site_reference import GENERATED_PAGES, REFERENCE_PAGES, SOURCE_PAGES, reference_pages
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -31,96 +31,95 @@ NAVIGATION: dict[str, list[str]] = {
         "coming-from/index.md", "coming-from/dronekit.md", "from-dronekit.md", "coming-from/mavsdk.md",
         "coming-from/pymavlink.md", "coming-from/mavros.md",
     ],
-    "Concepts": ["concepts.md"],
+    "Concepts": ["concepts.md", "glossary.md"],
     "Tools": ["command-line.md", "hub.md", "monitor.md", "report.md", "serve.md", "network.md", "convert.md"],
-    "Reference": ["reference/index.md", *(f"reference/{page}.md" for page in (*(room.page for room in ROOMS), *MADE))],
+    "Reference": ["reference/index.md", *(f"reference/{page.name}.md" for page in REFERENCE_PAGES),
+                  *(f"reference/{name}.md" for name in GENERATED_PAGES)],
     "Troubleshooting": ["troubleshooting.md"],
     "Gallery": ["gallery.md", "examples/*.md"],
     "About": [
-        "design.md", "design-rooms.md", "reliability.md", "firmware.md", "benchmarks.md", "features.md", "states.md",
-        "addresses.md",
-        "signing.md", "simulator.md", "testing.md", "about/*.md",
+        "design.md", "design-rooms.md", "reliability.md", "verification.md", "firmware.md", "benchmarks.md",
+        "features.md", "states.md", "addresses.md", "signing.md", "simulator.md", "testing.md", "about/*.md",
     ],
 }  # fmt: skip
-"""Tab: pages and patterns, in this order. What does not exist is left out; a page that stands nowhere is an error."""
-FROM_THE_ROOT = {
-    "README.md": "index.md",
+"""Tab title: pages and patterns, in order. Missing pages are skipped; an unlisted page fails the build."""
+ROOT_PAGES = {
     "CHANGELOG.md": "about/changelog.md",
     "CONTRIBUTING.md": "about/contributing.md",
     "SECURITY.md": "about/security.md",
 }
-"""Pages that live above docs/, and where they are on the site."""
+"""File above docs/: its page on the site."""
 INSTALL = """
-??? info "Install it for a project of your own"
+??? info "Install aerokit"
 
-    From a clone of the repository, or from the wheel that `nox -s release` makes of it:
+    From a clone of the repository, or from the wheel that `nox -s release` builds:
 
     ```sh
     pip install "aerokit-mavlink @ file:///path/to/clone"
     ```
 
-    Extras stand behind the name: `aerokit-mavlink[all] @ file:///path/to/clone`. Once it is published on PyPI, the name
-    is enough: `pip install aerokit-mavlink`. (`aerokit` there is another project.)
+    With extras: `aerokit-mavlink[all] @ file:///path/to/clone`. The package is not on PyPI yet, where `aerokit` is
+    another project.
 """
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 ROLE = re.compile(r":(?:class|func|meth|mod|attr|data|exc):(?=<code>)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are made here."""
-    for path, text in made_pages():
+    """Add the generated pages and the navigation."""
+    for path, text in generated_pages():
         files.append(File.generated(config, path, content=text))
     config.nav = navigation([file.src_uri for file in files.documentation_pages()])
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to files of the repository to their pages; say on every page how to install it."""
-    is_made = {made: source for source, made in FROM_THE_ROOT.items()}
-    source = is_made.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    """Convert links to files of the repository, and add the install instructions to every page."""
+    sources = {page_path: source for source, page_path in ROOT_PAGES.items()}
+    source = sources.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     text = outside_code(
-        markdown, lambda part: LINK.sub(lambda link: led(link, source, page.file.src_uri), part)
+        markdown, lambda part: LINK.sub(lambda link: converted_link(link, source, page.file.src_uri), part)
     )
     if page.file.src_uri == "index.md":
-        return text.replace('src="docs/', 'src="')  # it has the line in its first screen
+        return text  # the home page has its own install instructions
     title, _, rest = text.partition("\n")
     return f"{title}\n{INSTALL}{rest}"
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Roles of docstrings (``:class:`…```) are for other tools."""
+    """Remove Sphinx roles of docstrings (``:class:`…```), which MkDocs shows as text."""
     return ROLE.sub("", html)
 
 
-# ------------------------------------------------------------------------------------ pages that are made
+# ------------------------------------------------------------------------------------ generated pages
 
 
-def made_pages() -> Iterator[tuple[str, str]]:
-    """Path on the site, text."""
-    for source, made in FROM_THE_ROOT.items():
-        yield made, (ROOT / source).read_text(encoding="utf-8")
+def generated_pages() -> Iterator[tuple[str, str]]:
+    """Yield path on the site and text of each page."""
+    for source, page_path in ROOT_PAGES.items():
+        yield page_path, (ROOT / source).read_text(encoding="utf-8")
     for path in example_files():
-        shown = path.relative_to(ROOT)
+        name = path.relative_to(ROOT)
         yield (
-            example_page(shown.as_posix()),
-            f"# {shown}\n\n```python\n{path.read_text(encoding='utf-8')}```\n",
+            example_page(name.as_posix()),
+            f"# {name}\n\n```python\n{path.read_text(encoding='utf-8')}```\n",
         )
     yield from reference_pages()
 
 
 def example_files() -> list[Path]:
-    """Every program of examples/."""
+    """Return every program of examples/."""
     return sorted((ROOT / "examples").rglob("*.py"))
 
 
 def example_page(path: str) -> str:
-    """Its page: ``examples/dronekit/hello.py`` → ``examples/dronekit-hello.md``."""
+    """Return the page of an example: ``examples/dronekit/hello.py`` → ``examples/dronekit-hello.md``."""
     name = path.removeprefix("examples/").removesuffix(".py").replace("/", "-")
     return f"examples/{name}.md"
 
 
 def navigation(pages: list[str]) -> list[Any]:
-    """The tabs, with what there is of their pages."""
+    """Return the tabs with their existing pages."""
     left = [page for page in pages if page != "index.md"]
     tabs: list[Any] = [{"aerokit": "index.md"}]
     for title, wanted in NAVIGATION.items():
@@ -138,31 +137,33 @@ def navigation(pages: list[str]) -> list[Any]:
 
 
 def outside_code(markdown: str, change: Any) -> str:
-    """Change what is no block of code."""
+    """Apply ``change`` to everything outside code blocks."""
     parts = re.split(r"(^ *```.*?^ *```$)", markdown, flags=re.DOTALL | re.MULTILINE)
     return "".join(part if number % 2 else change(part) for number, part in enumerate(parts))
 
 
-def led(link: re.Match[str], source: str, page: str) -> str:
-    """A link of a file of the repository, as a link of its page on the site; text alone where no page is."""
+def converted_link(link: re.Match[str], source: str, page: str) -> str:
+    """Return a link to a file of the repository as a link to its page, or only the text if it has none."""
     picture, label, target, anchor = link[1], link[2], link[3], link[4] or ""
     if not target or "://" in target or target.startswith("mailto:"):
         return link[0]
     path = normpath(join(dirname(source), target))
-    place = site_page(path)
-    if place is None:
+    target_page = site_page(path)
+    if target_page is None:
         return label
-    return f"{picture}[{label}]({relpath(place, dirname(page) or '.')}{anchor})"
+    return f"{picture}[{label}]({relpath(target_page, dirname(page) or '.')}{anchor})"
 
 
 def site_page(path: str) -> str | None:
-    """Where a file of the repository is on the site."""
+    """Return the page of a file of the repository."""
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
-    if path in FROM_THE_ROOT:
-        return FROM_THE_ROOT[path]
+    if path == "README.md":
+        return "index.md"
+    if path in ROOT_PAGES:
+        return ROOT_PAGES[path]
     if path.startswith("examples/") and path.endswith(".py"):
         return example_page(path)
     if path in ("examples", "examples/dronekit", "examples/testing_a_mission"):
         return "gallery.md" if (ROOT / "docs" / "gallery.md").exists() else None
-    return HOMES.get(path)
+    return SOURCE_PAGES.get(path)

@@ -1,6 +1,6 @@
-"""A terminal as an SVG picture: whole at first, then the lines appear one after the other.
+"""Draws a terminal as an animated SVG, in which the lines appear one after the other.
 
-What shows no animations, or only the first moment of them, shows all of it.
+The first frame shows all lines, for viewers without animations.
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ from html import escape
 __all__ = ["draw_terminal"]
 
 WIDTH, LINE_HEIGHT, LEFT, TOP = 800, 19, 18, 52
-PAUSE_S, LONGEST_S = 0.35, 14.0
-"""Before each line, where none of them tells its time; all of it takes this long at most."""
+PAUSE_S, MAX_DURATION_S = 0.35, 14.0
+"""Delay before a line without a time; limit of the whole animation."""
 STYLE = """
 text { font: 13px ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; fill: #d5dbe3; white-space: pre }
-.said { fill: #8a96a6 } .command { fill: #ffffff } .prompt { fill: #7ee787 } .time { fill: #79c0ff }
+.message { fill: #8a96a6 } .command { fill: #ffffff } .prompt { fill: #7ee787 } .time { fill: #79c0ff }
 @media (prefers-reduced-motion: no-preference) { .late { animation: hidden 1s 0.8s } }
 @keyframes hidden { from, to { opacity: 0 } }
 """.strip()
 TIMED = re.compile(r"^ *(\d+\.\d) s .{9} ")
-"""Seconds and height, as the demonstration begins a line."""
+"""Matches seconds and height at the beginning of a line of the demonstration."""
 
 
 def draw_terminal(command: str, lines: list[str]) -> str:
-    """The text of an SVG file; each line is hidden for as long as it took to come.
+    """Return an SVG file in which each line appears at its time.
 
     Args:
-        command: what was typed.
-        lines: what was printed; those that begin with seconds (``   1.5 s …``) appear in that rhythm.
+        command: the command line.
+        lines: its output. A line that begins with seconds (``   1.5 s …``) appears at that time.
     """
     height = TOP + LINE_HEIGHT * (len(lines) + 1)
     shapes = [
@@ -40,31 +40,31 @@ def draw_terminal(command: str, lines: list[str]) -> str:
         shapes.append(f'<circle cx="{20 + 20 * number}" cy="18" r="6" fill="{colour}"/>')
     typed = f'<tspan class="prompt">$ </tspan><tspan class="command">{escape(command)}</tspan>'
     shapes.append(f'<text x="{LEFT}" y="{TOP}">{typed}</text>')
-    for number, (line, hidden_s) in enumerate(zip(lines, hidden_for_s(lines), strict=True), 1):
-        place = f'x="{LEFT}" y="{TOP + LINE_HEIGHT * number}"'
+    for number, (line, hidden_s) in enumerate(zip(lines, appearance_times_s(lines), strict=True), 1):
+        position = f'x="{LEFT}" y="{TOP + LINE_HEIGHT * number}"'
         shapes.append(
-            f'<text {place} class="late" style="animation-duration:{hidden_s:.2f}s">{coloured(line)}</text>'
+            f'<text {position} class="late" style="animation-duration:{hidden_s:.2f}s">{coloured(line)}</text>'
         )
     return "\n".join([*shapes, "</svg>\n"])
 
 
-def hidden_for_s(lines: list[str]) -> list[float]:
-    """Until each line appears: by its own seconds where it has some, a moment after the one before at least."""
+def appearance_times_s(lines: list[str]) -> list[float]:
+    """Return the seconds until each line appears: its own time, but after the previous line."""
     times: list[float] = []
     now = 0.6
     for line in lines:
         timed = TIMED.match(line)
         now = max(now + PAUSE_S / 3, float(timed[1]) if timed else now + PAUSE_S)
         times.append(now)
-    scale = min(1.0, LONGEST_S / now)
+    scale = min(1.0, MAX_DURATION_S / now)
     return [time * scale for time in times]
 
 
 def coloured(line: str) -> str:
-    """Seconds and height in one colour, what the vehicle said in another."""
+    """Colour the time and height, and indented messages of the vehicle."""
     timed = TIMED.match(line)
     if not timed:
         return escape(line)
     head, rest = line[: timed.end()], line[timed.end() :]
-    said = ' class="said"' if rest.startswith("  ") else ""
-    return f'<tspan class="time">{escape(head)}</tspan><tspan{said}>{escape(rest)}</tspan>'
+    message_class = ' class="message"' if rest.startswith("  ") else ""
+    return f'<tspan class="time">{escape(head)}</tspan><tspan{message_class}>{escape(rest)}</tspan>'

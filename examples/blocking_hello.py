@@ -1,4 +1,4 @@
-"""The same library without async: connect, look, fly up and down.
+"""Without async: connect, print the state, take off and land.
 
 python examples/blocking_hello.py udpin:0.0.0.0:14550
 """
@@ -12,14 +12,14 @@ from aerokit import errors
 
 
 def main(address: str) -> None:
-    """Every call waits until the vehicle has done it; Ctrl-C ends any of them."""
+    """Fly up and down; every call returns when the vehicle has done it, and Ctrl-C ends any call."""
     with aerokit.sync.connect(address) as vehicle:
         vehicle.wait_ready()
         print(f"{vehicle.autopilot.firmware} {vehicle.version.value} at {vehicle.position.value}")
         try:
             vehicle.arm()
         except errors.CommandRejected as error:
-            print(f"it does not arm: {error}")
+            print(f"the vehicle does not arm: {error}")
             return
         vehicle.take_off(altitude_m=5)
         print(f"at {vehicle.position.fresh(within=2).altitude_relative_m} m")

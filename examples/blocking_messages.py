@@ -12,7 +12,7 @@ from aerokit import VelocitySetpoint, messages
 
 
 def main(address: str) -> None:
-    """Fly sideways while looking at what the vehicle says."""
+    """Fly sideways and print speed and altitude."""
     with aerokit.sync.connect(address) as vehicle:
         vehicle.wait_ready()
         vehicle.arm()

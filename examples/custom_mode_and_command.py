@@ -1,4 +1,4 @@
-"""Modes by name and by number, and commands that have no method of their own.
+"""Set modes by name and by number, and send raw commands.
 
 python examples/custom_mode_and_command.py udpin:0.0.0.0:14550
 """
@@ -13,11 +13,11 @@ from aerokit import enums, errors, messages
 
 
 async def main(address: str) -> None:
-    """Nothing is armed."""
+    """Set modes and send commands without arming the vehicle."""
     async with aerokit.connect(address) as vehicle:
         hold = vehicle.autopilot.mode_for("hold")
         if hold is not None:
-            await vehicle.set_mode(hold.custom_mode)  # the number in HEARTBEAT; "BRAKE" would do as well
+            await vehicle.set_mode(hold.custom_mode)  # the number, or a name: "BRAKE"
             print(f"mode {vehicle.mode.value}")
         try:
             await vehicle.set_mode("FASTER")
@@ -28,7 +28,7 @@ async def main(address: str) -> None:
             await vehicle.command(enums.MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
             print(await versions.get(timeout=5))
         try:
-            await vehicle.command(enums.MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10)  # it is not armed
+            await vehicle.command(enums.MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10)  # refused: the vehicle is not armed
         except errors.CommandRejected as error:
             print(f"result {error.result}: {error}")
 

@@ -11,11 +11,11 @@ import aerokit.sync
 
 
 def main(address: str, file: str = "") -> None:
-    """What was begun before is continued; it gets its name when it is complete."""
+    """Download the newest log; the file gets its name when it is complete."""
     with aerokit.sync.connect(address) as vehicle:
         logs = vehicle.logs.list()
         if not logs:
-            print("there are no logs")
+            print("the vehicle has no logs")
             return
         newest = logs[-1]
         to = file or f"log{newest.id:05}{vehicle.autopilot.log_suffix}"
@@ -24,6 +24,4 @@ def main(address: str, file: str = "") -> None:
 
 
 if __name__ == "__main__":
-    main(
-        sys.argv[1] if len(sys.argv) > 1 else "udpin:0.0.0.0:14550", sys.argv[2] if len(sys.argv) > 2 else ""
-    )
+    main(sys.argv[1] if len(sys.argv) > 1 else "udpin:0.0.0.0:14550", sys.argv[2] if len(sys.argv) > 2 else "")

@@ -1,6 +1,6 @@
-"""Three vehicles as a fleet: they take off, fly in formation behind the first, and land.
+"""Fly three vehicles as a fleet: take off, fly in formation behind the leader, land.
 
-python examples/fleet_formation.py udpin:0.0.0.0:14550 [how many]
+python examples/fleet_formation.py udpin:0.0.0.0:14550 [count]
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import aerokit
 
 
 async def main(address: str, count: int = 3) -> None:
-    """Take off together, form, follow the leader, land."""
+    """Take off together, form a wedge, follow the leader, land."""
     async with aerokit.fleet({"field": address}, count=count, on_error="hold_others") as fleet:
         print(fleet)
         for action in (fleet.wait_ready(), fleet.arm(), fleet.take_off(10, stagger_s=2)):

@@ -1,4 +1,4 @@
-"""Take off, fly a square, come back and land.
+"""Take off, fly a square and land.
 
 python examples/fly_square.py udpin:0.0.0.0:14550 [metres]
 """
@@ -12,7 +12,7 @@ import aerokit
 
 
 async def main(address: str, side_m: float = 20.0) -> None:
-    """Every line waits until the vehicle has done it."""
+    """Fly the square; every action returns when the vehicle has done it."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         await vehicle.arm()

@@ -1,4 +1,4 @@
-"""Steer by velocity. When this program stops feeding set-points, for whatever reason, the vehicle holds.
+"""Steer by velocity. When the program stops sending set-points, the vehicle holds.
 
 python examples/guided_velocity.py udpin:0.0.0.0:14550
 """
@@ -14,7 +14,7 @@ from aerokit import VelocitySetpoint
 
 
 async def fly_circle(vehicle: aerokit.Vehicle, speed_m_s: float = 4.0, seconds: float = 4.0) -> None:
-    """A new set-point ten times a second; one that is older than a second is not sent any more."""
+    """Set a new velocity ten times a second. The stream ends when the last one is older than a second."""
     async with vehicle.guided.velocity() as stream:
         steps = round(seconds * 10)
         for step in range(steps):
@@ -25,7 +25,7 @@ async def fly_circle(vehicle: aerokit.Vehicle, speed_m_s: float = 4.0, seconds: 
 
 
 async def main(address: str) -> None:
-    """Up, around, and back."""
+    """Take off, fly a circle and land."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         await vehicle.arm()

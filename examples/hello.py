@@ -1,4 +1,4 @@
-"""Connect and say what is there; nothing moves.
+"""Connect and print the state of the vehicle; nothing moves.
 
 python examples/hello.py udpin:0.0.0.0:14550
 """
@@ -12,7 +12,7 @@ import aerokit
 
 
 async def main(address: str) -> None:
-    """Print who it is and how it is."""
+    """Print firmware, mode, position, batteries, and whether it can be armed."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         here = vehicle.position.value
@@ -22,7 +22,7 @@ async def main(address: str) -> None:
         for battery in vehicle.batteries.value:
             print(f"battery {battery.id}: {battery.voltage_v} V, {battery.remaining_percent} %")
         reasons = await vehicle.why_not_armable()
-        print("could be armed" if not reasons else "cannot be armed: " + "; ".join(reasons))
+        print("can be armed" if not reasons else "cannot be armed: " + "; ".join(reasons))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Watch something while flying, and change the plan when it happens: a flight is a task that can be cancelled.
+"""Watch the battery while flying, and land when it is low. A flight is a task that you can cancel.
 
 python examples/land_on_low_battery.py udpin:0.0.0.0:14550 [percent]
 """
@@ -12,17 +12,15 @@ import aerokit
 
 
 async def battery_low(vehicle: aerokit.Vehicle, percent: float) -> None:
-    """Return when the first battery has been below this for a second."""
+    """Return when the first battery has been below ``percent`` for a second."""
     await vehicle.batteries.wait_until(
-        lambda batteries: (
-            batteries[0].remaining_percent is not None and batteries[0].remaining_percent < percent
-        ),
+        lambda batteries: batteries[0].remaining_percent is not None and batteries[0].remaining_percent < percent,
         held_for=1.0,
     )
 
 
 async def patrol(vehicle: aerokit.Vehicle) -> None:
-    """To and fro, for ever."""
+    """Fly between two places until cancelled."""
     start = vehicle.position.value
     while True:
         await vehicle.go_to(start.offset(north_m=40))
@@ -30,7 +28,7 @@ async def patrol(vehicle: aerokit.Vehicle) -> None:
 
 
 async def main(address: str, percent: float = 30.0) -> None:
-    """Cancelling a go_to tells the vehicle to hold; the next order takes over from there."""
+    """Patrol until the battery is low, then land. A cancelled go_to ends in a hold."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         await vehicle.arm()

@@ -1,4 +1,4 @@
-"""Upload a small mission, fly it, and say how far it is.
+"""Upload a small mission, fly it, and report its progress.
 
 python examples/mission.py udpin:0.0.0.0:14550
 """
@@ -14,7 +14,7 @@ from aerokit.missions import Mission, change_speed, return_to_launch, take_off, 
 
 
 async def main(address: str) -> None:
-    """The upload is checked before it is sent and read back afterwards; the end is when it is on the ground."""
+    """Fly the mission; the upload is checked first and read back afterwards."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         start = vehicle.position.value

@@ -1,4 +1,4 @@
-"""What was changed on this vehicle, and a value changed for a while.
+"""Print parameters that differ from their defaults, and change one temporarily.
 
 python examples/parameters.py udpin:0.0.0.0:14550 [NAME VALUE]
 """
@@ -13,7 +13,7 @@ from aerokit import errors
 
 
 async def main(address: str, name: str = "LAND_SPEED", value: float = 40) -> None:
-    """The defaults come with a download by MAVFTP; other vehicles tell none."""
+    """Download by MAVFTP, which brings the defaults, or by list, which does not."""
     async with aerokit.connect(address) as vehicle:
         table = await vehicle.parameters.download()
         print(f"{len(table)} parameters")

@@ -1,4 +1,4 @@
-"""Record what is received and sent, then run the same program on the recording, as fast as it goes.
+"""Record a live vehicle, then run the same program on the recording at full speed.
 
 python examples/record_and_replay.py udpin:0.0.0.0:14550 flight.tlog [seconds]
 """
@@ -13,7 +13,7 @@ from aerokit import errors, messages
 
 
 async def count_attitudes(vehicle: aerokit.Vehicle) -> int:
-    """The program: it does not know whether the vehicle is there or was."""
+    """Count attitudes, of a live vehicle or of a recording."""
     count = 0
     with vehicle.subscribe(messages.Attitude, capacity=1000) as attitudes:
         try:
@@ -27,7 +27,7 @@ async def count_attitudes(vehicle: aerokit.Vehicle) -> int:
 
 
 async def main(address: str, path: str = "flight.tlog", seconds: float = 5.0) -> None:
-    """Watch live for some seconds, then again from the file."""
+    """Count live for some seconds, then again from the file."""
     async with aerokit.connect(address, record=path) as vehicle:
         try:
             await asyncio.wait_for(count_attitudes(vehicle), seconds)

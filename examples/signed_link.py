@@ -1,8 +1,8 @@
-"""Give a vehicle a key for signing, over a cable; the time stamp is kept in a file for the next program.
+"""Give a vehicle a signing key over a cable. A file keeps the time stamp for the next program.
 
     python signed_link.py /dev/ttyACM0 "a long passphrase"
 
-Afterwards the vehicle takes orders only from programs that have the key:
+Afterwards, the vehicle obeys only programs that have the key:
 
     async with aerokit.connect(address, signing=Signing(key, keep=STAMP)) as vehicle: ...
 """
@@ -20,15 +20,15 @@ STAMP = Path("signing-timestamp.txt")
 
 
 async def main(address: str, passphrase: str, stamp: Path = STAMP) -> None:
-    """Set the key up, use it, and take it away again."""
+    """Set up the key, use it, and remove it."""
     signing = Signing(SigningKey.from_passphrase(passphrase), keep=stamp)
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
-        await vehicle.setup_signing(signing)  # the key travels in clear, here and never again
+        await vehicle.setup_signing(signing)  # sends the key in clear, only here
         print("the vehicle signs with", signing.key)
-        await vehicle.parameters.get("MAV_SYSID")  # asked for and answered with signatures
+        await vehicle.parameters.get("MAV_SYSID")  # request and answer are signed
         print(signing.frames_refused, "frames were refused")
-        await vehicle.setup_signing(None)  # leave this out to keep the key on the vehicle
+        await vehicle.setup_signing(None)  # leave this out to keep the key
         print("the vehicle does not sign any more")
 
 

@@ -1,7 +1,7 @@
-"""Survey a field: fly lanes, take a picture every two seconds, and write them with their places into a folder.
+"""Survey a field: fly lanes, take a picture every two seconds, and save them with their positions.
 
 python examples/survey_photos.py                              # a simulated copter with a camera, in a few seconds
-python examples/survey_photos.py udpin:0.0.0.0:14550 FOLDER   # yours
+python examples/survey_photos.py udpin:0.0.0.0:14550 FOLDER   # your vehicle
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ HEIGHT_M, LENGTH_M, LANE_M, LANES = 20.0, 40.0, 15.0, 3
 
 
 async def main(address: Any, folder: str = "pictures") -> None:
-    """Pictures that were missed on a bad radio are asked for again; the series ends with its block."""
+    """Fly the lanes and read the pictures; pictures missed on a bad radio are requested again."""
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready()
         print((await vehicle.camera.wait_found()).model)
@@ -34,12 +34,12 @@ async def main(address: Any, folder: str = "pictures") -> None:
                     await vehicle.go_to(corner.replace(altitude_amsl_m=None, altitude_relative_m=HEIGHT_M))
         await vehicle.return_to_launch()
         captures = await vehicle.camera.load_captures()
-        pictures = [await vehicle.camera.read_picture(each) for each in captures]
+        pictures = [await vehicle.camera.read_picture(capture) for capture in captures]
     save(Path(folder), captures, pictures)
 
 
 def save(folder: Path, captures: list[Capture], pictures: list[bytes]) -> None:
-    """Each picture with its place, and the list of them."""
+    """Write geotagged pictures and captures.csv."""
     folder.mkdir(exist_ok=True)
     for capture, picture in zip(captures, pictures, strict=True):
         (folder / f"picture{capture.index:04d}.jpg").write_bytes(geotagged(picture, capture))
@@ -48,7 +48,7 @@ def save(folder: Path, captures: list[Capture], pictures: list[bytes]) -> None:
 
 
 async def simulated(folder: str = "pictures") -> None:
-    """The same on virtual time."""
+    """Fly on a simulated copter, on virtual time."""
     copter = SimulatedCopter(components=[SimulatedCamera()])
     async with simulated_link(copter) as link:
         await main(link, folder)

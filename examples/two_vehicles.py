@@ -1,4 +1,4 @@
-"""Two vehicles on one link, told apart by their system ids, fly at the same time.
+"""Fly two vehicles on one link at the same time; their system ids distinguish them.
 
 python examples/two_vehicles.py udpin:0.0.0.0:14550 [system id] [system id]
 """
@@ -12,7 +12,7 @@ import aerokit
 
 
 async def fly(vehicle: aerokit.Vehicle, altitude_m: float) -> None:
-    """The same flight for each, at an altitude of its own."""
+    """Fly up and down."""
     await vehicle.wait_ready()
     await vehicle.arm()
     await vehicle.take_off(altitude_m)
@@ -21,7 +21,7 @@ async def fly(vehicle: aerokit.Vehicle, altitude_m: float) -> None:
 
 
 async def main(address: str, first_id: int = 1, second_id: int = 2) -> None:
-    """One connection, two vehicles."""
+    """Connect to both vehicles over one connection, and fly them."""
     async with (
         aerokit.open_connection(address) as connection,
         aerokit.connect(connection, system_id=first_id) as first,

@@ -1,4 +1,4 @@
-"""Follow a vehicle: values with their ages, every attitude at 20 Hz, and whatever happens.
+"""Print values with their ages, attitudes at 20 Hz, and all events.
 
 python examples/watch_state.py udpin:0.0.0.0:14550 [seconds]
 """
@@ -13,7 +13,7 @@ from aerokit import events, messages
 
 
 async def print_values(vehicle: aerokit.Vehicle) -> None:
-    """Once a second, the latest of everything; a value that is not known yet is None."""
+    """Print the latest values once a second; an unknown value is None."""
     while True:
         position, ground_speed = vehicle.position, vehicle.ground_speed_m_s
         print(f"{vehicle.mode_name}, {ground_speed.latest} m/s, {position.latest}, {position.age:.2f} s old")
@@ -21,21 +21,21 @@ async def print_values(vehicle: aerokit.Vehicle) -> None:
 
 
 async def print_attitudes(vehicle: aerokit.Vehicle) -> None:
-    """The raw message, 20 times a second; a reader that is too slow gets the newest and can see what it missed."""
+    """Print raw messages at 20 Hz; a slow reader gets the latest and a count of missed ones."""
     with vehicle.subscribe(messages.Attitude, rate_hz=20) as attitudes:
         async for attitude in attitudes:
             print(f"roll {attitude.roll:+.3f} rad, {attitudes.missed} missed")
 
 
 async def print_events(vehicle: aerokit.Vehicle) -> None:
-    """Modes, arming, texts, silence, reboots, slow streams, a blocked loop: all of them."""
+    """Print every event: modes, arming, texts, silence, reboots, slow streams, a blocked event loop."""
     with vehicle.subscribe(events.Event, capacity=100) as news:
         async for event in news:
             print(event)
 
 
 async def main(address: str, seconds: float = 10.0) -> None:
-    """All three at once, for some seconds."""
+    """Run all three for some seconds."""
     async with aerokit.connect(address) as vehicle:
         watching = (print_values(vehicle), print_attitudes(vehicle), print_events(vehicle))
         try:

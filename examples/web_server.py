@@ -1,9 +1,8 @@
-"""Inside an asyncio program that is there already: a web server whose GET / tells the vehicle's state as JSON.
+"""Use a vehicle inside an asyncio web server: GET / returns its state as JSON.
 
     python examples/web_server.py udpin:0.0.0.0:14550 [port]        then: curl http://127.0.0.1:8080/
 
-It uses the standard library only; with FastAPI, aiohttp or a ROS 2 node the vehicle is held open in the same way, by
-their start-up and shut-down hooks.
+The server uses the standard library only. With FastAPI or aiohttp, open the vehicle in their start-up hook.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import aerokit
 
 
 def state_of(vehicle: aerokit.Vehicle) -> dict[str, object]:
-    """Reading values never waits, so a request is answered at once; the age says what the answer is worth."""
+    """Return the state as JSON types. Reading values never waits."""
     here = vehicle.position.latest
     return {
         "mode": vehicle.mode_name,

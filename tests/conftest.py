@@ -1,4 +1,4 @@
-"""What all tests share: async tests run on asyncio, on virtual time unless a test asks for real sockets."""
+"""Shared by all tests: async tests run on asyncio, on virtual time unless a test needs real sockets."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ from hypothesis import given, settings, strategies
 from late_loop import LateLoop
 from recorded import headline
 
-if sys.dont_write_bytecode:  # each worker, and each program of a test, would compile everything anew
+if sys.dont_write_bytecode:  # else each worker and each child process would compile every module again
     sys.dont_write_bytecode = False
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-if (
-    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-):  # a background job of a script: some tests interrupt themselves
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a background job of a script: some tests interrupt themselves
     signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("aerokit", deadline=None, max_examples=60, derandomize=True)
 settings.load_profile("aerokit")
@@ -32,19 +30,19 @@ def anyio_backend() -> tuple[str, dict[str, Any]]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def hypothesis_has_begun() -> None:
-    """At its first example it looks for who refers to its generators, and finds nobody who is frozen."""
+def hypothesis_started() -> None:
+    """Warm up hypothesis before objects are frozen: its first example looks up the referrers of its generators."""
     given(strategies.none())(lambda _: None)()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def what_was_there_before_is_no_garbage(hypothesis_has_begun: None) -> None:
-    """Collections that go through ten thousand tests keep all threads waiting, the simulated vehicles' among them."""
+def freeze_existing_objects(hypothesis_started: None) -> None:
+    """Garbage collections over the objects of ten thousand tests would block all threads, including the simulator's."""
     gc.collect()
     gc.freeze()
 
 
-@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+@pytest.hookimpl(optionalhook=True)  # pytest-xdist's hook
 def pytest_xdist_auto_num_workers() -> int:
     """Twice the number of processors: many tests wait for sockets and other processes."""
     return 2 * (os.cpu_count() or 1)
@@ -56,7 +54,7 @@ def pytest_report_header() -> str:
 
 @pytest.fixture
 async def grounded(anyio_backend: object) -> AsyncIterator[Flight]:
-    """Ready, disarmed, in STABILIZE."""
+    """A copter that is ready, disarmed and in STABILIZE."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.wire.forget()
@@ -65,6 +63,6 @@ async def grounded(anyio_backend: object) -> AsyncIterator[Flight]:
 
 @pytest.fixture
 async def flying(anyio_backend: object) -> AsyncIterator[Flight]:
-    """Hovering 10 m above home in GUIDED; nothing but what the test does is in ``wire.sent``."""
+    """A copter hovering 10 m above home in GUIDED; ``wire.sent`` has only what the test sends."""
     async with in_the_air() as flight:
         yield flight

@@ -1,4 +1,4 @@
-"""The benchmarks run and write what they promise; what they measure is no matter for a test."""
+"""The benchmarks run and write their tables; measured values are not checked."""
 
 from __future__ import annotations
 
@@ -24,14 +24,12 @@ AIMS = {
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "benchmarks/run.py", *arguments]
-    return subprocess.run(
-        command, cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=200, check=False
-    )
+    return subprocess.run(command, cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=200, check=False)
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, Any]], str]:
-    """The rows and the table of a run with few rounds."""
+    """Return rows and table of a run with few rounds."""
     path = tmp_path_factory.mktemp("bench") / "bench.json"
     done = run("--quick", "--output", str(path))
     assert done.returncode == 0, done.stderr
@@ -39,7 +37,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, Any]
 
 
 @pytest.mark.exhaustive
-def test_rows_have_the_promised_names_figures_and_aims(quick: tuple[list[dict[str, Any]], str]) -> None:
+def test_benchmark_rows_have_names_figures_and_aims(quick: tuple[list[dict[str, Any]], str]) -> None:
     rows = {row["name"]: row for row in quick[0]}
     expected = {name: aim for name, aim in AIMS.items() if name != "command_rtt_mavsdk" or HAS_MAVSDK}
     assert {name: rows[name]["aim"] for name in expected} == expected
@@ -51,7 +49,7 @@ def test_rows_have_the_promised_names_figures_and_aims(quick: tuple[list[dict[st
 
 
 @pytest.mark.exhaustive
-def test_the_table_shows_every_row_and_what_was_left_out(quick: tuple[list[dict[str, Any]], str]) -> None:
+def test_benchmark_table_shows_all_rows(quick: tuple[list[dict[str, Any]], str]) -> None:
     rows, table = quick
     lines = table.splitlines()
     for row in rows:
@@ -61,7 +59,7 @@ def test_the_table_shows_every_row_and_what_was_left_out(quick: tuple[list[dict[
 
 
 @pytest.mark.exhaustive
-def test_rows_can_be_chosen_and_a_wrong_name_is_refused(tmp_path: Path) -> None:
+def test_benchmark_rows_can_be_selected(tmp_path: Path) -> None:
     done = run("--quick", "--output", str(tmp_path / "bench.json"), "import")
     assert done.returncode == 0
     assert [row["name"] for row in json.loads((tmp_path / "bench.json").read_text())] == ["import"]
@@ -71,7 +69,7 @@ def test_rows_can_be_chosen_and_a_wrong_name_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.exhaustive
-def test_transfers_are_measured_and_compared_with_what_they_should_be(tmp_path: Path) -> None:
+def test_transfer_benchmarks_compare_with_ideal(tmp_path: Path) -> None:
     path = tmp_path / "bench.json"
     done = subprocess.run(
         [sys.executable, "benchmarks/transfers.py", "--quick", "--library", "aerokit", "--library", "pymavlink",

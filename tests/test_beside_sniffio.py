@@ -1,6 +1,6 @@
-"""With sniffio installed anyio knows which library is running in tasks only: aerokit asks it nowhere else.
+"""With sniffio installed, anyio detects the library in tasks only; aerokit calls it nowhere else.
 
-The programs run as processes of their own, beside the real sniffio where it is installed, else beside a stand-in.
+The programs run in their own processes, with the real sniffio if installed, else with a stand-in.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ loop.close()
     [BLOCKING, CLASSIC, CALLED_FROM_ANOTHER_LIBRARY, HELD_FROM_A_TIMER],
     ids=["blocking", "classic", "called from another library", "held from a timer"],
 )
-def test_it_works_beside_sniffio(program: str) -> None:
+def test_sniffio_does_not_interfere(program: str) -> None:
     source = str(Path(__file__).parents[1] / "src")
     stand_in = [] if importlib.util.find_spec("sniffio") else [str(STAND_IN)]
     done = subprocess.run(

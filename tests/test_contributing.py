@@ -1,4 +1,4 @@
-"""The recipes of CONTRIBUTING.md are followed to the letter, on a copy of the sources."""
+"""Apply the recipes of CONTRIBUTING.md to a copy of the sources."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from exhaustive import exhaustive
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-WHERE = r"In `(?P<path>[^`]+)`, (?P<how>at the end of|at the end|before|anew)(?: `(?P<anchor>[^\n]*)`)?"
+PLACE = r"In `(?P<path>[^`]+)`, (?P<how>at the end of|at the end|before|anew)(?: `(?P<anchor>[^\n]*)`)?"
 STEP = re.compile(
-    rf"^ *(?:\d\. )?(?:(?P<then>Then)|{WHERE}):\n\n(?P<indent> *)```python\n(?P<code>.*?)\n(?P=indent)```$",
+    rf"^ *(?:\d\. )?(?:(?P<then>Then)|{PLACE}):\n\n(?P<indent> *)```python\n(?P<code>.*?)\n(?P=indent)```$",
     re.MULTILINE | re.DOTALL,
 )
-RECIPES = re.findall(r"^## (.*)$", TEXT, re.MULTILINE)
+RECIPES = re.findall(r"^### (.*)$", TEXT, re.MULTILINE)
 
 
 def steps_until(recipe: str) -> list[re.Match[str]]:
-    """Those of the recipes up to this one: a later one may go on where an earlier one ended."""
-    end = TEXT.find("\n## ", TEXT.index(f"## {recipe}") + 1)
+    """Return the steps of all recipes up to this one, because a recipe may continue an earlier one."""
+    end = TEXT.find("\n### ", TEXT.index(f"### {recipe}") + 1)
     return list(STEP.finditer(TEXT[: None if end < 0 else end]))
 
 
@@ -51,10 +51,8 @@ def apply(step: re.Match[str], sources: Path) -> None:
 
 
 @pytest.mark.parametrize("recipe", [*map(exhaustive, RECIPES[:-1]), RECIPES[-1]])
-def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
-    shutil.copytree(
-        ROOT / "src" / "aerokit", tmp_path / "aerokit", ignore=shutil.ignore_patterns("__pycache__")
-    )
+def test_recipe_works(recipe: str, tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "src" / "aerokit", tmp_path / "aerokit", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "tests" / "helpers", tmp_path / "tests" / "helpers")
     steps = steps_until(recipe)
     for step in steps:
@@ -62,9 +60,7 @@ def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
             apply(step, tmp_path)
     check = textwrap.dedent(steps[-1]["code"])
     assert steps[-1]["then"]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, tmp_path / "tests" / "helpers")))
-    }
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tmp_path, tmp_path / "tests" / "helpers")))}
     done = subprocess.run(
         [sys.executable, "-c", check],
         env=environment,
@@ -76,6 +72,6 @@ def test_the_recipe_works(recipe: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_there_are_four_recipes_of_several_steps() -> None:
+def test_four_recipes_have_all_their_steps() -> None:
     assert len(RECIPES) == 4
     assert [len(steps_until(recipe)) for recipe in RECIPES] == [3, 6, 10, 12]

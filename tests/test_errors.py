@@ -1,4 +1,4 @@
-"""The tree of errors in docs/how-to/errors.md is that of the classes."""
+"""The tree of errors in docs/how-to/errors.md equals the class hierarchy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "how-to" / "errors.md"
 
 
 def branch(cls: type[BaseException], depth: int = 0) -> list[str]:
-    """A class, with the built-in errors that it is, too, and below it those that are of its kind."""
+    """Return lines for a class, its built-in bases, and its subclasses below."""
     builtin = [base.__name__ for base in cls.__bases__ if base.__module__ == builtins.__name__]
     also = f" ({', '.join(builtin)})" if builtin and cls is not errors.AerokitError else ""
     below = [each for each in (getattr(errors, name) for name in errors.__all__) if each.__bases__[0] is cls]
@@ -19,12 +19,12 @@ def branch(cls: type[BaseException], depth: int = 0) -> list[str]:
     return lines + [line for each in below for line in branch(each, depth + 1)]
 
 
-def test_tree_of_errors_is_that_of_the_classes() -> None:
+def test_error_tree_in_reference_matches_classes() -> None:
     tree = branch(errors.AerokitError)
     assert "\n".join(tree) in PAGE.read_text(encoding="utf-8")
     assert len(tree) == len(errors.__all__)
 
 
-def test_errors_of_files_and_streams_are_no_arguments_and_no_refusals() -> None:
+def test_file_and_stream_errors_have_own_bases() -> None:
     assert not issubclass(errors.FileFormatError, errors.InvalidArgument)
     assert not issubclass(errors.SetpointStreamStopped, errors.OperationRejected)

@@ -1,4 +1,4 @@
-"""docs/features.md: each of MAVSDK's calls about what is on board has its name here, or the reason why not."""
+"""docs/features.md has an equivalent, or a reason, for each MAVSDK call about components."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ CALLS = {
     """,
     "component_metadata": "request_component request_autopilot_component subscribe_metadata_available get_metadata",
 }
-"""Of MAVSDK 4.1; what is asked for and subscribed to is one call."""
+"""Calls of MAVSDK 4.1 by plugin; ``get_`` and ``subscribe_`` of one thing are one call."""
 
 
 def rows() -> list[tuple[str, str, str]]:
     return ROW.findall(PAGE.read_text(encoding="utf-8"))
 
 
-def test_every_call_has_a_row() -> None:
-    told = [(plugin, call) for plugin, call, _ in rows()]
-    assert len(told) == len(set(told))
-    assert set(told) == {(plugin, call) for plugin, calls in CALLS.items() for call in calls.split()}
+def test_every_call_has_one_row() -> None:
+    listed = [(plugin, call) for plugin, call, _ in rows()]
+    assert len(listed) == len(set(listed))
+    assert set(listed) == {(plugin, call) for plugin, calls in CALLS.items() for call in calls.split()}
 
 
 def names_in(answer: str) -> list[str]:
@@ -61,9 +61,9 @@ def names_in(answer: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def missing() -> set[str]:
-    """What the page names and a vehicle, or one of its parts, does not have."""
+    """Names on the page that do not exist on a vehicle."""
 
-    async def look() -> set[str]:
+    async def find_missing() -> set[str]:
         copter = SimulatedCopter(boot_time_s=0.0, components=[SimulatedCamera()])
         async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
             roots: dict[str, Any] = {
@@ -74,12 +74,12 @@ def missing() -> set[str]:
                 "gimbal": vehicle.gimbal,
             }
             named = {name for *_, answer in rows() for name in names_in(answer)}
-            return {name for name in named if not has(roots, name)}
+            return {name for name in named if not exists(roots, name)}
 
-    return run_virtual(look())
+    return run_virtual(find_missing())
 
 
-def has(roots: dict[str, Any], name: str) -> bool:
+def exists(roots: dict[str, Any], name: str) -> bool:
     root, _, rest = name.partition(".")
     try:
         attrgetter(rest)(roots[root])
@@ -89,29 +89,21 @@ def has(roots: dict[str, Any], name: str) -> bool:
 
 
 @for_each("plugin, call, answer", rows())
-def test_what_is_named_exists_or_a_reason_is_given(
-    plugin: str, call: str, answer: str, missing: set[str]
-) -> None:
+def test_row_names_existing_attribute_or_gives_reason(plugin: str, call: str, answer: str, missing: set[str]) -> None:
     names = names_in(answer)
-    assert names or answer.startswith("no: "), f"{plugin}.{call} has neither a name nor a reason"
-    assert not missing.intersection(names), f"{plugin}.{call} names what is not there"
+    assert names or answer.startswith("no: "), f"{plugin}.{call} has no name and no reason"
+    assert not missing.intersection(names), f"{plugin}.{call} names a missing attribute"
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mavsdk") is None, reason="MAVSDK is not installed")
-def test_the_list_is_that_of_mavsdk() -> None:
+def test_calls_are_those_of_installed_mavsdk() -> None:
     spec = importlib.util.find_spec("mavsdk")
     assert spec is not None
     assert spec.origin is not None
     plugins = Path(spec.origin).parent / "asyncio" / "plugins"
     for plugin, calls in CALLS.items():
         tree = ast.parse((plugins / plugin / f"{plugin}.py").read_text())
-        classes = [
-            each for each in tree.body if isinstance(each, ast.ClassDef) and each.name.endswith("Async")
-        ]
-        methods = {each.name for each in ast.walk(classes[0]) if isinstance(each, ast.AsyncFunctionDef)}
+        classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name.endswith("Async")]
+        methods = {node.name for node in ast.walk(classes[0]) if isinstance(node, ast.AsyncFunctionDef)}
         for call in calls.split():
-            assert (
-                call in methods
-                or call.removeprefix("subscribe_") in methods
-                or f"subscribe_{call}" in methods
-            )
+            assert call in methods or call.removeprefix("subscribe_") in methods or f"subscribe_{call}" in methods

@@ -1,4 +1,4 @@
-"""Files from outside that mean no good: our documented errors, bounded memory and time."""
+"""Hostile files raise documented errors within bounded memory and time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from for_each import for_each
 
-from aerokit._internal.files import LARGEST_FILE
+from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink import Dialect
 from aerokit.missions import Plan, read_plan_file
@@ -55,48 +55,48 @@ def px4(**changes: Any) -> bytes:
     ],
     ids=lambda data: repr(data[:30]),
 )
-def test_metadata_that_is_wrong(data: bytes) -> None:
+def test_invalid_metadata_is_rejected(data: bytes) -> None:
     with pytest.raises(FileFormatError, match=r"^metadata "):
         parse_metadata(data)
 
 
 @pytest.mark.parametrize("number", ["inf", "1e999", "nan", "9" * 5000, "0x" + "f" * 5000, 1e400, -1, 1.5, 64])
-def test_a_bit_that_is_none_is_left_out(number: object) -> None:
+def test_metadata_ignores_invalid_bit(number: object) -> None:
     bitmask = [{"index": number, "description": "No bit"}, {"index": 3, "description": "A bit"}]
     assert parse_metadata(px4(bitmask=bitmask))["MPC_XY_VEL_MAX"].bitmask == {3: "A bit"}
 
 
 @pytest.mark.parametrize("places", ["inf", 1e400, 1.5, "many", [1]])
-def test_decimal_places_that_are_none_are_left_out(places: object) -> None:
+def test_metadata_ignores_invalid_decimal_places(places: object) -> None:
     assert parse_metadata(px4(decimalPlaces=places))["MPC_XY_VEL_MAX"].decimal_places is None
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan"), -float("inf"), 1e300])
-def test_any_value_is_described(value: float) -> None:
+def test_metadata_describes_any_value(value: float) -> None:
     known = parse_metadata(px4(bitmask=[{"index": 1, "description": "A bit"}]))["MPC_XY_VEL_MAX"]
     assert isinstance(known.describe(value), str)
 
 
-def test_a_small_file_that_unpacks_to_a_large_one() -> None:
+def test_decompression_bomb_is_rejected() -> None:
     packer = lzma.LZMACompressor(preset=0)
     zeros = bytes(MEGABYTE)
     bomb = b"".join((*(packer.compress(zeros) for _ in range(100)), packer.flush()))
     del zeros
     tracemalloc.start()
     try:
-        with pytest.raises(FileFormatError, match=r"^metadata has more than 16 MB"):
+        with pytest.raises(FileFormatError, match=r"^metadata is too large: more than 16 MB"):
             parse_metadata(bomb)
-        assert tracemalloc.get_traced_memory()[1] < 3 * LARGEST_FILE
+        assert tracemalloc.get_traced_memory()[1] < 3 * MAX_FILE_SIZE
     finally:
         tracemalloc.stop()
 
 
 @pytest.mark.parametrize("read", [load_metadata, read_parameter_file, read_plan_file, Dialect.from_xml])
-def test_a_file_that_is_too_large(read: Callable[[Path], object], tmp_path: Path) -> None:
+def test_large_file_is_rejected(read: Callable[[Path], object], tmp_path: Path) -> None:
     path = tmp_path / "large"
     with path.open("wb") as file:
-        file.truncate(LARGEST_FILE + 1)
-    with pytest.raises(FileFormatError, match=r"large has more than 16 MB"):
+        file.truncate(MAX_FILE_SIZE + 1)
+    with pytest.raises(FileFormatError, match=r"large is too large: more than 16 MB"):
         read(path)
 
 
@@ -104,33 +104,31 @@ def test_a_file_that_is_too_large(read: Callable[[Path], object], tmp_path: Path
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "1e999", "9" * 5000, "0x" + "f" * 5000, "1e39"])
-def test_a_value_that_no_vehicle_can_hold(value: str) -> None:
+def test_parameter_file_rejects_impossible_value(value: str) -> None:
     with pytest.raises(FileFormatError, match=r"line 2"):
         parse_parameter_file(f"RTL_ALT,1500\nRTL_SPEED,{value}\n")
 
 
 def nested_plan(depth: int) -> str:
     unknown = "[" * depth + "]" * depth
-    return json.dumps({"fileType": "Plan", "version": 1, "rallyPoints": {"points": [], "version": 2}})[
-        :-1
-    ] + (f', "groundStation": {unknown}}}')
+    return json.dumps({"fileType": "Plan", "version": 1, "rallyPoints": {"points": [], "version": 2}})[:-1] + (
+        f', "groundStation": {unknown}}}'
+    )
 
 
-def test_a_plan_that_is_nested_deep() -> None:
+def test_deeply_nested_plan_is_rejected() -> None:
     with pytest.raises(FileFormatError):
         parse_plan(nested_plan(100_000))
 
 
-def test_a_value_in_the_wrong_place_that_is_nested_deep_or_large() -> None:
+def test_plan_error_shortens_deep_or_large_value() -> None:
     deep = "[" * 300 + "]" * 300
     with pytest.raises(FileFormatError, match=r"fileType = \[{37}\.\.\.: expected"):
         parse_plan(f'{{"fileType": {deep}}}')
 
 
 def deepest_plan() -> Plan:
-    for depth in range(
-        2_000 if sys.version_info < (3, 12) else 100_000, 0, -1 if sys.version_info < (3, 12) else -100
-    ):
+    for depth in range(2_000 if sys.version_info < (3, 12) else 100_000, 0, -1 if sys.version_info < (3, 12) else -100):
         try:
             return parse_plan(nested_plan(depth))
         except FileFormatError:
@@ -138,7 +136,7 @@ def deepest_plan() -> Plan:
     raise AssertionError("no plan can be read")
 
 
-def test_a_plan_that_is_nested_too_deep_to_be_written_again() -> None:
+def test_deeply_nested_plan_cannot_be_written() -> None:
     with pytest.raises(InvalidArgument):
         format_plan(deepest_plan())
 
@@ -162,7 +160,7 @@ def entries(*values: str, name: str = "E") -> str:
 FIELD = '<field type="uint8_t" name="a">Text</field>'
 
 
-def test_values_of_an_enum_have_64_bits(tmp_path: Path) -> None:
+def test_enum_values_must_fit_64_bits(tmp_path: Path) -> None:
     highest = (1 << 64) - 1
     values = (
         "0**64",
@@ -188,16 +186,16 @@ def test_values_of_an_enum_have_64_bits(tmp_path: Path) -> None:
         (message(f'<field type="uint8_t[{"9" * 5000}]" name="a"/>'), "unknown field type"),
         (message('<field type="uint8_t[999]" name="a"/>'), "at most 255 fit"),
         (message(FIELD, name="A&#10;B"), "is not a name"),
-        (entries("1&lt;&lt;99999999999"), "is no value of an enum"),
-        (entries("9**99999999999"), "is no value of an enum"),
-        (entries("2**-1"), "is no value of an enum"),
-        (entries("2**65"), "is no value of an enum"),
-        (entries("1&lt;&lt;65"), "is no value of an enum"),
-        (entries("1&lt;&lt;64"), "beyond 64 bits"),
-        (entries(f"{1 << 64}**0"), "is no value of an enum"),
-        (entries("0x1" + "0" * 20), "beyond 64 bits"),
-        (entries(str(1 << 64)), "beyond 64 bits"),
-        (entries(str(-(1 << 63) - 1)), "beyond 64 bits"),
+        (entries("1&lt;&lt;99999999999"), "is not a valid enum value"),
+        (entries("9**99999999999"), "is not a valid enum value"),
+        (entries("2**-1"), "is not a valid enum value"),
+        (entries("2**65"), "is not a valid enum value"),
+        (entries("1&lt;&lt;65"), "is not a valid enum value"),
+        (entries("1&lt;&lt;64"), "exceeds 64 bits"),
+        (entries(f"{1 << 64}**0"), "is not a valid enum value"),
+        (entries("0x1" + "0" * 20), "exceeds 64 bits"),
+        (entries(str(1 << 64)), "exceeds 64 bits"),
+        (entries(str(-(1 << 63) - 1)), "exceeds 64 bits"),
         (entries("9" * 5000), "is not a MAVLink dialect"),
         (dialect('<enums><enum name="E"><entry name="E_A"/><entry name="E_A"/></enum></enums>'), "enum E of"),
         (dialect('<enums><enum name="E"><entry name="E__X_"/></enum></enums>'), "enum E of"),
@@ -209,7 +207,7 @@ def test_values_of_an_enum_have_64_bits(tmp_path: Path) -> None:
     ],
     ids=lambda text: text[-60:],
 )
-def test_a_dialect_that_is_wrong(text: str, complaint: str, tmp_path: Path) -> None:
+def test_invalid_dialect_is_rejected(text: str, complaint: str, tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
     path.write_text(text)
     with pytest.raises(InvalidArgument, match=complaint):
@@ -221,11 +219,9 @@ FIELD_NAMES = ("tuple", "bytes", "values", "body", "frame", "None", "struct")
 
 
 @for_each("name, field", list(itertools.product(MESSAGE_NAMES, FIELD_NAMES)))
-def test_names_that_python_has_use_for(name: str, field: str, tmp_path: Path) -> None:
+def test_dialect_with_reserved_names(name: str, field: str, tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
-    path.write_text(
-        message(f'<field type="uint8_t" name="{field}"/><field type="int16_t[5]" name="b"/>', name=name)
-    )
+    path.write_text(message(f'<field type="uint8_t" name="{field}"/><field type="int16_t[5]" name="b"/>', name=name))
     (winch,) = Dialect.from_xml(path)
     attribute = winch.FIELDS[0].name
     made = winch(**{attribute: 3, "b": (1, 2, 3, 4, 5)})
@@ -233,16 +229,14 @@ def test_names_that_python_has_use_for(name: str, field: str, tmp_path: Path) ->
     assert winch.decode(made.encode()) == made
 
 
-def test_control_characters_in_attributes_stay_texts(tmp_path: Path) -> None:
+def test_dialect_keeps_control_characters_in_texts(tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
-    path.write_text(
-        message('<field type="uint8_t" name="a" units="m&#10;s&quot;\\" invalid="&#13;&#9;">T</field>')
-    )
+    path.write_text(message('<field type="uint8_t" name="a" units="m&#10;s&quot;\\" invalid="&#13;&#9;">T</field>'))
     (winch,) = Dialect.from_xml(path)
     assert (winch.FIELDS[0].units, winch.FIELDS[0].invalid) == ('m\ns"\\', "\r\t")
 
 
-def test_an_enum_without_entries(tmp_path: Path) -> None:
+def test_dialect_with_empty_enum(tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
     path.write_text(dialect('<enums><enum name="EMPTY"/></enums>'))
     assert Dialect.from_xml(path).enum("EMPTY").__members__ == {}

@@ -18,13 +18,11 @@ PEER = os.environ.get("AEROKIT_MAVPROXY_PYTHON")
 def run(*arguments: str, peer: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "benchmarks/hub.py", *arguments]
     env = {**os.environ, "AEROKIT_MAVPROXY_PYTHON": peer}
-    return subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False, env=env
-    )
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False, env=env)
 
 
 @pytest.mark.exhaustive
-def test_aerokit_alone_passes_everything_on(tmp_path: Path) -> None:
+def test_aerokit_alone_forwards_everything(tmp_path: Path) -> None:
     """It has nobody to be compared with, so there are no rows; that no frame was lost is what counts."""
     path = tmp_path / "bench.json"
     done = run("--quick", "out_4", "latency_p99", "--output", str(path), peer="/nowhere/python")
@@ -33,17 +31,15 @@ def test_aerokit_alone_passes_everything_on(tmp_path: Path) -> None:
     assert json.loads(path.read_text()) == []
 
 
-def test_a_wrong_name_is_refused() -> None:
+def test_wrong_name_is_refused() -> None:
     wrong = run("out_5", peer="")
     assert wrong.returncode == 2
     assert "out_1, out_4" in wrong.stderr
 
 
 @pytest.mark.skipif(PEER is None, reason="AEROKIT_MAVPROXY_PYTHON names no interpreter that has MAVProxy")
-def test_a_row_compares_with_mavproxy(tmp_path: Path) -> None:
+def test_row_compares_with_mavproxy(tmp_path: Path) -> None:
     path = tmp_path / "bench.json"
     assert run("--quick", "out_1", "--output", str(path), peer=PEER or "").returncode == 0
     rows: list[dict[str, Any]] = json.loads(path.read_text())
-    assert [(row["name"], row["peer_name"], row["aim"]) for row in rows] == [
-        ("out_1", "MAVProxy --out", 10.0)
-    ]
+    assert [(row["name"], row["peer_name"], row["aim"]) for row in rows] == [("out_1", "MAVProxy --out", 10.0)]

@@ -1,4 +1,4 @@
-"""A number of MAVLink stands in the generated enums, and nowhere else."""
+"""MAVLink's numbers are used through the generated enums only."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAMES = {f"{prefix}{each.name}": each.value for kind in ENUMS for each in kind f
 
 
 def declared(path: Path) -> Iterator[tuple[str, int]]:
-    """Whole numbers that a module gives names of its own."""
+    """Return integer constants of a module."""
     for node in ast.parse(path.read_text()).body:
         if not isinstance(node, ast.Assign) or len(node.targets) != 1:
             continue
@@ -45,11 +45,9 @@ def declared(path: Path) -> Iterator[tuple[str, int]]:
 
 
 @pytest.mark.parametrize("package", sorted(each.name for each in SOURCE.iterdir() if each.is_dir()))
-def test_no_number_of_the_standard_is_declared_again(package: str) -> None:
+def test_standard_numbers_are_not_redeclared(package: str) -> None:
     files = [
-        each
-        for each in (SOURCE / package).rglob("*.py")
-        if not str(each.relative_to(SOURCE)).startswith(GENERATED)
+        each for each in (SOURCE / package).rglob("*.py") if not str(each.relative_to(SOURCE)).startswith(GENERATED)
     ]
     again = [
         f"{each.relative_to(SOURCE)}: {name} = {number}"

@@ -1,4 +1,4 @@
-"""The package itself: its public names, and what importing it costs."""
+"""The package: public names and import time."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import aerokit
 
 
 @for_each("name", aerokit.__all__)
-def test_every_public_name_is_there(name: str) -> None:
+def test_public_names_are_importable(name: str) -> None:
     assert getattr(aerokit, name) is getattr(aerokit, name)
     assert name in dir(aerokit)
 
 
-def test_another_name_is_an_attribute_error() -> None:
+def test_unknown_name_raises_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'aerokit' has no attribute 'conect'"):
         getattr(aerokit, "conect")  # noqa: B009
 
 
-def test_import_loads_nothing_before_it_is_asked_for() -> None:
+def test_import_is_lazy() -> None:
     program = "import sys, aerokit; bare = set(sys.modules); aerokit.connect; print('asyncio' in bare)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
@@ -33,7 +33,7 @@ SOURCE = Path(aerokit.__file__).parent
 
 
 def mixed(folder: Path, init: str | None) -> Path:
-    """What is left when the other project called aerokit is installed, too: before ours (None) or after it."""
+    """Remains of the unrelated project named aerokit, installed before ours (None) or after it."""
     package = folder / "aerokit"
     package.mkdir()
     for each in SOURCE.iterdir():
@@ -46,25 +46,23 @@ def mixed(folder: Path, init: str | None) -> Path:
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-B", *arguments], capture_output=True, text=True, cwd=folder, check=False
-    )
+    return subprocess.run([sys.executable, "-B", *arguments], capture_output=True, text=True, cwd=folder, check=False)
 
 
-def test_files_of_the_other_aerokit_are_noticed_at_import(tmp_path: Path) -> None:
+def test_other_aerokit_is_detected_at_import(tmp_path: Path) -> None:
     done = run(mixed(tmp_path, None), "-c", "import aerokit; aerokit.Position")
     assert done.returncode == 0
     assert "RuntimeWarning: files of another project called aerokit (aerokit.aero)" in done.stderr
     assert "pip uninstall aerokit aerokit-mavlink" in done.stderr
 
 
-def test_commands_say_so_when_ours_was_overwritten(tmp_path: Path) -> None:
+def test_command_line_detects_overwritten_package(tmp_path: Path) -> None:
     done = run(mixed(tmp_path, '__version__ = "1.5.0"\n'), "-m", "aerokit", "sim", "--help")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("aerokit: files of another project")
 
 
-def test_enums_and_messages_are_modules_of_their_own_and_imported_in_parts() -> None:
+def test_enums_and_messages_modules_are_lazy() -> None:
     code = (
         "import sys; from aerokit.enums import MavState; from aerokit.messages import Heartbeat; import aerokit;"
         " assert aerokit.enums.MavState is MavState; assert aerokit.messages.Heartbeat is Heartbeat;"
@@ -73,7 +71,7 @@ def test_enums_and_messages_are_modules_of_their_own_and_imported_in_parts() -> 
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_connect_loads_nothing_that_only_some_programs_need() -> None:
+def test_connect_loads_only_required_modules() -> None:
     code = (
         "import sys, aerokit; aerokit.connect;"
         " print([name for name in ('serial', 'pymavlink', 'xml',"

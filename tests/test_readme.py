@@ -1,4 +1,4 @@
-"""The README tells the truth: its programs fly, its commands are complete, its links lead somewhere."""
+"""README.md: programs, commands, links and pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.parametrize("number", [0, 1], ids=["async", "blocking"])
-def test_the_programs_fly(number: int) -> None:
+def test_readme_program_flies(number: int) -> None:
     program = blocks("python")[number]
     assert program.count(ADDRESS) == 1
     assert len([line for line in program.splitlines() if line.strip()]) <= 10
@@ -27,11 +27,11 @@ def test_the_programs_fly(number: int) -> None:
         exec(compile(program.replace(ADDRESS, address), "README.md", "exec"), {"__name__": "__main__"})
 
 
-def test_there_are_no_other_programs() -> None:
+def test_readme_has_two_programs() -> None:
     assert len(blocks("python")) == 2
 
 
-def test_the_commands_stand_on_one_line_each_in_blocks_of_their_own() -> None:
+def test_readme_commands_are_single_lines() -> None:
     install, *commands = [block.strip() for block in blocks("sh")]
     assert install == 'pip install "aerokit-mavlink @ file:///path/to/clone"'
     assert len(commands) == 2
@@ -41,28 +41,34 @@ def test_the_commands_stand_on_one_line_each_in_blocks_of_their_own() -> None:
         assert command.endswith(f"&& .venv/bin/{last}")
 
 
-def test_ci_runs_the_readmes_test_command() -> None:
+def test_first_line_ending_in_pytest_is_test_command() -> None:
+    # .ci/run takes this line.
     found = next(line for line in README.splitlines() if line.endswith("pytest"))
     assert found == blocks("sh")[2].strip()
 
 
-DOCUMENTS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def test_readme_and_changelog_are_short() -> None:
+    assert len(README.splitlines()) <= 150
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 120
 
 
 @for_each("path", DOCUMENTS)
-def test_links_lead_somewhere(path: Path) -> None:
+def test_link_target_exists(path: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (path.parent / target).exists(), f"{path.name} links to {target}"
 
 
 @for_each("path", DOCUMENTS)
-def test_pictures_are_there(path: Path) -> None:
+def test_picture_exists(path: Path) -> None:
     for source in re.findall(r'<img src="([^"]+)"', path.read_text(encoding="utf-8")):
         assert (path.parent / source).exists(), f"{path.name} shows {source}"
 
 
-def test_the_first_screen_shows_flight_and_terminal() -> None:
+def test_first_screen_shows_flight_and_terminal() -> None:
     first = README.partition("```python")[0]
     assert len(first.splitlines()) < 20
     for name in ("demo", "terminal"):

@@ -1,4 +1,4 @@
-"""The reference of the documentation has every public name; `nox -s docs` fills the pages."""
+"""The reference pages list every public name."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def pages(site: dict[str, Any]) -> dict[str, str]:
     return dict(site["reference_pages"]())
 
 
-def test_every_object_stands_once(pages: dict[str, str]) -> None:
-    told = [line for text in pages.values() for line in text.splitlines() if line.startswith("::: ")]
-    assert len(told) > 400
-    assert sorted(told) == sorted(set(told))
+def test_every_object_is_listed_once(pages: dict[str, str]) -> None:
+    listed = [line for text in pages.values() for line in text.splitlines() if line.startswith("::: ")]
+    assert len(listed) > 400
+    assert sorted(listed) == sorted(set(listed))
 
 
 @for_each(
@@ -44,27 +44,27 @@ def test_every_object_stands_once(pages: dict[str, str]) -> None:
         ("sync", ["sync.twins.Vehicle"]),
     ],
 )
-def test_what_was_missing_once_is_there(pages: dict[str, str], page: str, names: list[str]) -> None:
+def test_page_lists_central_names(pages: dict[str, str], page: str, names: list[str]) -> None:
     for name in names:
         assert f"\n::: aerokit.{name}\n" in pages[f"reference/{page}.md"]
 
 
 @for_each("name", ["", "missions", "parameters", "errors", "events", "sim", "testing", "transport"])
-def test_whatever_is_exported_is_told(pages: dict[str, str], name: str) -> None:
+def test_every_exported_name_is_listed(pages: dict[str, str], name: str) -> None:
     module = importlib.import_module(f"aerokit.{name}" if name else "aerokit")
-    told = pages[f"reference/{name or 'aerokit'}.md"]
+    text = pages[f"reference/{name or 'aerokit'}.md"]
     for exported in module.__all__:
         if not inspect.ismodule(getattr(module, exported)):
-            assert f".{exported}\n" in told or f"[`{exported}`][" in told, exported
+            assert f".{exported}\n" in text or f"[`{exported}`][" in text, exported
 
 
-def test_messages_and_enums_are_all_there(pages: dict[str, str]) -> None:
-    for page, least in (("messages", 300), ("enums", 200)):
-        assert pages[f"reference/{page}.md"].count('<a id="') > least
+def test_messages_and_enums_are_listed(pages: dict[str, str]) -> None:
+    for page, min_count in (("messages", 300), ("enums", 200)):
+        assert pages[f"reference/{page}.md"].count('<a id="') > min_count
     assert "**Attitude** · ATTITUDE (30): " in pages["reference/messages.md"]
 
 
-def test_every_command_is_told(pages: dict[str, str]) -> None:
+def test_every_command_is_listed(pages: dict[str, str]) -> None:
     for command in (
         "demo",
         "sim",

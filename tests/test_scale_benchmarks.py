@@ -1,4 +1,4 @@
-"""The benchmark of many simulated vehicles runs and writes what it promises; the figures are no matter for a test."""
+"""The benchmark of many simulated vehicles runs and writes its table; measured values are not checked."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.exhaustive
-def test_every_row_has_a_figure_and_its_aim(tmp_path: Path) -> None:
+def test_scale_benchmark_rows_have_figures_and_aims(tmp_path: Path) -> None:
     path = tmp_path / "scale.json"
     done = run("--quick", "--output", str(path))
     assert done.returncode == 0, done.stderr
@@ -35,7 +35,7 @@ def test_every_row_has_a_figure_and_its_aim(tmp_path: Path) -> None:
     assert rows["copter_hundred"]["vehicles"] <= rows["copter_hundred"]["aerokit"]
 
 
-def test_a_wrong_name_is_refused() -> None:
+def test_scale_benchmark_rejects_unknown_name() -> None:
     wrong = run("copter")
     assert wrong.returncode == 2
     assert "copter_hundred, px4_hundred" in wrong.stderr

@@ -1,4 +1,4 @@
-"""Signing as programs meet it: the command line's keys, pymavlink's mavutil, the example, the blocking twin."""
+"""Signing in programs: the command line's keys, pymavlink's mavutil, the example and the blocking API."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from served_copter import served
 import aerokit.sync
 from aerokit import Signing, SigningKey
 from aerokit.apps.cli import main
-from aerokit.apps.cli.vehicle_command import ENVIRONMENT, key_file, signing_of
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, key_file, signing_of
 from aerokit.sim import SimulatedCopter
 
 KEY = SigningKey.from_passphrase("right")
@@ -24,7 +24,7 @@ KEY = SigningKey.from_passphrase("right")
 
 @pytest.fixture
 def copter() -> SimulatedCopter:
-    """Has the key, and is reached by radio."""
+    """A vehicle with the key, reached by radio."""
     copter = SimulatedCopter(boot_time_s=0.0, signing_key=KEY, parameter_count=30)
     copter.signing.trusts_first_port = False
     return copter
@@ -39,14 +39,14 @@ def address(copter: SimulatedCopter) -> Iterator[str]:
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    monkeypatch.delenv(SIGNING_KEY_VARIABLE, raising=False)
 
 
 # ----------------------------------------------------------------------------------- command line
 
 
 @pytest.mark.parametrize("text", ["right\n", KEY.secret.hex(), "\ufeff" + KEY.secret.hex() + "\r\n"])
-def test_a_key_from_a_file(text: str, tmp_path: Path) -> None:
+def test_signing_key_from_file(text: str, tmp_path: Path) -> None:
     path = tmp_path / "vehicle.key"
     path.write_text(text, encoding="utf-8")
     assert key_file(str(path)) == KEY
@@ -54,9 +54,9 @@ def test_a_key_from_a_file(text: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "expected"),
-    [(None, "No such file"), (b"", "has no signing key"), (b"\xff\xfe\x00", "it is no text")],
+    [(None, "No such file"), (b"", "has no signing key"), (b"\xff\xfe\x00", "it is not a text file")],
 )
-def test_a_file_without_a_key(content: bytes | None, expected: str, tmp_path: Path) -> None:
+def test_signing_key_file_without_key(content: bytes | None, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "vehicle.key"
     if content is not None:
         path.write_bytes(content)
@@ -64,16 +64,16 @@ def test_a_file_without_a_key(content: bytes | None, expected: str, tmp_path: Pa
         key_file(str(path))
 
 
-def test_commands_sign_with_the_key(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_signs_with_key(address: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("vehicle.key").write_text("right")
     assert main(["params", "get", "RTL_ALT", "--connect", address, "--signing-key", "vehicle.key"]) == 0
     assert "RTL_ALT" in capsys.readouterr().out
 
 
-def test_a_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signing_key_from_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing, given = Namespace(signing_key=None), Namespace(signing_key=KEY)
     assert signing_of(nothing) is None
-    monkeypatch.setenv(ENVIRONMENT, "left")
+    monkeypatch.setenv(SIGNING_KEY_VARIABLE, "left")
     for options, expected in ((nothing, SigningKey.from_passphrase("left")), (given, KEY)):
         signing = signing_of(options)
         assert signing is not None
@@ -83,7 +83,7 @@ def test_a_key_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 # -------------------------------------------------------------------------------------- pymavlink
 
 
-def test_pymavlinks_mavutil_is_heard_with_the_key_and_not_without(
+def test_mavutil_is_accepted_only_with_key(
     address: str, copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAVLINK20", "1")
@@ -95,7 +95,7 @@ def test_pymavlinks_mavutil_is_heard_with_the_key_and_not_without(
         link.wait_heartbeat(timeout=100)
         link.mav.param_set_send(1, 1, b"RTL_ALT", 1234.0, 9)
         link.setup_signing(KEY.secret, link_id=3)
-        link.mav.heartbeat_send(6, 8, 0, 0, 4)  # the vehicle's time stamps follow those that it hears
+        link.mav.heartbeat_send(6, 8, 0, 0, 4)  # the vehicle's timestamps follow received ones
         link.mav.param_set_send(1, 1, b"RTL_SPEED", 700.0, 9)
         deadline = time.monotonic() + 100
         value = None
@@ -110,10 +110,10 @@ def test_pymavlinks_mavutil_is_heard_with_the_key_and_not_without(
         link.close()
 
 
-# ----------------------------------------------------------------------------------- blocking twin
+# ------------------------------------------------------------------------------------ blocking API
 
 
-def test_blocking_programs_sign(address: str, copter: SimulatedCopter) -> None:
+def test_blocking_api_signs(address: str, copter: SimulatedCopter) -> None:
     signing = Signing(KEY)
     with aerokit.sync.connect(address, signing=signing, rates={}) as vehicle:
         assert vehicle.connection.signing is signing

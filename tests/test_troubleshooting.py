@@ -1,4 +1,4 @@
-"""docs/troubleshooting.md cannot rot: each text that it quotes is in the sources, or is provoked here."""
+"""Texts quoted in docs/troubleshooting.md occur in the sources, or are provoked here."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ from aerokit.transport import memory_link_pair
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
-WITHOUT_BLOCKS = re.sub(r"^```.*?^```$", "", PAGE, flags=re.DOTALL | re.MULTILINE)
+PAGE_WITHOUT_BLOCKS = re.sub(r"^```.*?^```$", "", PAGE, flags=re.DOTALL | re.MULTILINE)
 BLOCKS = re.findall(r"^```text\n(.*?)^```$", PAGE, flags=re.DOTALL | re.MULTILINE)
 HEADINGS = re.findall(r"^### (`.*`)$", PAGE, flags=re.MULTILINE)
-NOT_QUOTED = ("await ", "python ", "pip ", "aerokit ", "sudo ", "ss ", ". ")
-"""How a span of code begins that is typed, and not printed by anything."""
-LONG = 4
-"""A span of so many words is a text that somebody has read; shorter ones are names."""
-PRINTS_NO_ERRORS = (
+CODE_PREFIXES = ("await ", "python ", "pip ", "aerokit ", "sudo ", "ss ", ". ")
+"""Prefixes of code spans that a user types. They are not quoted texts."""
+MIN_WORDS = 4
+"""Code spans with this many words are quoted texts; shorter ones are names."""
+MIN_PIECE_LENGTH = 10
+"""A quoted text has a continuous piece of at least this length in the sources."""
+DIRECTORIES_WITHOUT_ERRORS = (
     "mavlink/messages",
     "mavlink/enums",
     "sim/",
@@ -43,23 +45,21 @@ PRINTS_NO_ERRORS = (
     "sync/twins",
     "sync/fleet_twins",
 )
-SAYS_ENOUGH = 10
-"""So many letters of a quoted text have to stand in one piece somewhere."""
 
 
-def quoted() -> list[str]:
-    spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", WITHOUT_BLOCKS)]
-    long = [span for span in spans if len(span.split()) >= LONG and not span.startswith(NOT_QUOTED)]
+def quoted_texts() -> list[str]:
+    spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", PAGE_WITHOUT_BLOCKS)]
+    long = [span for span in spans if len(span.split()) >= MIN_WORDS and not span.startswith(CODE_PREFIXES)]
     return list(dict.fromkeys([heading.strip("`") for heading in HEADINGS] + long))
 
 
 @functools.cache
-def literals() -> str:
-    """What the sources can print, a line for each text between what varies."""
+def source_strings() -> str:
+    """Return all string literals of the sources, split at placeholders, one per line."""
     found: set[str] = set()
     source = ROOT / "src" / "aerokit"
     for path in source.rglob("*.py"):
-        if not str(path.relative_to(source).as_posix()).startswith(PRINTS_NO_ERRORS):
+        if not str(path.relative_to(source).as_posix()).startswith(DIRECTORIES_WITHOUT_ERRORS):
             for node in ast.walk(ast.parse(path.read_bytes())):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
                     found |= set(re.split(r"%[sdr]", node.value))
@@ -67,8 +67,8 @@ def literals() -> str:
 
 
 @functools.cache
-def pythons() -> tuple[str, ...]:
-    """What Python and the system print by themselves, provoked."""
+def python_texts() -> tuple[str, ...]:
+    """Return the texts of Python and of the system that the page quotes."""
     texts = [os.strerror(number) for number in (errno.EADDRINUSE, errno.EACCES, errno.ENOENT)]
     for provoke in (lambda: types.ModuleType("aerokit").connect, lambda: compile("await x", "x.py", "exec")):
         with pytest.raises((AttributeError, SyntaxError)) as raised:
@@ -82,29 +82,29 @@ def pythons() -> tuple[str, ...]:
         warnings.simplefilter("always")
         _ = arm()
         del _
-    return *texts, *(str(each.message) for each in caught)
+    return *texts, *(str(warning.message) for warning in caught)
 
 
-def is_said(piece: str) -> bool:
-    return piece in literals() or any(piece in text for text in pythons())
+def is_printed(piece: str) -> bool:
+    return piece in source_strings() or any(piece in text for text in python_texts())
 
 
-def test_the_page_has_headings_and_blocks() -> None:
+def test_page_has_headings_and_provoked_blocks() -> None:
     assert len(HEADINGS) > 60
-    assert len(BLOCKS) == len(provoked())
+    assert len(BLOCKS) == len(provoked_errors())
 
 
-@for_each("text", quoted())
-def test_a_quoted_text_is_in_the_sources(text: str) -> None:
+@for_each("text", quoted_texts())
+def test_quoted_text_occurs_in_sources(text: str) -> None:
     pieces = [piece.strip(" ") for part in text.split("…") for piece in pieces_of(part)]
-    missing = [piece for piece in pieces if piece and not is_said(piece)]
+    missing = [piece for piece in pieces if piece and not is_printed(piece)]
     assert not missing, f"nothing prints {missing}"
-    assert max(map(len, pieces)) >= SAYS_ENOUGH or text == "… is not allowed: …", "it could be anything"
+    assert max(map(len, pieces)) >= MIN_PIECE_LENGTH or text == "… is not allowed: …", "too short to be checked"
 
 
 def pieces_of(part: str) -> list[str]:
-    """A part as it is, or, where the sources put it together, in pieces."""
-    if is_said(part.strip(" ")):
+    """Split a part that the sources build from several strings."""
+    if is_printed(part.strip(" ")):
         return [part]
     return re.split(r"\(|\)|: |, |MAV_CMD_", part)
 
@@ -114,37 +114,41 @@ def error_classes() -> list[str]:
 
 
 @for_each("name", error_classes())
-def test_each_class_of_errors_is_on_the_page(name: str) -> None:
+def test_error_class_is_on_page(name: str) -> None:
     assert re.search(rf"\b{name}\b", PAGE)
 
 
-def test_what_is_called_a_class_of_errors_is_one() -> None:
+def test_error_classes_on_page_exist() -> None:
     named = set(re.findall(r"\b[A-Z][A-Za-z]+(?:Error|Timeout|Rejected|Failed)\b", PAGE))
     assert named <= {*error_classes(), *dir(builtins)}
 
 
-# ---------------------------------------------------------------------------- blocks, whole errors
+# ---------------------------------------------------------------------------- blocks with whole errors
 
 
 @functools.cache
-def provoked() -> tuple[str, ...]:
-    """The errors of the page, provoked on simulated vehicles."""
-    return *run_virtual(nobody_is_heard()), *run_virtual(on_the_ground()), *run_virtual(in_the_air())
+def provoked_errors() -> tuple[str, ...]:
+    """Return the errors of the page's blocks, provoked on simulated vehicles."""
+    return (
+        *run_virtual(errors_without_vehicle()),
+        *run_virtual(errors_on_ground()),
+        *run_virtual(errors_in_air()),
+    )
 
 
-def told(error: BaseException) -> str:
+def traceback_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-async def nobody_is_heard() -> list[str]:
+async def errors_without_vehicle() -> list[str]:
     near, _ = memory_link_pair()
     with pytest.raises(errors.ConnectFailed) as failed:
         async with aerokit.connect(near):
             pass
-    return [told(failed.value)]
+    return [traceback_line(failed.value)]
 
 
-async def on_the_ground() -> list[str]:
+async def errors_on_ground() -> list[str]:
     copter = SimulatedCopter(boot_time_s=3.0)
     async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
         with pytest.raises(errors.OperationTimeout) as not_ready:
@@ -162,10 +166,10 @@ async def on_the_ground() -> list[str]:
         await asyncio.sleep(10)
         with pytest.raises(errors.CommandRejected) as refused:
             await vehicle.arm()
-    return [told(each.value) for each in (not_ready, unanswered, stale, refused)]
+    return [traceback_line(raised.value) for raised in (not_ready, unanswered, stale, refused)]
 
 
-async def in_the_air() -> list[str]:
+async def errors_in_air() -> list[str]:
     async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link, aerokit.connect(link) as vehicle:
         await vehicle.wait_ready()
         await vehicle.arm()
@@ -175,10 +179,10 @@ async def in_the_air() -> list[str]:
                 stream.set(aerokit.VelocitySetpoint(north_m_s=1))
                 await asyncio.sleep(2)
         await vehicle.land()
-    return [told(stopped.value)]
+    return [traceback_line(stopped.value)]
 
 
 @pytest.mark.parametrize("block", BLOCKS)
-def test_a_whole_error_comes_as_it_is_shown(block: str) -> None:
+def test_block_shows_error_as_raised(block: str) -> None:
     wanted = ".*".join(map(re.escape, block.strip().split("…")))
-    assert any(re.fullmatch(wanted, text, flags=re.DOTALL) for text in provoked()), "\n".join(provoked())
+    assert any(re.fullmatch(wanted, text, flags=re.DOTALL) for text in provoked_errors()), "\n".join(provoked_errors())

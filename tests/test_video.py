@@ -1,4 +1,4 @@
-"""Frames of a video stream that is made here, beside what the vehicle tells."""
+"""Frames of a locally generated video stream, matched with telemetry."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def encode(target: str, kind: str, count: int, *, pace: Callable[[], object] = l
 
 @contextmanager
 def streamed(port: int) -> Iterator[threading.Event]:
-    """A camera that sends MPEG-TS by UDP until the block ends, or the event is set."""
+    """Send MPEG-TS by UDP, as a camera does, until the block ends or the event is set."""
     is_over = threading.Event()
 
     def pace() -> None:
@@ -75,7 +75,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-async def test_a_live_stream_beside_the_vehicles_state() -> None:
+async def test_live_video_frames_have_vehicle_state() -> None:
     port = free_port()
     async with (
         simulated_link(SimulatedCopter(boot_time_s=0.0), speedup=10.0) as link,
@@ -101,7 +101,7 @@ async def test_a_live_stream_beside_the_vehicles_state() -> None:
             assert not each.is_alive()
 
 
-async def test_a_file_is_read_to_its_end(tmp_path: Path) -> None:
+async def test_video_file_is_read_to_end(tmp_path: Path) -> None:
     path = tmp_path / "flight.mp4"
     encode(str(path), "mp4", 10)
     async with open_video(str(path)) as video:
@@ -111,7 +111,7 @@ async def test_a_file_is_read_to_its_end(tmp_path: Path) -> None:
     assert math.isclose(frames[-1].stream_s or 0, 9 / RATE)
 
 
-async def test_a_slow_reader_gets_the_latest(tmp_path: Path) -> None:
+async def test_slow_video_reader_gets_latest_frame(tmp_path: Path) -> None:
     path = tmp_path / "flight.mp4"
     encode(str(path), "mp4", 40)
     async with open_video(str(path)) as video:
@@ -124,10 +124,10 @@ async def test_a_slow_reader_gets_the_latest(tmp_path: Path) -> None:
             await video.__anext__()
 
 
-async def test_a_stream_that_falls_silent_is_lost() -> None:
+async def test_silent_video_stream_is_lost() -> None:
     port = free_port()
     with streamed(port) as is_over:
-        async with open_video(f"udp://127.0.0.1:{port}", silence_s=0.5) as video:
+        async with open_video(f"udp://127.0.0.1:{port}", idle_timeout_s=0.5) as video:
             await video.__anext__()
             is_over.set()
             with pytest.raises(LinkLost, match="broke off"), anyio.fail_after(100):
@@ -135,7 +135,7 @@ async def test_a_stream_that_falls_silent_is_lost() -> None:
                     pass
 
 
-async def test_a_stream_that_is_not_there() -> None:
+async def test_missing_video_stream_cannot_be_opened() -> None:
     with pytest.raises(LinkOpenError, match=r"no-such-file\.mp4 cannot be opened"):
         async with open_video("/no-such-file.mp4"):
             pass
@@ -145,19 +145,19 @@ async def test_a_stream_that_is_not_there() -> None:
 
 
 @pytest.mark.exhaustive
-async def test_cancelled_while_opening_it_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_video_opening_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("aerokit.video.ENDS_WITHIN_S", 0.1)
     with anyio.move_on_after(0.2) as scope:
         async with open_video(f"udp://127.0.0.1:{free_port()}", timeout=3.0):
             pass
     assert scope.cancelled_caught
     left = [each for each in threading.enumerate() if "video" in each.name]
-    assert len(left) == 1  # until the time-out
+    assert len(left) == 1  # until the timeout
     left[0].join(100)
     assert not left[0].is_alive()
 
 
-async def test_one_reader(tmp_path: Path) -> None:
+async def test_video_stream_has_one_reader(tmp_path: Path) -> None:
     port = free_port()
     with streamed(port):
         async with open_video(f"udp://127.0.0.1:{port}") as video, anyio.create_task_group() as tasks:
@@ -167,16 +167,14 @@ async def test_one_reader(tmp_path: Path) -> None:
                 await video.__anext__()
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"uri": ""}, {"uri": "x", "timeout": 0.0}, {"uri": "x", "silence_s": -1.0}]
-)
-async def test_wrong_arguments(wrong: dict[str, Any]) -> None:
+@pytest.mark.parametrize("wrong", [{"uri": ""}, {"uri": "x", "timeout": 0.0}, {"uri": "x", "idle_timeout_s": -1.0}])
+async def test_open_video_rejects_invalid_arguments(wrong: dict[str, Any]) -> None:
     with pytest.raises(InvalidArgument):
         async with open_video(**wrong):
             pass
 
 
-async def test_without_pyav_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_open_video_without_pyav_names_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(NotSupported, match=r"aerokit-mavlink\[video\]"):
         async with open_video("x"):

@@ -1,4 +1,4 @@
-"""Files of users are replaced by whole ones only: each place that opens a file for writing is known here, with why."""
+"""User files are written atomically: each place that opens a file for writing is listed here with its reason."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ SOURCE = Path(__file__).parent.parent / "src" / "aerokit"
 WRITES = re.compile(
     r"""open\([^)\n]*["'](?:w|x|a|r\+)[bt+]*["']|(?:write_text|write_bytes)\(|\.open\(["'](?:w|x|a)[bt+]*["']"""
 )
-KNOWN = {
-    "apps/cli/camera.py": "beside what is there: nothing is replaced",
-    "apps/cli/own_flight.py": "os.devnull",
+EXPECTED_WRITERS = {
+    "apps/cli/devices.py": "beside what is there: nothing is replaced",
+    "apps/cli/supervised_flight.py": "os.devnull",
     "apps/cli/main.py": "os.devnull",
     "apps/cli/output.py": "a new file",
     "logs/convert/mcap.py": "converting.py moves it when it is whole",
     "logs/convert/tables.py": "converting.py moves it when it is whole",
     "logs/convert/tracks.py": "converting.py moves it when it is whole",
-    "apps/cli/monitor.py": "os.devnull",
+    "apps/cli/listening.py": "os.devnull",
     "mavlink/generator.py": "our own sources",
     "mavlink/tlog.py": "recordings: connection/frame_observers.py replaces a file when the first frame is received",
     "connection/frame_observers.py": "only to see whether it can be written",
     "sync/generator.py": "our own sources",
     "testing/failure.py": "of a failed test, under a name of its own",
     "vehicle/camera/capture.py": "moved when it is whole",
-    "_internal/files.py": "write_whole; a .part, which finish() moves",
+    "_internal/files.py": "write_atomically; a .part, which finish() moves",
     "vehicle/parameters/store.py": "moved when it is whole",
 }
 
 
-def test_each_place_that_writes_files_is_known() -> None:
+def test_file_writers_are_known() -> None:
     found = {
         path.relative_to(SOURCE).as_posix()
         for path in SOURCE.rglob("*.py")
         if WRITES.search(path.read_text(encoding="utf-8"))
     }
-    assert found == set(KNOWN)
+    assert found == set(EXPECTED_WRITERS)

@@ -27,7 +27,7 @@ def download(vehicle: Vehicle) -> None:
 
 
 def upload_square(vehicle: Vehicle, home: LocationGlobal, side: float, altitude: float) -> None:
-    """Take-off, four corners around home, return."""
+    """Upload take-off, four corners around home, return."""
     north = side / 2 / METRES_PER_DEGREE
     east = north / math.cos(math.radians(home.lat))
     commands = vehicle.commands
@@ -49,7 +49,7 @@ def arm(vehicle: Vehicle, mode: str) -> None:
 
 
 def fly_mission(vehicle: Vehicle, mode: str, altitude: float) -> None:
-    """ArduCopter wants to be in the air before a mission begins, unless AUTO_OPTIONS allows it to take off so."""
+    """Take off first: ArduCopter starts a mission on the ground only if AUTO_OPTIONS allows it."""
     vehicle.simple_takeoff(altitude)
     while vehicle.location.global_relative_frame.alt < altitude * 0.9:
         time.sleep(POLL_S)
@@ -68,20 +68,18 @@ def main() -> None:
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--side", type=float, default=40.0, help="metres")
     parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
-    parser.add_argument("--px4", action="store_true", help="for the names of its modes")
+    parser.add_argument("--px4", action="store_true", help="use the mode names of PX4")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
     download(vehicle)
     home = vehicle.home_location
     if home is None:
-        raise SystemExit("the vehicle does not know its home yet")
+        raise SystemExit("the vehicle has no home position yet")
     upload_square(vehicle, home, options.side, options.altitude)
     download(vehicle)
     for command in vehicle.commands:
-        print(
-            f"{command.seq}: command {command.command} at {command.x:.6f}, {command.y:.6f}, {command.z:g} m"
-        )
+        print(f"{command.seq}: command {command.command} at {command.x:.6f}, {command.y:.6f}, {command.z:g} m")
     arm(vehicle, "LOITER" if options.px4 else "GUIDED")
     fly_mission(vehicle, "MISSION" if options.px4 else "AUTO", options.altitude)
     print("landed")

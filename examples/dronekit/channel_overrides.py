@@ -1,4 +1,4 @@
-"""Read the sticks, and move them in the pilot's place. Not with a pilot's hands on them, and not in the air.
+"""Read the RC channels and override them. Do not run this in the air or while a pilot is flying.
 
 python -m aerokit.dronekit examples/dronekit/channel_overrides.py --connect udp:127.0.0.1:14550
 """
@@ -9,18 +9,16 @@ import time
 from dronekit import Vehicle, connect
 
 POLL_S = 0.1
-HEARD_S = 5.0
+TIMEOUT_S = 5.0
 
 
 def wait_for_channels(vehicle: Vehicle, wanted: dict[str, int]) -> None:
-    """The vehicle tells what it works with: the receiver's values, or what overrides them."""
+    """Wait until RC_CHANNELS reports these values: the receiver's or the overrides."""
 
     def has_them() -> bool:
         return all(vehicle.channels[number] == value for number, value in wanted.items())
 
-    vehicle.wait_for(
-        has_them, timeout=HEARD_S, interval=POLL_S, errmsg=f"the channels do not become {wanted}"
-    )
+    vehicle.wait_for(has_them, timeout=TIMEOUT_S, interval=POLL_S, errmsg=f"the channels did not change to {wanted}")
     print("channels:", vehicle.channels)
 
 
@@ -30,7 +28,7 @@ def main() -> None:
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
-    deadline = time.monotonic() + HEARD_S
+    deadline = time.monotonic() + TIMEOUT_S
     while vehicle.channels["1"] is None and time.monotonic() < deadline:
         time.sleep(POLL_S)
     before = dict(vehicle.channels)

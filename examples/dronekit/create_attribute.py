@@ -1,4 +1,4 @@
-"""A vehicle with an attribute of its own, made of a message that DroneKit does not know.
+"""Add an attribute to Vehicle, from a message that DroneKit does not use.
 
 python -m aerokit.dronekit examples/dronekit/create_attribute.py --connect udp:127.0.0.1:14550
 """
@@ -11,7 +11,7 @@ from dronekit import Vehicle, connect
 
 
 class Vibration:
-    """How much the vehicle shakes, in m/s², and how often its accelerometers were at their end."""
+    """Vibration levels in m/s², and the number of accelerometer clippings."""
 
     def __init__(self, x: float, y: float, z: float, clippings: int) -> None:
         self.x = x
@@ -24,7 +24,7 @@ class Vibration:
 
 
 class ShakingVehicle(Vehicle):
-    """Has ``vibration``, None before the first VIBRATION."""
+    """Vehicle with the attribute ``vibration``, None before the first VIBRATION."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -33,9 +33,7 @@ class ShakingVehicle(Vehicle):
         @self.on_message("VIBRATION")
         def on_vibration(vehicle: Vehicle, name: str, message: Any) -> None:
             clippings = message.clipping_0 + message.clipping_1 + message.clipping_2
-            self._vibration = Vibration(
-                message.vibration_x, message.vibration_y, message.vibration_z, clippings
-            )
+            self._vibration = Vibration(message.vibration_x, message.vibration_y, message.vibration_z, clippings)
             self.notify_attribute_listeners("vibration", self._vibration)
 
     @property
@@ -44,9 +42,9 @@ class ShakingVehicle(Vehicle):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Print the vibration that a vehicle feels.")
+    parser = argparse.ArgumentParser(description="Print the vibration of a vehicle.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
-    parser.add_argument("--count", type=int, default=5, help="how often")
+    parser.add_argument("--count", type=int, default=5, help="number of values")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=["mode", "vibration"], vehicle_class=ShakingVehicle)
@@ -64,7 +62,7 @@ def main() -> None:
 
     vehicle.add_attribute_listener("vibration", print_it)
     if not done.wait(30):
-        print("the vehicle tells no more of it")
+        print("no further VIBRATION within 30 s")
     vehicle.close()
 
 

@@ -1,4 +1,4 @@
-"""Fly where a recorded flight has been: its track becomes a mission.
+"""Fly the track of a recorded flight as a mission.
 
 python -m aerokit.dronekit examples/dronekit/flight_replay.py flight.tlog --connect udp:127.0.0.1:14550
 """
@@ -16,14 +16,14 @@ ABOVE_HOME = mavutil.mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
 
 
 def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
-    """Metres, altitude included."""
+    """Return the distance in metres, altitude included."""
     north = (other.lat - one.lat) * METRES_PER_DEGREE
     east = (other.lon - one.lon) * METRES_PER_DEGREE * math.cos(math.radians(one.lat))
     return math.hypot(north, east, other.alt - one.alt)
 
 
 def track_of(path: str, spacing: float, lowest: float) -> list[LocationGlobalRelative]:
-    """Places of a flight that are so many metres apart, those near the ground left out."""
+    """Return places of a flight, at least ``spacing`` metres apart and above ``lowest``."""
     track: list[LocationGlobalRelative] = []
     recording = mavutil.mavlink_connection(path)
     while (message := recording.recv_match(type="GLOBAL_POSITION_INT")) is not None:
@@ -42,9 +42,7 @@ def upload(vehicle: Vehicle, track: list[LocationGlobalRelative]) -> None:
     commands = vehicle.commands
     commands.clear()
     for place in track:
-        commands.add(
-            Command(0, 0, 0, ABOVE_HOME, WAYPOINT, 0, 1, 0, 0, 0, 0, place.lat, place.lon, place.alt)
-        )
+        commands.add(Command(0, 0, 0, ABOVE_HOME, WAYPOINT, 0, 1, 0, 0, 0, 0, place.lat, place.lon, place.alt))
     commands.upload()
 
 
@@ -53,17 +51,17 @@ def main() -> None:
     parser.add_argument("recording", help="a .tlog file")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--spacing", type=float, default=5.0, help="metres between waypoints")
-    parser.add_argument("--farthest", type=float, default=1000.0, help="metres from here to its beginning")
-    parser.add_argument("--px4", action="store_true", help="for the names of its modes")
+    parser.add_argument("--farthest", type=float, default=1000.0, help="maximum distance to its start, in metres")
+    parser.add_argument("--px4", action="store_true", help="use the mode names of PX4")
     options = parser.parse_args()
 
     track = track_of(options.recording, options.spacing, lowest=2.0)
     if not track:
-        raise SystemExit("nothing flies in this recording")
+        raise SystemExit("the recording has no flight")
     vehicle = connect(options.connect, wait_ready=True)
     way = distance(here(vehicle), track[0])
     if way > options.farthest:
-        raise SystemExit(f"the flight began {way:.0f} m from here")
+        raise SystemExit(f"the recorded flight starts {way:.0f} m away, more than --farthest")
     print(f"{len(track)} waypoints")
     upload(vehicle, track)
 
@@ -78,7 +76,7 @@ def main() -> None:
         time.sleep(POLL_S)
     print("at the end of the track")
     vehicle.mode = VehicleMode("RTL")
-    vehicle.wait_for(lambda: not vehicle.armed, timeout=300, errmsg="does not land")
+    vehicle.wait_for(lambda: not vehicle.armed, timeout=300, errmsg="the vehicle did not land")
     vehicle.close()
 
 

@@ -1,4 +1,4 @@
-"""Fly above somebody who moves: another vehicle, or for trying it out a walker that exists only here.
+"""Follow another vehicle, or a simulated walker.
 
 python -m aerokit.dronekit examples/dronekit/follow_me.py --connect udp:127.0.0.1:14550 [--leader udp:127.0.0.1:14560]
 """
@@ -12,20 +12,20 @@ from dronekit import LocationGlobalRelative, VehicleMode, connect
 
 POLL_S = 0.2
 MODES = ("GUIDED", "LOITER", "TAKEOFF")
-"""In which an ArduPilot, or a PX4, goes where it is told."""
+"""Modes in which ArduPilot or PX4 obeys simple_goto."""
 METRES_PER_DEGREE = 111_320.0
 Position = Callable[[], LocationGlobalRelative]
 
 
 def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
-    """Metres along the ground."""
+    """Return the horizontal distance in metres."""
     north = (other.lat - one.lat) * METRES_PER_DEGREE
     east = (other.lon - one.lon) * METRES_PER_DEGREE * math.cos(math.radians(one.lat))
     return math.hypot(north, east)
 
 
 def walker(start: LocationGlobalRelative, speed: float) -> Position:
-    """Somebody who walks north from a place, so many metres per second."""
+    """Return the position of a walker who walks north, at ``speed`` m/s."""
     started = time.monotonic()
 
     def where() -> LocationGlobalRelative:
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
     parser.add_argument("--walking-speed", type=float, default=1.5, help="metres per second")
     parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--mode", default="GUIDED", help="in which it is told where to go (PX4: LOITER)")
+    parser.add_argument("--mode", default="GUIDED", help="mode for simple_goto (PX4: LOITER)")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
@@ -58,14 +58,14 @@ def main() -> None:
         location = leader.location
         where = lambda: location.global_relative_frame  # noqa: E731
     end = time.monotonic() + options.seconds
-    while time.monotonic() < end and vehicle.mode.name in MODES:  # a pilot who changes the mode has it back
+    while time.monotonic() < end and vehicle.mode.name in MODES:  # stop when the pilot changes the mode
         place = where()
         vehicle.simple_goto(LocationGlobalRelative(place.lat, place.lon, options.altitude))
         print(f"{distance(vehicle.location.global_relative_frame, place):.0f} m behind")
         time.sleep(POLL_S)
     print(f"followed for {distance(start, vehicle.location.global_relative_frame):.0f} m")
     vehicle.mode = VehicleMode("LAND")
-    vehicle.wait_for(lambda: not vehicle.armed, timeout=60, errmsg="does not land")
+    vehicle.wait_for(lambda: not vehicle.armed, timeout=60, errmsg="the vehicle did not land")
     print("landed")
     vehicle.close()
     if leader is not None:

@@ -1,4 +1,4 @@
-"""Steer by velocities and headings, with messages of our own making.
+"""Steer by velocities and headings with raw messages.
 
 python -m aerokit.dronekit examples/dronekit/guided_velocity_and_yaw.py --connect udp:127.0.0.1:14550
 """
@@ -10,13 +10,13 @@ from dronekit import Vehicle, VehicleMode, connect, mavutil
 
 POLL_S = 0.1
 LEGS = ((2, 0, 0), (0, 2, 0), (-2, -2, 0), (0, 0, 0.5), (0, 0, 0))
-"""Metres per second north, east and down; the last one stops it."""
+"""Velocities in m/s north, east, down; the last one stops the vehicle."""
 ONLY_VELOCITY = 0b110111000111
-"""Bits of what the vehicle is to ignore: position, acceleration, yaw and yaw rate."""
+"""type_mask: ignore position, acceleration, yaw and yaw rate."""
 
 
 def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float) -> None:
-    """Metres per second; sent again and again, since the vehicle stops when it hears no more of it."""
+    """Send a velocity in m/s repeatedly, because the vehicle stops when set-points stop."""
     message = vehicle.message_factory.set_position_target_local_ned_encode(
         0, 0, 0, mavutil.mavlink.MAV_FRAME_LOCAL_NED, ONLY_VELOCITY, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0
     )
@@ -27,7 +27,7 @@ def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float
 
 
 def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
-    """Point the nose to a heading in degrees; waits until it does."""
+    """Turn to a heading in degrees and wait for it."""
     message = vehicle.message_factory.command_long_encode(
         0, 0, mavutil.mavlink.MAV_CMD_CONDITION_YAW, 0, heading, 0, 0, 0, 0, 0, 0
     )
@@ -36,7 +36,7 @@ def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
     def off() -> float:
         return float(abs((vehicle.heading - heading + 180) % 360 - 180))
 
-    vehicle.wait_for(lambda: off() < 5, timeout=timeout, errmsg=f"does not turn to {heading:g} degrees")
+    vehicle.wait_for(lambda: off() < 5, timeout=timeout, errmsg=f"the vehicle did not turn to {heading:g} degrees")
     print(f"heading {vehicle.heading}")
 
 
@@ -58,7 +58,7 @@ def main() -> None:
     for heading in (90, 180):
         turn(vehicle, heading)
     vehicle.mode = VehicleMode("LAND")
-    vehicle.wait_for(lambda: not vehicle.armed, timeout=60, errmsg="does not land")
+    vehicle.wait_for(lambda: not vehicle.armed, timeout=60, errmsg="the vehicle did not land")
     print("landed")
     vehicle.close()
 

@@ -1,4 +1,4 @@
-"""Connect, look, leave.
+"""Connect and print the state.
 
 python -m aerokit.dronekit examples/dronekit/hello.py --connect udp:127.0.0.1:14550
 """
@@ -9,7 +9,7 @@ from dronekit import connect
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Print what a vehicle says of itself.")
+    parser = argparse.ArgumentParser(description="Print the state of a vehicle.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     options = parser.parse_args()
 

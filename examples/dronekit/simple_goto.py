@@ -1,4 +1,4 @@
-"""Take off, visit two places, come back.
+"""Take off, visit two places, return.
 
 python -m aerokit.dronekit examples/dronekit/simple_goto.py --connect udp:127.0.0.1:14550
 """
@@ -11,18 +11,18 @@ from dronekit import LocationGlobalRelative, Vehicle, VehicleMode, connect
 
 POLL_S = 0.2
 MODES = ("GUIDED", "LOITER", "TAKEOFF")
-"""In which an ArduPilot, or a PX4, goes where it is told."""
+"""Modes in which ArduPilot or PX4 obeys simple_goto."""
 METRES_PER_DEGREE = 111_320.0
 
 
 def offset(place: LocationGlobalRelative, north: float, east: float) -> LocationGlobalRelative:
-    """The place so many metres away, at the same altitude."""
+    """Return the place that is ``north`` and ``east`` metres away, at the same altitude."""
     lon = place.lon + east / METRES_PER_DEGREE / math.cos(math.radians(place.lat))
     return LocationGlobalRelative(place.lat + north / METRES_PER_DEGREE, lon, place.alt)
 
 
 def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
-    """Metres along the ground."""
+    """Return the horizontal distance in metres."""
     north = (other.lat - one.lat) * METRES_PER_DEGREE
     east = (other.lon - one.lon) * METRES_PER_DEGREE * math.cos(math.radians(one.lat))
     return math.hypot(north, east)
@@ -44,7 +44,7 @@ def arm_and_take_off(vehicle: Vehicle, mode: str, altitude: float) -> None:
 
 
 def go_to(vehicle: Vehicle, place: LocationGlobalRelative, speed: float) -> None:
-    """Return when it is there, or when somebody else has taken over."""
+    """Return on arrival, or when the pilot has changed the mode."""
     vehicle.simple_goto(place, groundspeed=speed)
     while vehicle.mode.name in MODES:
         left = distance(vehicle.location.global_relative_frame, place)
@@ -59,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Fly to two places in GUIDED mode.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
     parser.add_argument("--altitude", type=float, default=10.0, help="metres above home")
-    parser.add_argument("--mode", default="GUIDED", help="in which it is told where to go (PX4: LOITER)")
+    parser.add_argument("--mode", default="GUIDED", help="mode for simple_goto (PX4: LOITER)")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)

@@ -36,8 +36,8 @@ def print_attributes(vehicle: Vehicle) -> None:
         print(place)
 
 
-def listen_for_a_while(vehicle: Vehicle, seconds: float) -> None:
-    """A decorated listener stays for good; one that was added can be removed."""
+def listen(vehicle: Vehicle, seconds: float) -> None:
+    """Listen to attributes. Only a listener from add_attribute_listener can be removed."""
     headings: list[int] = []
     names: set[str] = set()
 
@@ -45,16 +45,16 @@ def listen_for_a_while(vehicle: Vehicle, seconds: float) -> None:
     def on_heading(vehicle: Vehicle, name: str, value: int) -> None:
         headings.append(value)
 
-    def on_anything(vehicle: Vehicle, name: str, value: object) -> None:
+    def on_any(vehicle: Vehicle, name: str, value: object) -> None:
         names.add(name)
 
-    vehicle.add_attribute_listener("*", on_anything)
+    vehicle.add_attribute_listener("*", on_any)
     time.sleep(seconds)
-    vehicle.remove_attribute_listener("*", on_anything)
-    print(f"told {len(headings)} headings, and these attributes: {', '.join(sorted(names))}")
+    vehicle.remove_attribute_listener("*", on_any)
+    print(f"received {len(headings)} headings, and these attributes: {', '.join(sorted(names))}")
 
 
-def change_a_parameter(vehicle: Vehicle, name: str) -> None:
+def change_parameter(vehicle: Vehicle, name: str) -> None:
     before = vehicle.parameters[name]
     vehicle.parameters[name] = before + 1
     print(f"{name} was {before}, is {vehicle.parameters[name]}")
@@ -64,19 +64,17 @@ def change_a_parameter(vehicle: Vehicle, name: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Print the state of a vehicle.")
     parser.add_argument("--connect", metavar="ADDRESS", default="udp:127.0.0.1:14550")
-    parser.add_argument(
-        "--parameter", default="RTL_LOIT_TIME", help="one to change and restore; PX4: RTL_RETURN_ALT"
-    )
+    parser.add_argument("--parameter", default="RTL_LOIT_TIME", help="one to change and restore; PX4: RTL_RETURN_ALT")
     parser.add_argument("--seconds", type=float, default=3.0, help="how long to listen")
     options = parser.parse_args()
 
     vehicle = connect(options.connect, wait_ready=True)
-    vehicle.commands.download()  # which also brings home
+    vehicle.commands.download()  # also downloads the home position
     vehicle.commands.wait_ready()
     print_attributes(vehicle)
-    listen_for_a_while(vehicle, options.seconds)
+    listen(vehicle, options.seconds)
     print(f"{len(vehicle.parameters)} parameters")
-    change_a_parameter(vehicle, options.parameter)
+    change_parameter(vehicle, options.parameter)
     vehicle.close()
 
 

@@ -1,4 +1,4 @@
-"""The program that is tested: fly around a field and come back; three times, for three kinds of programs.
+"""The program under test: fly around a field and return. Asynchronous, blocking, and for DroneKit.
 
 python survey.py udpin:0.0.0.0:14550
 """
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 ALTITUDE_M = 10.0
 SIDE_M = 20.0
-LEAST_BATTERY_PERCENT = 40.0
+MIN_BATTERY_PERCENT = 40.0
 
 
 class BatteryTooLow(Exception):
-    """There is not enough charge to begin."""
+    """The battery has too little charge for the survey."""
 
 
 def corners(home: Position) -> list[Position]:
-    """The corners of the field."""
+    """Return the corners of the field."""
     return [
         home.offset(north_m=SIDE_M),
         home.offset(north_m=SIDE_M, east_m=SIDE_M),
@@ -35,7 +35,7 @@ def corners(home: Position) -> list[Position]:
 
 
 def plan(home: Position) -> Mission:
-    """Take off, visit each corner, return."""
+    """Return the mission: take off, visit each corner, return."""
     return Mission([
         take_off(home, altitude_relative_m=ALTITUDE_M),
         *(waypoint(place, altitude_relative_m=ALTITUDE_M) for place in corners(home)),
@@ -44,7 +44,7 @@ def plan(home: Position) -> Mission:
 
 
 async def survey(vehicle: aerokit.Vehicle) -> None:
-    """For programs on asyncio; BatteryTooLow before anything moves."""
+    """Survey the field. Raises BatteryTooLow before arming."""
     await vehicle.wait_ready()
     check_battery(vehicle.batteries.value[0].remaining_percent)
     await vehicle.mission.upload(plan(vehicle.position.value))
@@ -54,7 +54,7 @@ async def survey(vehicle: aerokit.Vehicle) -> None:
 
 
 def survey_blocking(vehicle: sync.Vehicle) -> None:
-    """The same for programs without ``async``."""
+    """Survey the field without ``async``."""
     vehicle.wait_ready()
     check_battery(vehicle.batteries.value[0].remaining_percent)
     vehicle.mission.upload(plan(vehicle.position.value))
@@ -64,7 +64,7 @@ def survey_blocking(vehicle: sync.Vehicle) -> None:
 
 
 def hop_classic(address: str) -> None:
-    """As a DroneKit program does it: up, and down again."""
+    """Fly up and down with DroneKit's API."""
     from dronekit import VehicleMode, connect
 
     vehicle: Any = connect(address, wait_ready=True)
@@ -81,9 +81,9 @@ def hop_classic(address: str) -> None:
 
 
 def check_battery(percent: float | None) -> None:
-    """Raise BatteryTooLow when it is known to be too low."""
-    if percent is not None and percent < LEAST_BATTERY_PERCENT:
-        raise BatteryTooLow(f"{percent:g} % is less than {LEAST_BATTERY_PERCENT:g} %")
+    """Raise BatteryTooLow if the charge is known and too low."""
+    if percent is not None and percent < MIN_BATTERY_PERCENT:
+        raise BatteryTooLow(f"{percent:g} % is less than {MIN_BATTERY_PERCENT:g} %")
 
 
 def wait_for(condition: Any) -> None:
@@ -93,7 +93,7 @@ def wait_for(condition: Any) -> None:
 
 
 async def main(address: str) -> None:
-    """Fly it."""
+    """Survey the field of the vehicle at ``address``."""
     async with aerokit.connect(address) as vehicle:
         await survey(vehicle)
 

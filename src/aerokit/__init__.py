@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.imports import complaint, lazy_exports
+from aerokit._internal.imports import installation_problem, lazy_exports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from aerokit import errors as errors
     from aerokit import events as events
     from aerokit.connection.connection import Connection as Connection
+    from aerokit.connection.heartbeats import OwnHeartbeat as OwnHeartbeat
     from aerokit.connection.opening import open_connection as open_connection
-    from aerokit.connection.own_heartbeat import OwnHeartbeat as OwnHeartbeat
     from aerokit.events import LinkState as LinkState
     from aerokit.fleets.fleet import Fleet as Fleet
     from aerokit.fleets.formation import Formation as Formation
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.opening import fleet as fleet
     from aerokit.fleets.policy import FleetResult as FleetResult
     from aerokit.fleets.separation import Deconfliction as Deconfliction
-    from aerokit.fleets.shows.show import Show as Show
+    from aerokit.fleets.show import Show as Show
     from aerokit.hub.hub import Hub as Hub
     from aerokit.hub.values import Endpoint as Endpoint
     from aerokit.mavlink import enums as enums
@@ -58,10 +58,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 
-if (_mixed := complaint(__path__[0])) is not None:
+if (_problem := installation_problem(__path__[0])) is not None:
     import warnings
 
-    warnings.warn(_mixed, RuntimeWarning, stacklevel=2)
+    warnings.warn(_problem, RuntimeWarning, stacklevel=2)
 
 __getattr__: Callable[[str], Any]
 __dir__: Callable[[], list[str]]
@@ -70,7 +70,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     {
         "aerokit.connection.connection": ("Connection",),
         "aerokit.connection.opening": ("open_connection",),
-        "aerokit.connection.own_heartbeat": ("OwnHeartbeat",),
+        "aerokit.connection.heartbeats": ("OwnHeartbeat",),
         "aerokit.errors": ("errors",),
         "aerokit.events": ("LinkState", "events"),
         "aerokit.fleets.fleet": ("Fleet",),
@@ -79,7 +79,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.fleets.opening": ("fleet",),
         "aerokit.fleets.policy": ("FleetResult",),
         "aerokit.fleets.separation": ("Deconfliction",),
-        "aerokit.fleets.shows.show": ("Show",),
+        "aerokit.fleets.show": ("Show",),
         "aerokit.hub.hub": ("Hub",),
         "aerokit.hub.values": ("Endpoint",),
         "aerokit.mavlink.dialect": ("Dialect",),

@@ -1,4 +1,4 @@
-"""``python -m aerokit`` is ``aerokit``."""
+"""Entry point of ``python -m aerokit``."""
 
 import sys
 

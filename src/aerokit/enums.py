@@ -1,4 +1,4 @@
-"""MAVLink's enums: ``from aerokit.enums import MavCmd``; the module :mod:`aerokit.mavlink.enums` itself."""
+"""MAVLink enums: ``from aerokit.enums import MavCmd``. An alias of :mod:`aerokit.mavlink.enums`."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -8,5 +8,5 @@ from aerokit.mavlink import enums
 if TYPE_CHECKING:
     from aerokit.mavlink.enums import *  # noqa: F403
 else:
-    # Not a star import: each part is imported when the first of its names is used.
+    # An alias, because a star import would load all parts instead of those in use.
     sys.modules[__name__] = enums

@@ -1,4 +1,4 @@
-"""Every exception that aerokit raises: one tree, so that one ``except AerokitError`` catches it all."""
+"""Exceptions raised by aerokit. All derive from `AerokitError`, so that `except AerokitError` catches every one."""
 
 from __future__ import annotations
 
@@ -43,53 +43,56 @@ __all__ = [
 
 
 class AerokitError(Exception):
-    """The root of every exception that this library raises on purpose."""
+    """Base class of all exceptions that this library raises on purpose."""
 
 
 # ---------------------------------------------------------------------------------------- links
 
 
 class LinkError(AerokitError, OSError):
-    """Bytes cannot be moved."""
+    """Base class of link failures: no bytes can be sent or received."""
 
 
 class LinkOpenError(LinkError):
-    """A link could not be opened: the port is taken, the host does not answer, the device is missing."""
+    """A link could not be opened: the port is in use, the host does not answer, or the device is missing."""
 
 
 class LinkLost(LinkError):
-    """A link that was open has gone: the peer closed it or the device was unplugged."""
+    """An open link failed: the peer closed it, or the device was unplugged."""
 
 
 class RecordingEnded(LinkLost):
-    """A recording that was replayed has come to its end, or cannot be read on."""
+    """The recording being replayed has ended, or its next part cannot be read."""
 
 
 class ConnectionClosed(AerokitError):
-    """The connection was used after it was closed, or closed while this call waited; ``__cause__`` says why."""
+    """The connection was closed before or during this call. ``__cause__`` is the reason."""
 
 
 # ------------------------------------------------------------------------------------- timeouts
 
 
 class OperationTimeout(AerokitError, TimeoutError):
-    """Something did not happen in time; the text says what was waited for and what was seen meanwhile."""
+    """An operation did not complete in time. The text names what was expected and what happened instead."""
 
 
 class CommandTimeout(OperationTimeout):
-    """No COMMAND_ACK arrived, although the command was sent again."""
+    """The vehicle did not acknowledge a command (COMMAND_ACK), despite retries."""
 
 
 class HeartbeatTimeout(OperationTimeout):
-    """No heartbeat of the vehicle arrived in time."""
+    """The vehicle did not send a heartbeat in time."""
 
 
 class ConnectFailed(HeartbeatTimeout):
-    """No vehicle was found; the text says what was heard instead."""
+    """The connection found no vehicle. The text lists what was received instead."""
 
 
 class ParameterTimeout(OperationTimeout):
-    """Parameters did not arrive or were not confirmed; ``missing`` are their names, or indices of unknown ones."""
+    """Parameters were not received or not confirmed in time.
+
+    ``missing`` holds their names, or the indices of those whose names are unknown.
+    """
 
     def __init__(self, message: str, *, missing: tuple[str | int, ...] = ()) -> None:
         super().__init__(message)
@@ -97,7 +100,10 @@ class ParameterTimeout(OperationTimeout):
 
 
 class MissionTimeout(OperationTimeout):
-    """A mission transfer did not end; ``missing`` are the items (counted as the program counts) not transferred."""
+    """A mission transfer did not complete in time.
+
+    ``missing`` holds the indices of the items not transferred, counted as your program counts them (without home).
+    """
 
     def __init__(self, message: str, *, missing: tuple[int, ...] = ()) -> None:
         super().__init__(message)
@@ -105,7 +111,7 @@ class MissionTimeout(OperationTimeout):
 
 
 class FileTimeout(OperationTimeout):
-    """A file or log did not arrive whole; ``missing`` are the byte ranges (offset, size) that did not."""
+    """A file or log was not received completely in time. ``missing`` holds the missing ranges as (offset, size)."""
 
     def __init__(self, message: str, *, missing: tuple[tuple[int, int], ...] = ()) -> None:
         super().__init__(message)
@@ -116,9 +122,9 @@ class FileTimeout(OperationTimeout):
 
 
 class OperationRejected(AerokitError):
-    """The vehicle refused, or accepted and then did something else.
+    """The vehicle refused an operation, or accepted it and then did something else.
 
-    ``reasons`` holds what the vehicle gave for it: status texts, failing health bits, estimator flags.
+    ``reasons`` holds the explanations of the vehicle: status texts, failing health bits, estimator flags.
     """
 
     def __init__(self, message: str, *, reasons: tuple[str, ...] = ()) -> None:
@@ -129,7 +135,7 @@ class OperationRejected(AerokitError):
 class CommandRejected(OperationRejected):
     """The vehicle answered a command with a result other than ACCEPTED.
 
-    ``result`` is the MAV_RESULT (https://mavlink.io/en/messages/common.html#MAV_RESULT), ``command`` the MAV_CMD.
+    ``command`` is the MAV_CMD, ``result`` the MAV_RESULT (https://mavlink.io/en/messages/common.html#MAV_RESULT).
     """
 
     def __init__(self, message: str, *, command: int, result: int, reasons: tuple[str, ...] = ()) -> None:
@@ -139,10 +145,10 @@ class CommandRejected(OperationRejected):
 
 
 class ParameterRejected(OperationRejected):
-    """The vehicle refused a parameter: it has none of this name, or does not take the value.
+    """The vehicle has no parameter of this name, or refused the value.
 
-    ``name`` is the parameter, ``code`` the MAV_PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR),
-    None when the vehicle gave none.
+    ``name`` is the parameter; ``code`` is the MAV_PARAM_ERROR
+    (https://mavlink.io/en/messages/common.html#PARAM_ERROR), or None if the vehicle sent none.
     """
 
     def __init__(self, message: str, *, name: str, code: int | None = None) -> None:
@@ -152,7 +158,7 @@ class ParameterRejected(OperationRejected):
 
 
 class RollbackFailed(OperationRejected):
-    """What was to be put back could not be; ``not_restored`` maps the parameters to the values they should have."""
+    """Parameters could not be restored. ``not_restored`` maps their names to the values they should have."""
 
     def __init__(self, message: str, *, not_restored: dict[str, float]) -> None:
         super().__init__(message)
@@ -160,22 +166,20 @@ class RollbackFailed(OperationRejected):
 
 
 class MissionRejected(OperationRejected):
-    """The vehicle refused a mission, a fence or rally points; the text says whether it still has those from before.
+    """The vehicle refused a mission, a fence or rally points. The text says whether it kept the previous ones.
 
-    ``result`` is the MAV_MISSION_RESULT (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT), ``item`` the
-    index of the item it was about, None when that is not known.
+    ``result`` is the MAV_MISSION_RESULT (https://mavlink.io/en/messages/common.html#MAV_MISSION_RESULT); ``item`` is
+    the index of the refused item, or None if unknown.
     """
 
-    def __init__(
-        self, message: str, *, result: int, item: int | None = None, reasons: tuple[str, ...] = ()
-    ) -> None:
+    def __init__(self, message: str, *, result: int, item: int | None = None, reasons: tuple[str, ...] = ()) -> None:
         super().__init__(message, reasons=reasons)
         self.result = result
         self.item = item
 
 
 class VerificationFailed(OperationRejected):
-    """The vehicle confirmed something and then holds something else; ``differences`` says what, one text each."""
+    """The vehicle confirmed a change but reads back different values. ``differences`` has one text for each."""
 
     def __init__(self, message: str, *, differences: tuple[str, ...]) -> None:
         super().__init__(message, reasons=differences)
@@ -183,9 +187,10 @@ class VerificationFailed(OperationRejected):
 
 
 class FileError(OperationRejected):
-    """The vehicle refused a file operation; ``code`` is the MAV_FTP_ERR, ``errno`` the system's number behind it.
+    """The vehicle refused a file operation.
 
-    See https://mavlink.io/en/services/ftp.html#error_codes.
+    ``code`` is the MAV_FTP_ERR (https://mavlink.io/en/services/ftp.html#error_codes); ``errno`` is the error number of
+    the vehicle's operating system, or None.
     """
 
     def __init__(self, message: str, *, path: str, code: int, errno: int | None = None) -> None:
@@ -196,11 +201,14 @@ class FileError(OperationRejected):
 
 
 class NotSupported(OperationRejected):
-    """This vehicle cannot do that; nothing was sent."""
+    """This vehicle does not support the operation. Nothing was sent."""
 
 
 class GimbalTaken(OperationRejected):
-    """Control of a gimbal was lost to ``system_id`` and ``component_id``; zeros: nobody has it now."""
+    """Another system took control of a gimbal.
+
+    ``system_id`` and ``component_id`` identify the one in control now; both are 0 if there is none.
+    """
 
     def __init__(self, message: str, *, system_id: int, component_id: int) -> None:
         super().__init__(message)
@@ -209,7 +217,7 @@ class GimbalTaken(OperationRejected):
 
 
 class FleetError(OperationRejected):
-    """Some of a fleet did not do what all of them were to do; ``errors`` has the error of each by the member's name."""
+    """Some members of a fleet failed to complete an action. ``errors`` maps member names to their exceptions."""
 
     def __init__(self, message: str, *, errors: Mapping[str, Exception]) -> None:
         super().__init__(message, reasons=tuple(f"{name}: {error}" for name, error in errors.items()))
@@ -220,19 +228,19 @@ class FleetError(OperationRejected):
 
 
 class InvalidArgument(AerokitError, ValueError):
-    """An argument cannot be right: the text says which, its value, and what is allowed. Nothing was sent."""
+    """An argument is invalid. The text has its name, its value and what is allowed. Nothing was sent."""
 
 
 class FileFormatError(AerokitError, ValueError):
-    """A file is damaged or of another kind; the text names file, place and what was expected."""
+    """A file is damaged or has another format. The text names the file, the position and what was expected."""
 
 
 class RemoteProtocolError(AerokitError):
-    """The vehicle broke the standard."""
+    """The vehicle violated the MAVLink standard."""
 
 
 class ValueUnknownError(AerokitError, LookupError):
-    """The vehicle has not said this yet."""
+    """The vehicle has not reported this value yet."""
 
 
 class StaleValueError(ValueUnknownError):
@@ -240,12 +248,12 @@ class StaleValueError(ValueUnknownError):
 
 
 class SubscriptionOverflow(AerokitError):
-    """A subscription with the policy ``error`` was not read fast enough."""
+    """The program did not read a subscription with the policy ``error`` fast enough."""
 
 
 class SetpointStreamStopped(AerokitError):
-    """A stream ended by itself: stale set-points, a blocked loop, a lost link or a changed mode; the text says why."""
+    """A set-point stream stopped: stale set-points, blocked loop, lost link or mode change. The text says which."""
 
 
 class BusyError(AerokitError):
-    """Something that can only be done once at a time is under way."""
+    """The operation is already running and can run only once at a time."""

@@ -1,6 +1,6 @@
-"""What a program may want to be told of: a small family of frozen events, apart from wire messages.
+"""Events that programs can subscribe to: small immutable values, separate from MAVLink messages.
 
-``vehicle.subscribe(events.ModeChanged)`` gives them one after the other; subscribing to :class:`Event` gives all.
+``vehicle.subscribe(events.ModeChanged)`` yields events of one class; subscribing to :class:`Event` yields all.
 """
 
 from __future__ import annotations
@@ -19,55 +19,58 @@ __all__ = [
     "ArmedChanged",
     "ComponentFound",
     "ComputerSlept",
+    "DuplicateSender",
     "Event",
     "FrameRefused",
     "GimbalControlLost",
-    "HeardTwice",
     "HeartbeatPaused",
     "HeartbeatResumed",
     "ImageCaptured",
     "LandedStateChanged",
-    "LinkChosen",
     "LinkClosed",
     "LinkDrained",
     "LinkInterrupted",
     "LinkReport",
     "LinkRestored",
+    "LinkSelected",
     "LinkStalled",
     "LinkState",
     "LinkStateChanged",
     "LinkStatus",
     "LoopBlocked",
+    "MemberLinkOpenFailed",
+    "MemberLinkStateChanged",
     "MissionCurrentChanged",
     "MissionFinished",
     "MissionItemReached",
     "ModeChanged",
-    "MoveRefused",
-    "OneLinkChanged",
-    "OneLinkNotOpened",
     "OrderRefused",
     "ParameterChanged",
+    "RouteChangeRefused",
+    "RouteChanged",
     "SettingChanged",
     "StatusTextReceived",
     "StreamSlow",
     "StreamUnavailable",
-    "VehicleBack",
     "VehicleFound",
-    "VehicleMoved",
     "VehicleRebooted",
+    "VehicleRecovered",
     "VehicleSilent",
 ]
 
 
 class Event(Snapshot):
-    """Something happened at ``at`` (seconds on the event loop's clock) to ``system_id`` (0: to the link as a whole)."""
+    """Base class of all events.
+
+    ``at`` is the time in seconds on the event loop's clock; ``system_id`` is the vehicle, or 0 for the link as a whole.
+    """
 
     at: float
     system_id: int
 
 
 class VehicleFound(Event):
-    """The first heartbeat of this autopilot was heard on the connection, whether a vehicle is connected to or not.
+    """The first heartbeat of an autopilot arrived on the connection, even if no `Vehicle` is connected to it.
 
     ``vehicle_type`` is its MAV_TYPE, ``autopilot`` its MAV_AUTOPILOT.
     """
@@ -78,9 +81,10 @@ class VehicleFound(Event):
 
 
 class ComponentFound(Event):
-    """The first heartbeat of another component than an autopilot was heard on the connection; ``type`` is its MAV_TYPE.
+    """The first heartbeat of a component other than an autopilot arrived on the connection.
 
-    Cameras, gimbals, companion computers, other ground stations: of any system, connected to or not.
+    Reported for cameras, gimbals, companion computers and other ground stations of any system. ``type`` is the
+    MAV_TYPE.
     """
 
     component_id: int
@@ -88,43 +92,43 @@ class ComponentFound(Event):
 
 
 class VehicleSilent(Event):
-    """No heartbeat has come for ``silent_for_s`` seconds."""
+    """The vehicle has sent no heartbeat for ``silent_for_s`` seconds."""
 
     silent_for_s: float
 
 
-class VehicleBack(Event):
-    """Heartbeats come again after a silence of ``silent_for_s`` seconds."""
+class VehicleRecovered(Event):
+    """Heartbeats arrive again after a silence of ``silent_for_s`` seconds."""
 
     silent_for_s: float
 
 
 class VehicleRebooted(Event):
-    """The autopilot's time since boot went backwards: it has started anew. Message rates are asked for again."""
+    """The autopilot rebooted: its time since boot went backwards. aerokit requests message rates again."""
 
 
-class HeardTwice(Event):
-    """The same system and component id came from a second sender; what it says is not listened to.
+class DuplicateSender(Event):
+    """A second sender uses a system and component id that is already in use. Its messages are ignored.
 
-    Two vehicles with the same ids, or two ways to the same one, behind two peers of the link or behind one (told apart
-    by their sequence numbers). Told once for each such peer.
+    Either two vehicles have the same ids, or one vehicle is reachable over two paths. The second sender is another peer
+    of the link, or has its own sequence numbers behind the same peer. Published once for each such peer.
     """
 
     component_id: int
 
 
-class VehicleMoved(Event):
-    """A component is heard from another peer now: the addresses ``before`` and ``after``, as text."""
+class RouteChanged(Event):
+    """A component moved to another peer of the link. ``before`` and ``after`` are the addresses."""
 
     component_id: int
     before: str
     after: str
 
 
-class MoveRefused(Event):
-    """A component is silent, and ``peer`` speaks in its name without going on where it stopped; it is not listened to.
+class RouteChangeRefused(Event):
+    """A silent component seems to have moved to ``peer``, but its sequence numbers do not continue. It is ignored.
 
-    Another vehicle, or this one rebooted with another IP address: ``may_move=True`` allows it.
+    It may be another vehicle, or this one after a reboot with a new IP address. ``may_move=True`` accepts it.
     """
 
     component_id: int
@@ -132,9 +136,9 @@ class MoveRefused(Event):
 
 
 class FrameRefused(Event):
-    """A frame was not let in, because it carries no good signature of our key. Told once for each reason.
+    """A frame was dropped because it has no valid signature of our key. Published once for each reason.
 
-    ``connection.signing.refused`` counts them all.
+    ``connection.signing.refused`` counts all of them.
     """
 
     component_id: int
@@ -142,61 +146,62 @@ class FrameRefused(Event):
 
 
 class OrderRefused(Event):
-    """What we sent did not go to the vehicle: the program that has it on the network refused it (docs/network.md).
+    """The program that serves the vehicle on the network refused to forward a message of ours (docs/network.md).
 
-    ``message`` is the MAVLink message's name, ``reason`` a clause, ``helm`` who orders the vehicle, if that is why.
-    Told twice a second at most of messages of one name.
+    ``message`` is the name of the MAVLink message, ``reason`` a clause, ``lease_holder`` the client that controls the
+    vehicle if that is the reason. Published at most twice a second for each message name.
     """
 
     message: str
     reason: str
-    helm: str | None
+    lease_holder: str | None
 
 
 class ModeChanged(Event):
-    """The flight mode that HEARTBEAT tells has changed; names as in ``vehicle.mode``."""
+    """The flight mode reported by HEARTBEAT changed. Names are those of ``vehicle.mode``."""
 
     before: str | None
     after: str
 
 
 class ArmedChanged(Event):
-    """The armed flag of HEARTBEAT has changed."""
+    """The armed flag of HEARTBEAT changed."""
 
     is_armed: bool
 
 
 class LandedStateChanged(Event):
-    """EXTENDED_SYS_STATE.landed_state has changed (MAV_LANDED_STATE)."""
+    """EXTENDED_SYS_STATE.landed_state changed (MAV_LANDED_STATE)."""
 
     before: int | None
     after: int
 
 
 class MissionItemReached(Event):
-    """The vehicle has reached item ``item`` of its mission (counted from 0, home never counts).
+    """The vehicle reached mission item ``item``, counted from 0 without home.
 
-    An autopilot may leave items out that it flies past without stopping.
+    Autopilots may not report items that they pass without stopping.
     """
 
     item: int
 
 
 class MissionCurrentChanged(Event):
-    """The vehicle goes for another item of its mission; None: for none, because it has not begun or has no mission."""
+    """The current mission item changed. None: the mission has not started, or there is none."""
 
     before: int | None
     after: int | None
 
 
 class MissionFinished(Event):
-    """The vehicle has flown its mission to the end."""
+    """The vehicle completed its mission."""
 
 
 class GimbalControlLost(Event):
-    """A gimbal that a block ``gimbal.control()`` had in its hands is not ours any more (GIMBAL_MANAGER_STATUS).
+    """Another system took control of a gimbal from a ``gimbal.control()`` block (GIMBAL_MANAGER_STATUS).
 
-    ``to_system_id`` and ``to_component_id`` are who has it now, zeros: nobody; ``is_primary``: which control it was.
+    ``to_system_id`` and ``to_component_id`` identify the one in control now, 0 if there is none. ``is_primary`` tells
+    primary from secondary control.
     """
 
     gimbal_device_id: int
@@ -206,23 +211,23 @@ class GimbalControlLost(Event):
 
 
 class StatusTextReceived(Event):
-    """The vehicle said something (STATUSTEXT, chunks joined); ``severity`` is a MAV_SEVERITY, 0 the worst, 7 debug."""
+    """The vehicle sent a STATUSTEXT; chunks are joined. ``severity`` is a MAV_SEVERITY: 0 emergency to 7 debug."""
 
     severity: int
     text: str
 
 
 class StreamSlow(Event):
-    """A message comes at less than half the rate that this component was asked for."""
+    """A message arrives at less than half of the rate requested from this component."""
 
     message: str
-    asked_hz: float
+    requested_hz: float
     achieved_hz: float
     component_id: int = 1
 
 
 class StreamUnavailable(Event):
-    """This component refuses to send this message at the rate that was asked for."""
+    """The component refuses to send this message at the requested rate."""
 
     message: str
     reason: str
@@ -230,7 +235,7 @@ class StreamUnavailable(Event):
 
 
 class ParameterChanged(Event):
-    """A parameter of this component whose value was known has another one now, whoever changed it."""
+    """A known parameter of this component has a new value, regardless of who changed it."""
 
     name: str
     before: int | float
@@ -239,7 +244,7 @@ class ParameterChanged(Event):
 
 
 class SettingChanged(Event):
-    """A setting of this component (PARAM_EXT) whose value was known has another one now, whoever changed it."""
+    """A known setting (PARAM_EXT) of this component has a new value, regardless of who changed it."""
 
     name: str
     before: bool | int | float | str | bytes
@@ -248,10 +253,11 @@ class SettingChanged(Event):
 
 
 class ImageCaptured(Event):
-    """A camera has told of a picture, heard of for the first time; ``camera.captures()`` has more of it.
+    """A camera reported a new image. ``camera.captures()`` has more about it.
 
-    ``camera`` is 1 to 6 behind the autopilot, otherwise a component id; ``index`` counts from 0; ``success`` is None
-    where nobody said. Told once ``vehicle.camera`` or ``vehicle.cameras`` was used, or a message of this kind has come.
+    ``camera`` is 1 to 6 for cameras behind the autopilot, otherwise a component id. ``index`` counts from 0.
+    ``success`` is None if not reported. Published once ``vehicle.camera`` or ``vehicle.cameras`` was used, or a message
+    about images arrived.
     """
 
     camera: int
@@ -263,10 +269,10 @@ class ImageCaptured(Event):
 
 
 class LinkReport(Event):
-    """How the link did in the last second, once a second.
+    """Link quality of the last second, published every second.
 
-    ``loss_percent`` (frames missing by sequence number, None before any), ``round_trip_s`` (TIMESYNC, None before the
-    first answer), ``frames_per_s`` and ``bytes_per_s`` as received.
+    ``loss_percent`` is derived from missing sequence numbers (None before the first frame), ``round_trip_s`` from
+    TIMESYNC (None before the first answer). ``frames_per_s`` and ``bytes_per_s`` count what was received.
     """
 
     loss_percent: float | None
@@ -276,64 +282,64 @@ class LinkReport(Event):
 
 
 class LoopBlocked(Event):
-    """The program kept the event loop from running for ``seconds``: nothing was received or sent meanwhile."""
+    """The program blocked the event loop for ``seconds``: nothing was received or sent meanwhile."""
 
     seconds: float
 
 
 class ComputerSlept(Event):
-    """The computer slept for ``seconds``, while the event loop's clock stood still: values are older by that."""
+    """The computer was suspended for ``seconds``. The event loop's clock stood still, so values are that much older."""
 
     seconds: float
 
 
 class HeartbeatPaused(Event):
-    """The program has shown no sign of life for ``idle_s`` seconds: our own heartbeat is not sent."""
+    """The program has shown no activity for ``idle_s`` seconds, so aerokit stopped sending its own heartbeat."""
 
     idle_s: float
 
 
 class HeartbeatResumed(Event):
-    """The program has shown one: our own heartbeat is sent again, after ``paused_s`` seconds."""
+    """The program is active again, so aerokit sends its own heartbeat again, after ``paused_s`` seconds."""
 
     paused_s: float
 
 
 class LinkInterrupted(Event):
-    """The link has gone and is being opened again (``reconnect=True``); what is sent meanwhile is lost."""
+    """The link failed and aerokit is reopening it (``reconnect=True``). Data sent meanwhile is lost."""
 
     error: AerokitError
 
 
 class LinkRestored(Event):
-    """The link is there again after ``away_s`` seconds. Message rates are asked for again."""
+    """The link is open again after ``away_s`` seconds. aerokit requests message rates again."""
 
     away_s: float
 
 
 class LinkStalled(Event):
-    """What was written has not left for a second; ``unsent_bytes`` wait, and an order among them may arrive late.
+    """The link has not transmitted anything for a second. ``unsent_bytes`` are queued, so commands may arrive late.
 
-    What has waited for a second in aerokit is dropped; what the system has taken (``connection.unsent_bytes``) is
-    beyond recall. :class:`LinkDrained` is the end of it, or the link's own end.
+    aerokit drops what waits in its own queue for more than a second. It cannot drop what the operating system has
+    accepted (``connection.unsent_bytes``). :class:`LinkDrained`, or the end of the link, follows.
     """
 
     unsent_bytes: int
 
 
 class LinkDrained(Event):
-    """What is written leaves again, after ``stalled_s`` seconds."""
+    """The link transmits again, after ``stalled_s`` seconds."""
 
     stalled_s: float
 
 
-class LinkChosen(Event):
-    """Of several links, ``link`` (its address) is used for this system from now on: orders go over it.
+class LinkSelected(Event):
+    """The traffic to this system now uses ``link`` (its address), one of several links.
 
-    ``before`` is the one used until now (None: this is the first), ``reason`` says why: "first heard", "silent",
-    "stalled", "lost" (the former one), "better", "cheaper" (the former one is a costly one), or "another vehicle" (is
-    behind the former one: told late, by its AUTOPILOT_VERSION). Message rates are asked for again, for an autopilot
-    keeps them for each link.
+    ``before`` is the previous link, None for the first one. ``reason`` is "first heard", "silent", "stalled", "lost"
+    (all of the previous link), "better", "cheaper" (the previous one is costly), or "another vehicle"
+    (AUTOPILOT_VERSION showed another vehicle behind the previous one). aerokit requests message rates again, because
+    autopilots keep them for each link.
     """
 
     link: str
@@ -341,19 +347,19 @@ class LinkChosen(Event):
     reason: str
 
 
-class OneLinkChanged(Event):
-    """One of several links (its address) has gone, fallen silent, or is there again."""
+class MemberLinkStateChanged(Event):
+    """One of several links (``link`` is its address) failed, fell silent or recovered."""
 
     link: str
     before: LinkState
     after: LinkState
 
 
-class OneLinkNotOpened(Event):
-    """One of several links (its address) could not be opened at first, and why; it is tried again. Told once.
+class MemberLinkOpenFailed(Event):
+    """One of several links could not be opened at first; aerokit keeps trying. Published once for each link.
 
-    That is some tenths of a second after the connection was opened; ``connection.links`` has it as LOST all the time,
-    and ``OneLinkChanged`` tells when it is there.
+    Published some tenths of a second after the connection was opened. ``connection.links`` lists the link as LOST until
+    ``MemberLinkStateChanged`` reports it as open.
     """
 
     link: str
@@ -361,47 +367,47 @@ class OneLinkNotOpened(Event):
 
 
 class LinkStateChanged(Event):
-    """The way CONNECTED → SILENT → LOST, and back: of one vehicle, or of the link as a whole (``system_id`` 0)."""
+    """CONNECTED, SILENT or LOST: the state of one vehicle, or of the link as a whole (``system_id`` 0), changed."""
 
     before: LinkState
     after: LinkState
 
 
 class LinkClosed(Event):
-    """The link has gone and will not come back by itself."""
+    """The link failed, and aerokit does not reopen it."""
 
     error: AerokitError
 
 
 SILENT_AFTER_S = 3.5
-"""Three missed heartbeats and a half."""
+"""Seconds without a heartbeat before a vehicle counts as silent: three and a half intervals."""
 
 
 class LinkState(enum.Enum):
-    """Told by ``vehicle.link_state`` and ``connection.link_state``; each change is a ``LinkStateChanged``."""
+    """State of a vehicle (``vehicle.link_state``) or of a link (``connection.link_state``)."""
 
     CONNECTED = "connected"
-    """Something was heard within the last 3.5 seconds: heartbeats of the vehicle, any frame on the link."""
+    """The vehicle sent a heartbeat, or the link delivered any frame, within the last 3.5 seconds."""
     SILENT = "silent"
-    """Nothing was heard for longer; the link itself is there, as far as the system tells."""
+    """The link is open, but nothing arrived for longer than that."""
     LOST = "lost"
-    """The link has gone, or the connection was closed. With ``reconnect=True`` it may be CONNECTED again."""
+    """The link failed or the connection was closed. With ``reconnect=True`` it may become CONNECTED again."""
 
 
 class LinkStatus(Snapshot):
-    """How one of several links does: ``connection.links``."""
+    """Status of one of several links, see ``connection.links``."""
 
     link: str
-    """Its address."""
+    """Address of the link."""
     state: LinkState
-    """SILENT: nothing of any vehicle has come for a second or two; LOST: it is closed, and opened again if possible."""
+    """SILENT: no vehicle was received for a second or two. LOST: closed; aerokit reopens it if possible."""
     is_costly: bool
-    """Whether it is used only when the others fail (``costly=1``)."""
+    """True if it is used only when the others fail (``costly=1``)."""
     systems: tuple[int, ...]
-    """Which systems were heard over it."""
+    """Ids of the systems received over it."""
     used_for: tuple[int, ...]
-    """What is for these goes over it, and what they say is taken from it."""
+    """Ids of the systems whose traffic it carries."""
     loss_percent: float | None
-    """Frames missing by their numbers in the last seconds, of the system that misses most; None: not known yet."""
+    """Frame loss of the last seconds, by sequence numbers, for the system with the highest loss; None: unknown yet."""
     round_trip_s: float | None
-    """Seconds from a question (TIMESYNC) to its answer, of the slowest system; None: nothing was answered yet."""
+    """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

@@ -1,4 +1,4 @@
-"""MAVLink's messages: ``from aerokit.messages import Heartbeat``; the module :mod:`aerokit.mavlink.messages` itself."""
+"""MAVLink messages: ``from aerokit.messages import Heartbeat``. An alias of :mod:`aerokit.mavlink.messages`."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -8,5 +8,5 @@ from aerokit.mavlink import messages
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import *  # noqa: F403
 else:
-    # Not a star import: each part is imported when the first of its names is used.
+    # An alias, because a star import would load all parts instead of those in use.
     sys.modules[__name__] = messages

@@ -1,4 +1,4 @@
-"""``Position``: a place on earth, as programs write and read it."""
+"""``Position``: a place on earth."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ __all__ = ["Position"]
 
 @checks_arguments
 class Position(Snapshot):
-    """A place: degrees (WGS 84) and metres; ``Position(47.3977, 8.5456, altitude_relative_m=30)``.
+    """A place on earth in degrees (WGS 84) and metres: ``Position(47.3977, 8.5456, altitude_relative_m=30)``.
 
-    ``altitude_amsl_m`` is above mean sea level, ``altitude_relative_m`` above home; None is not known (as a
-    target: not given). Raises :class:`InvalidArgument` when it is no place on earth.
+    ``altitude_amsl_m`` is above mean sea level, ``altitude_relative_m`` above home; None means unknown, or not given.
+
+    Raises:
+        InvalidArgument: latitude or longitude is out of range, or a value is not a finite number.
     """
 
     latitude_deg: float
@@ -31,26 +33,24 @@ class Position(Snapshot):
     altitude_relative_m: float | None = None
 
     def distance_to(self, other: Position) -> float:
-        """Metres to the other place along the ground; altitudes do not count."""
+        """Return the distance in metres along the ground, ignoring altitudes."""
         return geo.distance_m(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
 
     def bearing_to(self, other: Position) -> float:
-        """Direction to the other place in degrees, 0 to 360."""
+        """Return the bearing to the other place in degrees: 0 to 360, clockwise from north."""
         return geo.bearing_deg(self.latitude_deg, self.longitude_deg, other.latitude_deg, other.longitude_deg)
 
     def offset(self, *, north_m: float = 0.0, east_m: float = 0.0, up_m: float = 0.0) -> Self:
-        """The place that many metres north, east and above."""
+        """Return the place that many metres north, east and above."""
         latitude, longitude = geo.offset(self.latitude_deg, self.longitude_deg, north_m, east_m)
-        above, relative = _add(self.altitude_amsl_m, up_m), _add(self.altitude_relative_m, up_m)
-        return type(self)(latitude, longitude, above, relative)
+        amsl_m, relative_m = _add(self.altitude_amsl_m, up_m), _add(self.altitude_relative_m, up_m)
+        return type(self)(latitude, longitude, amsl_m, relative_m)
 
     def _check(self) -> None:
         geo.check_place(self.latitude_deg, self.longitude_deg)
         for name in ("altitude_amsl_m", "altitude_relative_m"):
             altitude = getattr(self, name)
-            if altitude is not None and not (
-                isinstance(altitude, (float, int, Real)) and math.isfinite(altitude)
-            ):
+            if altitude is not None and not (isinstance(altitude, (float, int, Real)) and math.isfinite(altitude)):
                 raise InvalidArgument(f"{name} = {altitude!r} is not a finite number")
 
 

@@ -1,6 +1,6 @@
-"""``open_video``: the pictures of a video stream, each beside what the vehicle told when it came.
+"""Decoded video frames, each with the position and attitude of the vehicle.
 
-Needs PyAV: ``pip install "aerokit-mavlink[video]"``. https://pyav.basswood-io.com
+Needs PyAV (https://pyav.basswood-io.com): ``pip install "aerokit-mavlink[video]"``.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 __all__ = ["VideoFrame", "VideoStream", "open_video"]
 
-LIVE = {"rtsp_transport": "tcp", "fflags": "nobuffer", "flags": "low_delay", "probesize": "500000"}
-"""What FFmpeg is told of what is no file: no frame waits for later ones. https://ffmpeg.org/ffmpeg-protocols.html"""
+# FFmpeg options for live streams: no buffering. https://ffmpeg.org/ffmpeg-protocols.html
+LIVE_OPTIONS = {"rtsp_transport": "tcp", "fflags": "nobuffer", "flags": "low_delay", "probesize": "500000"}
 
-ENDS_WITHIN_S = 1.0
-"""How long the end of a block waits for the thread, which FFmpeg holds until the next frame, or its time-out."""
+# How long the end of a block waits for the thread, which FFmpeg blocks until the next frame or its timeout.
+JOIN_TIMEOUT_S = 1.0
 
 
 class VideoFrame(Snapshot):
-    """One picture of a stream.
+    """One video frame.
 
-    - ``picture``: PyAV's frame: ``picture.to_ndarray(format="rgb24")`` (height, width, 3), ``picture.to_image()``
-    - ``received_at``: when it was decoded, on the loop's clock; ``stream_s``: the stream's own time, None: not told
-    - ``position``, ``attitude``: what the vehicle had told by then; None without a vehicle, or before it told
+    - ``picture``: a PyAV frame: ``picture.to_ndarray(format="rgb24")`` (height, width, 3), ``picture.to_image()``
+    - ``received_at``: time of decoding on the loop's clock; ``stream_s``: time in the stream, None if it has none
+    - ``position``, ``attitude``: the latest of the vehicle at that time; None without a vehicle, or while unknown
     """
 
     picture: Any
@@ -56,77 +56,77 @@ async def open_video(
     vehicle: Vehicle | None = None,
     *,
     timeout: float = 10.0,
-    silence_s: float = 5.0,
+    idle_timeout_s: float = 5.0,
     options: Mapping[str, str] | None = None,
 ) -> AsyncIterator[VideoStream]:
-    """Read a video stream for the time of an ``async with`` block; the latest frame wins.
+    """Open a video stream for the duration of an ``async with`` block. A slow reader gets the latest frame.
 
-    ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. Decoding takes a thread of its
-    own. It ends with the block; where nothing comes from the stream just then, at its time-out, by itself.
+    ``async with open_video(stream.uri, vehicle) as video: async for frame in video: …``. A thread decodes the stream.
+    It ends with the block, or, if no frame arrives then, at its next timeout.
 
     Args:
-        uri: what FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, a file's path …; ``vehicle.camera.streams`` has
-            those of a camera.
-        vehicle: whose position and attitude stand beside the frames.
+        uri: anything that FFmpeg reads: ``rtsp://…``, ``udp://0.0.0.0:5600``, the path of a file.
+            ``vehicle.camera.streams`` lists those of a camera.
+        vehicle: adds its position and attitude to the frames.
         timeout: seconds until the stream must be open, above 0 to 3600.
-        silence_s: a stream that brings nothing for so long is lost, above 0 to 3600.
-        options: more for FFmpeg, in its words.
+        idle_timeout_s: seconds without data after which the stream counts as lost, above 0 to 3600.
+        options: further FFmpeg options.
 
     Raises:
         NotSupported: PyAV is not installed.
-        InvalidArgument: the URI is empty, a time is out of range, or an option is no text.
+        InvalidArgument: the URI is empty, a time is out of range, or an option is not a string.
         LinkOpenError: the stream cannot be opened, or has no video.
     """
     if not uri:
         raise InvalidArgument("uri = '' is not allowed: the address of a stream, or the path of a file")
     check_range("timeout", timeout, 0, 3600, above=True)
-    check_range("silence_s", silence_s, 0, 3600, above=True)
+    check_range("idle_timeout_s", idle_timeout_s, 0, 3600, above=True)
     stream = VideoStream(uri, vehicle)
     for name, value in (options or {}).items():
         if not isinstance(name, str) or not isinstance(value, str):
             raise InvalidArgument(f"options: {name!r} = {value!r} is not allowed: texts")
-    own = LIVE if "://" in uri else {}
-    thread = _Reader(uri, {**own, **(options or {})}, (timeout, silence_s), stream)
+    defaults = LIVE_OPTIONS if "://" in uri else {}
+    thread = _Reader(uri, {**defaults, **(options or {})}, (timeout, idle_timeout_s), stream)
     try:
         thread.start()
-        await stream._opened()
+        await stream._wait_until_open()
         yield stream
     finally:
         thread.stop()
-        with anyio.move_on_after(ENDS_WITHIN_S, shield=True):
+        with anyio.move_on_after(JOIN_TIMEOUT_S, shield=True):
             await thread.ended.wait()
 
 
 class VideoStream:
-    """Frames as they come, for one reader; made by :func:`open_video`.
+    """Asynchronous iterator over the frames of a stream, for a single reader. Created by :func:`open_video`.
 
-    The iteration ends with the stream (a file's), and raises LinkLost when a stream breaks off.
+    The iteration ends at the end of a file, and raises LinkLost if a stream fails.
     """
 
     def __init__(self, uri: str, vehicle: Vehicle | None) -> None:
         self.uri: str = uri
-        """Where it comes from."""
+        """Address of the stream."""
         self.missed: int = 0
-        """How many frames were dropped because the reader was slow: it always gets the latest."""
+        """Number of frames dropped because the reader was slow."""
         self._vehicle = vehicle
         self._now = asyncio.get_running_loop().time
         self._latest: VideoFrame | None = None
         self._is_open = False
         self._end: Exception | None = None
-        self._news = asyncio.Event()
-        self._is_read = False
+        self._changed = asyncio.Event()
+        self._has_reader = False
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> VideoFrame:
-        if self._is_read:
+        if self._has_reader:
             raise BusyError("a video stream has one reader; open it twice for a second one")
-        self._is_read = True
+        self._has_reader = True
         try:
             await self._wait(lambda: self._latest is not None)
         finally:
-            self._is_read = False
+            self._has_reader = False
         frame, self._latest = self._latest, None
         if frame is None:
             if isinstance(self._end, LinkLost):
@@ -134,43 +134,38 @@ class VideoStream:
             raise StopAsyncIteration
         return frame
 
-    async def _opened(self) -> None:
+    async def _wait_until_open(self) -> None:
         await self._wait(lambda: self._is_open)
         if not self._is_open and self._end is not None:
             raise self._end
 
-    async def _wait(self, is_there: Callable[[], bool]) -> None:
-        while not is_there() and self._end is None:
-            self._news.clear()
-            await self._news.wait()
+    async def _wait(self, condition: Callable[[], bool]) -> None:
+        while not condition() and self._end is None:
+            self._changed.clear()
+            await self._changed.wait()
 
-    # The reader's thread has the loop call these.
+    # Called on the event loop by the reader's thread.
 
-    def open(self) -> None:
-        """The first bytes were understood."""
+    def _on_open(self) -> None:
         self._is_open = True
-        self._news.set()
+        self._changed.set()
 
-    def take(self, picture: object, stream_s: float | None) -> None:
-        """A frame was decoded."""
+    def _on_frame(self, picture: object, stream_s: float | None) -> None:
         if self._latest is not None:
             self.missed += 1
         vehicle = self._vehicle
         position = None if vehicle is None else vehicle.position.latest
         attitude = None if vehicle is None else vehicle.attitude.latest
         self._latest = VideoFrame(picture, self._now(), stream_s, position, attitude)
-        self._news.set()
+        self._changed.set()
 
-    def end(self, error: Exception) -> None:
-        """Nothing more will come."""
+    def _on_end(self, error: Exception) -> None:
         self._end = error
-        self._news.set()
+        self._changed.set()
 
 
 class _Reader(threading.Thread):
-    def __init__(
-        self, uri: str, options: dict[str, str], limits_s: tuple[float, float], stream: VideoStream
-    ) -> None:
+    def __init__(self, uri: str, options: dict[str, str], limits_s: tuple[float, float], stream: VideoStream) -> None:
         super().__init__(name=f"aerokit video {uri}", daemon=True)
         self.ended = asyncio.Event()
         self._uri, self._options, self._limits_s, self._stream = uri, options, limits_s, stream
@@ -178,7 +173,6 @@ class _Reader(threading.Thread):
         self._is_stopped = False
 
     def start(self) -> None:
-        """NotSupported: PyAV is missing."""
         try:
             import av
         except ImportError:
@@ -191,15 +185,15 @@ class _Reader(threading.Thread):
         self._is_stopped = True
 
     def run(self) -> None:
-        error: Exception = LinkLost(f"the video of {self._uri} has ended")
+        error: Exception = LinkLost(f"the video of {self._uri} ended")
         try:
             self._read()
             error = EOFError()
         except Exception as caught:
             error = caught
         finally:
-            self._tell(self._stream.end, error)
-            self._tell(self.ended.set)
+            self._call_on_loop(self._stream._on_end, error)
+            self._call_on_loop(self.ended.set)
 
     def _read(self) -> None:
         errors = (self._av.error.FFmpegError, OSError, ValueError, IndexError)
@@ -210,16 +204,16 @@ class _Reader(threading.Thread):
         with container:
             if not container.streams.video:
                 raise LinkOpenError(f"{self._uri} has no video")
-            self._tell(self._stream.open)
+            self._call_on_loop(self._stream._on_open)
             try:
                 for picture in container.decode(video=0):
                     if self._is_stopped:
                         return
                     time = None if picture.time is None else float(picture.time)
-                    self._tell(self._stream.take, picture, time)
+                    self._call_on_loop(self._stream._on_frame, picture, time)
             except errors as error:
                 raise LinkLost(f"the video of {self._uri} broke off: {error}") from None
 
-    def _tell(self, function: Callable[..., object], *args: Any) -> None:
+    def _call_on_loop(self, function: Callable[..., object], *args: Any) -> None:
         with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(function, *args)

@@ -1,11 +1,11 @@
-"""Names that are not known: what was perhaps meant."""
+"""Suggestions for unknown names."""
 
 from __future__ import annotations
 
 import pytest
 from flight_harness import Flight
 
-from aerokit._internal.wording import did_you_mean, shown
+from aerokit._internal.formatting import did_you_mean, short_repr
 from aerokit.apps.cli import main
 from aerokit.errors import InvalidArgument, ParameterRejected
 from aerokit.sim.kinds import kind_class
@@ -25,7 +25,9 @@ from aerokit.transport import parse_address
     ],
     ids=lambda value: " ".join(value),
 )
-def test_commands_and_options(arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_did_you_mean_for_commands_and_options(
+    arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
     assert exit_.value.code == 2
@@ -40,18 +42,18 @@ def test_commands_and_options(arguments: list[str], meant: str, capsys: pytest.C
         ("serial:///dev/ttyS0?buad=9600", "'baud'"),
     ],
 )
-def test_schemes_and_options_of_addresses(address: str, meant: str) -> None:
+def test_did_you_mean_for_address_parts(address: str, meant: str) -> None:
     with pytest.raises(InvalidArgument, match=f"did you mean {meant}"):
         parse_address(address)
 
 
-def test_kinds() -> None:
+def test_did_you_mean_for_vehicle_kinds() -> None:
     with pytest.raises(InvalidArgument, match="did you mean 'rover'"):
         kind_class("rowver")
 
 
 @pytest.mark.anyio
-async def test_parameters(grounded: Flight) -> None:
+async def test_did_you_mean_for_parameters(grounded: Flight) -> None:
     parameters = grounded.vehicle.parameters
     with pytest.raises(ParameterRejected) as before:
         await parameters.get("RTL_ATL")
@@ -63,20 +65,20 @@ async def test_parameters(grounded: Flight) -> None:
         await parameters.set("RTL_ATL", 1500)
 
 
-def test_nothing_like_it() -> None:
+def test_did_you_mean_without_similar_name() -> None:
     assert did_you_mean("zzzz", ("demo", "sim")) == ""
     assert did_you_mean(["demo"], ("demo",)) == ""
 
 
-class _Unspeakable:
+class _NoRepr:
     def __repr__(self) -> str:
         raise RuntimeError("no")
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [("a", "'a'"), (_Unspeakable(), "<_Unspeakable>"), ("b" * 200, f"'{'b' * 96}..."), (10**5000, "<int>")],
+    [("a", "'a'"), (_NoRepr(), "<_NoRepr>"), ("b" * 200, f"'{'b' * 96}..."), (10**5000, "<int>")],
     ids=["short", "none", "long", "huge"],
 )
-def test_values_are_shown_whatever_they_are(value: object, text: str) -> None:
-    assert shown(value) == text
+def test_short_repr_accepts_any_value(value: object, text: str) -> None:
+    assert short_repr(value) == text

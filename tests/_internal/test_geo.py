@@ -1,4 +1,4 @@
-"""Geodesy: known lengths, and that offset and its inverse agree everywhere."""
+"""Geodesy: known distances, and that offset and its inverse agree everywhere."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_offset_and_its_inverse_agree(latitude: float, longitude: float, north: 
     geo.check_place(*there)
 
 
-def test_across_the_date_line() -> None:
+def test_geodesy_across_date_line() -> None:
     latitude, longitude = geo.offset(0, 179.9999, 0, 100)
     assert -180 <= longitude < -179.99
     assert geo.distance_m(0, 179.9999, latitude, longitude) == pytest.approx(100)
@@ -53,16 +53,16 @@ def test_across_the_date_line() -> None:
         (47, None, "longitude_deg = None is not allowed"),
     ],
 )
-def test_what_is_no_place_is_refused_by_name(latitude: Any, longitude: Any, text: str) -> None:
+def test_check_place_names_invalid_field(latitude: Any, longitude: Any, text: str) -> None:
     with pytest.raises(InvalidArgument, match=text):
         geo.check_place(latitude, longitude)
 
 
 @given(st.floats(-1e6, 1e6))
-def test_wrapping(angle: float) -> None:
+def test_wrap_360_and_wrap_longitude(angle: float) -> None:
     assert 0 <= geo.wrap_360(angle) < 360
     assert -180 <= geo.wrap_longitude(angle) < 180
 
 
-def test_a_tiny_negative_angle_does_not_become_360() -> None:
+def test_wrap_360_of_tiny_negative_angle_is_zero() -> None:
     assert geo.wrap_360(-1e-20) == 0.0

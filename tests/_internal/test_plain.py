@@ -1,4 +1,4 @@
-"""Every value as JSON."""
+"""Conversion of values to JSON."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import PurePosixPath
 
 from aerokit import Position
-from aerokit._internal.plain import plain
+from aerokit._internal.formatting import to_jsonable
 from aerokit.errors import AerokitError
 from aerokit.mavlink.enums import MavModeFlag, MavState
 from aerokit.mavlink.messages import Heartbeat
@@ -19,7 +19,7 @@ class Kind(enum.Enum):
     ONE = "one"
 
 
-def test_values_are_what_json_knows() -> None:
+def test_to_jsonable_values() -> None:
     value = {
         "texts": ("a", None, True),
         Kind.ONE: 1.5,
@@ -33,7 +33,7 @@ def test_values_are_what_json_knows() -> None:
         "error": AerokitError("no"),
         "set": {1},
     }
-    made = plain(value)
+    made = to_jsonable(value)
     assert made == {
         "texts": ["a", None, True],
         "ONE": 1.5,
@@ -51,8 +51,8 @@ def test_values_are_what_json_knows() -> None:
     json.dumps(made, allow_nan=False)
 
 
-def test_objects_are_their_fields_and_messages_say_which_they_are() -> None:
-    assert plain(Position(47.0, 8.0, altitude_relative_m=3))["altitude_relative_m"] == 3
-    heartbeat = plain(Heartbeat(2, 3, 81, 4, 3))
+def test_to_jsonable_objects_and_messages() -> None:
+    assert to_jsonable(Position(47.0, 8.0, altitude_relative_m=3))["altitude_relative_m"] == 3
+    heartbeat = to_jsonable(Heartbeat(2, 3, 81, 4, 3))
     assert (heartbeat["message"], heartbeat["custom_mode"]) == ("HEARTBEAT", 4)
-    assert plain(Heartbeat) == str(Heartbeat)
+    assert to_jsonable(Heartbeat) == str(Heartbeat)

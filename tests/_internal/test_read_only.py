@@ -1,4 +1,4 @@
-"""Assignments that look like orders are refused; an attribute of a value is not one of its cell."""
+"""Assignments to read-only attributes raise errors that name the method to call."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ CALLS = [
     ("armed", True, r"Vehicle\.armed = True is not allowed: .*arm\(\) or disarm\(\)"),
     ("home", None, r"set_home\(place\)"),
     ("heading_deg", 90, r"set_heading\(degrees\)"),
-    ("is_silent", True, r"Vehicle\.is_silent = True is not allowed: it is only read"),
+    ("is_silent", True, r"Vehicle\.is_silent = True is not allowed: it is read-only"),
 ]
 
 
 @pytest.mark.anyio
 @pytest.mark.parametrize(("name", "value", "text"), CALLS)
-async def test_assignment_to_a_vehicle_names_the_call(
-    grounded: Flight, name: str, value: object, text: str
-) -> None:
+async def test_assignment_error_names_method(grounded: Flight, name: str, value: object, text: str) -> None:
     cell = getattr(grounded.vehicle, name)
     with pytest.raises(AttributeError, match=text) as caught:
         setattr(grounded.vehicle, name, value)
@@ -36,19 +34,17 @@ async def test_assignment_to_a_vehicle_names_the_call(
 
 
 @pytest.mark.anyio
-async def test_no_public_attribute_of_a_vehicle_can_be_assigned(grounded: Flight) -> None:
+async def test_vehicle_attributes_are_read_only(grounded: Flight) -> None:
     objects = [grounded.vehicle, *(getattr(grounded.vehicle, part) for part in PARTS[:-1])]
     assert [assigned for each in objects for assigned in assignable(each)] == []
 
 
-def test_no_public_attribute_of_a_blocking_vehicle_can_be_assigned() -> None:
+def test_blocking_vehicle_attributes_are_read_only() -> None:
     with served_copter() as address, aerokit.sync.connect(address) as vehicle:
         vehicle.wait_ready()
         with pytest.raises(AttributeError, match=r"write ….set_mode\('GUIDED'\)"):
             vehicle.mode = "GUIDED"  # type: ignore[assignment]
-        with pytest.raises(
-            AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"
-        ):
+        with pytest.raises(AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"):
             vehicle.position.latitude_deg  # type: ignore[attr-defined]  # noqa: B018
         assert copy.copy(vehicle.position).latest is not None
         objects = [vehicle, *(getattr(vehicle, part) for part in PARTS)]
@@ -56,7 +52,7 @@ def test_no_public_attribute_of_a_blocking_vehicle_can_be_assigned() -> None:
 
 
 def assignable(thing: Any) -> list[str]:
-    """The names of what it tells (cells, properties, parts) that take another value; it is put back."""
+    """Return the reported attributes (cells, properties, parts) that accept another value, and restore them."""
     found = []
     for name in dir(type(thing)):
         told = inspect.getattr_static(type(thing), name)
@@ -72,7 +68,7 @@ def assignable(thing: Any) -> list[str]:
 
 
 @pytest.mark.anyio
-async def test_own_attributes_and_mocked_methods_can_be_assigned(grounded: Flight) -> None:
+async def test_program_attributes_and_mocks_can_be_assigned(grounded: Flight) -> None:
     vehicle: Any = grounded.vehicle
     for vehicle.note in (1, 2):
         assert vehicle.note
@@ -82,11 +78,9 @@ async def test_own_attributes_and_mocked_methods_can_be_assigned(grounded: Fligh
 
 
 @pytest.mark.anyio
-async def test_attribute_of_the_value_is_named_by_its_cell(grounded: Flight) -> None:
+async def test_cell_error_names_value_attribute(grounded: Flight) -> None:
     vehicle: Any = grounded.vehicle
-    with pytest.raises(
-        AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"
-    ):
+    with pytest.raises(AttributeError, match=r"position is a StateCell: did you mean \.value\.latitude_deg\?"):
         vehicle.position.latitude_deg  # noqa: B018
     with pytest.raises(AttributeError, match=r"StateCell has no attribute 'latitude'"):
         vehicle.position.latitude  # noqa: B018

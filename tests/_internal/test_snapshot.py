@@ -1,4 +1,4 @@
-"""Snapshots: what a frozen dataclass promises, kept."""
+"""Snapshots behave like frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ class Point(Snapshot):
     y: float = 2.0
 
 
-class Seen(Snapshot):
-    """Something at a time."""
+class Timed(Snapshot):
+    """A value with a time."""
 
     at: float
 
 
-class Heard(Seen):
-    """More of it."""
+class TimedText(Timed):
+    """A subclass with another field."""
 
     text: str
     loudness: float = 1.0
 
 
-class HeardAgain(Heard):
-    """The same with another name."""
+class SameFields(TimedText):
+    """A subclass without fields."""
 
 
 class Positive(Snapshot):
@@ -45,36 +45,36 @@ class Positive(Snapshot):
             raise ValueError(self.number)
 
 
-def test_fields_by_place_by_name_and_by_default() -> None:
+def test_snapshot_constructor_arguments() -> None:
     assert (Point(1).x, Point(1).y, Point(y=5, x=4).to_dict()) == (1, 2.0, {"x": 4, "y": 5})
     with pytest.raises(TypeError):
         Point()  # type: ignore[call-arg]
 
 
-def test_what_is_shown_of_a_class_are_its_fields_before_and_after_the_first_value() -> None:
-    class Late(Heard):
-        """Of which none was made."""
+def test_snapshot_signature_shows_fields() -> None:
+    class Extended(TimedText):
+        """A class without instances."""
 
         of: str = "it"
 
     shown = "(at, text, loudness=1.0, of='it')"
-    assert str(inspect.signature(Late)) == shown
-    Late(1.0, "a")
-    assert str(inspect.signature(Late)) == shown
-    assert str(inspect.signature(HeardAgain)) == "(at, text, loudness=1.0)"
+    assert str(inspect.signature(Extended)) == shown
+    Extended(1.0, "a")
+    assert str(inspect.signature(Extended)) == shown
+    assert str(inspect.signature(SameFields)) == "(at, text, loudness=1.0)"
     assert str(inspect.signature(Snapshot)) == "()"
 
-    class OwnWay(Late):
-        """Made of something else."""
+    class OwnInit(Extended):
+        """A class with a default."""
 
         def __init__(self, text: str) -> None:
             super().__init__(0.0, text)
 
-    assert str(inspect.signature(OwnWay)) == "(text: 'str') -> 'None'"
-    assert OwnWay("a").text == "a"
+    assert str(inspect.signature(OwnInit)) == "(text: 'str') -> 'None'"
+    assert OwnInit("a").text == "a"
 
 
-def test_it_cannot_be_changed_and_has_no_other_attributes() -> None:
+def test_snapshot_is_immutable() -> None:
     point = Point(1)
     with pytest.raises(AttributeError, match=r"Point is immutable: use replace\(x=…\)"):
         setattr(point, "x", 3)  # noqa: B010
@@ -85,7 +85,7 @@ def test_it_cannot_be_changed_and_has_no_other_attributes() -> None:
     assert not hasattr(point, "__dict__")
 
 
-def test_equality_hash_and_copies() -> None:
+def test_snapshot_equality_hash_and_copies() -> None:
     assert Point(1) == Point(1, 2.0) != Point(2)
     assert Point(1) != (1, 2.0)
     assert len({Point(1), Point(1), Point(2)}) == 2
@@ -93,26 +93,26 @@ def test_equality_hash_and_copies() -> None:
     assert pickle.loads(pickle.dumps(Point(1))) == copy.deepcopy(Point(1)) == Point(1)
 
 
-def test_repr_and_matching() -> None:
+def test_snapshot_repr_and_matching() -> None:
     assert repr(Point(0.1 + 0.2, 3)) == "Point(x=0.3, y=3)"
     match Point(1, 7):
         case Point(x, y):
             assert (x, y) == (1, 7)
 
 
-def test_fields_of_the_base_class_come_first() -> None:
-    heard = Heard(1.5, "ping")
+def test_snapshot_base_fields_come_first() -> None:
+    heard = TimedText(1.5, "ping")
     assert heard.to_dict() == {"at": 1.5, "text": "ping", "loudness": 1.0}
-    assert (Seen(1.5) == heard, heard == Heard(1.5, "ping", 1.0)) == (False, True)
+    assert (Timed(1.5) == heard, heard == TimedText(1.5, "ping", 1.0)) == (False, True)
     assert not hasattr(heard, "__dict__")
 
 
-def test_a_subclass_without_fields_of_its_own_is_made_the_same_way() -> None:
-    assert repr(HeardAgain(1, "ping")) == "HeardAgain(at=1, text='ping', loudness=1.0)"
-    assert HeardAgain(1, "ping") != Heard(1, "ping")
+def test_snapshot_subclass_without_own_fields() -> None:
+    assert repr(SameFields(1, "ping")) == "SameFields(at=1, text='ping', loudness=1.0)"
+    assert SameFields(1, "ping") != TimedText(1, "ping")
 
 
-def test_a_check_refuses_nonsense() -> None:
+def test_snapshot_check_rejects_invalid_fields() -> None:
     assert Positive(1).number == 1
     with pytest.raises(ValueError, match="-1"):
         Positive(-1)

@@ -1,4 +1,4 @@
-"""`write_whole`: whole or not at all, and never through a link that somebody has laid."""
+"""`write_atomically` never writes through a symbolic link."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from aerokit._internal.files import write_whole
+from aerokit._internal.files import write_atomically
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
-def test_no_other_file_is_written_through_a_link(tmp_path: Path) -> None:
+def test_atomic_write_does_not_follow_link(tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "report.html.part").symlink_to(victim)
-    write_whole(tmp_path / "report.html", "text")
+    write_atomically(tmp_path / "report.html", "text")
     assert victim.read_text() == "precious"
     assert not (tmp_path / "report.html").is_symlink()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["report.html", "victim"]

@@ -1,4 +1,4 @@
-"""Mode names and numbers: lookups, and parity with pymavlink's tables where those are right."""
+"""Mode names and numbers: lookups, and comparison with pymavlink's tables where those are right."""
 
 from __future__ import annotations
 
@@ -34,9 +34,7 @@ def ardupilot(kind: str) -> Autopilot:
     return autopilot_for(heartbeat(TYPES[kind]))
 
 
-def heartbeat(
-    vehicle_type: int, autopilot: int = ARDUPILOT, base_mode: int = 81, custom_mode: int = 0
-) -> Heartbeat:
+def heartbeat(vehicle_type: int, autopilot: int = ARDUPILOT, base_mode: int = 81, custom_mode: int = 0) -> Heartbeat:
     return Heartbeat(vehicle_type, autopilot, base_mode, custom_mode, 3)
 
 
@@ -45,37 +43,37 @@ EVERY_AUTOPILOT = [*(ardupilot(kind) for kind in TYPES), px4]
 
 
 @pytest.mark.parametrize("kind", TYPES)
-def test_names_are_those_of_pymavlink(kind: str) -> None:
+def test_mode_names_match_pymavlink(kind: str) -> None:
     theirs: Mapping[int, str] = mavutil.AP_MAV_TYPE_MODE_MAP_DEFAULT[TYPES[kind]]
     ours = ardupilot(kind).modes.numbers
     assert {number: ours.get(number) for number in theirs} == theirs
 
 
 NEWER = {"sub": {20: "MOTOR_DETECT", 21: "SURFTRAK"}, "tracker": {3: "SERVOTEST"}}
-"""What mode.h of ArduPilot 4.7 has beyond pymavlink's tables."""
+"""Modes in ArduPilot 4.7's mode.h that pymavlink's tables lack."""
 
 
 @pytest.mark.parametrize("kind", TYPES)
-def test_names_beyond_pymavlinks_are_the_firmwares(kind: str) -> None:
+def test_further_mode_names_match_firmware(kind: str) -> None:
     theirs = mavutil.AP_MAV_TYPE_MODE_MAP_DEFAULT[TYPES[kind]]
     ours = ardupilot(kind).modes.numbers
     assert {n: name for n, name in ours.items() if n not in theirs} == NEWER.get(kind, {})
 
 
 @for_each("name", mavutil.px4_map)
-def test_px4_names_and_numbers_are_those_of_pymavlink(name: str) -> None:
+def test_px4_modes_match_pymavlink(name: str) -> None:
     _, main, sub = mavutil.px4_map[name]
     assert px4.find_mode(name).custom_mode == px4_custom_mode(main, sub)
 
 
-def test_px4_modes_as_the_firmware_was_seen_to_send_them() -> None:
+def test_px4_modes_match_recorded_firmware() -> None:
     assert px4.find_mode("LOITER").custom_mode == 50593792
     assert px4.mode(50593792, 157) == Mode("LOITER", 50593792)
     assert px4.mode(px4_custom_mode(6), 157).name == "OFFBOARD"
 
 
 @for_each("autopilot", EVERY_AUTOPILOT)
-def test_every_name_is_found_again(autopilot: Autopilot) -> None:
+def test_mode_name_round_trip(autopilot: Autopilot) -> None:
     for number, name in autopilot.modes.numbers.items():
         for spelling in (name, name.lower(), name.replace("_", " ").title(), f" {name} "):
             assert autopilot.find_mode(spelling) == Mode(name, number)
@@ -83,7 +81,7 @@ def test_every_name_is_found_again(autopilot: Autopilot) -> None:
 
 
 @for_each("autopilot", EVERY_AUTOPILOT)
-def test_every_purpose_names_a_mode_that_exists(autopilot: Autopilot) -> None:
+def test_purposes_name_existing_modes(autopilot: Autopilot) -> None:
     for purpose in get_args(Purpose):
         for is_vtol in (False, True):
             mode = autopilot.mode_for(purpose, is_vtol=is_vtol)
@@ -109,7 +107,7 @@ def test_every_purpose_names_a_mode_that_exists(autopilot: Autopilot) -> None:
         ("blimp", "setpoint", False, None),
     ],
 )
-def test_modes_by_purpose(kind: str, purpose: Purpose, is_vtol: bool, name: str | None) -> None:
+def test_mode_for_purpose(kind: str, purpose: Purpose, is_vtol: bool, name: str | None) -> None:
     mode = ardupilot(kind).mode_for(purpose, is_vtol=is_vtol)
     assert (mode.name if mode else None) == name
 
@@ -120,16 +118,14 @@ def test_px4_aliases(alias: str) -> None:
 
 
 @given(st.integers(0, 0xFFFF_FFFF))
-def test_an_unknown_number_has_a_name_that_parses(number: int) -> None:
+def test_unknown_mode_number_name_parses(number: int) -> None:
     for autopilot in EVERY_AUTOPILOT:
         mode = autopilot.mode(number, 1)
         assert autopilot.find_mode(mode.name).custom_mode == number
 
 
-def test_an_unknown_name_raises_with_the_known_ones() -> None:
-    with pytest.raises(
-        InvalidArgument, match=r"'guidde' is not known \(did you mean 'GUIDED'\?\).*RTL, CIRCLE"
-    ):
+def test_unknown_mode_error_lists_known_names() -> None:
+    with pytest.raises(InvalidArgument, match=r"'guidde' is not known \(did you mean 'GUIDED'\?\).*RTL, CIRCLE"):
         ardupilot("copter").find_mode("guidde")
     with pytest.raises(InvalidArgument, match="0 to 4294967295"):
         ardupilot("copter").find_mode(-1)
@@ -137,10 +133,10 @@ def test_an_unknown_name_raises_with_the_known_ones() -> None:
         ardupilot("copter").find_mode("")
 
 
-def test_modes_the_vehicle_told_are_found_by_their_names() -> None:
+def test_reported_modes_are_found_by_name() -> None:
     copter = ardupilot("copter")
     assert copter.learn_mode_name(127, "Drone show") == "Drone show"
-    assert copter.learn_mode_name(21, "SMARTRTL") is None  # known by another spelling already
+    assert copter.learn_mode_name(21, "SMARTRTL") is None  # already known with another spelling
     extra = {127: "Drone show"}
     assert copter.find_mode("drone_show", extra) == Mode("Drone show", 127)
     assert copter.mode(127, 81, extra).name == "Drone show"
@@ -148,18 +144,18 @@ def test_modes_the_vehicle_told_are_found_by_their_names() -> None:
         copter.find_mode("nonsense", extra)
 
 
-def test_px4_external_modes_have_the_names_they_registered() -> None:
+def test_px4_external_modes_use_registered_names() -> None:
     number = px4_custom_mode(4, 11)
     assert px4.mode(number, 1).name == "EXTERNAL1"
     assert px4.learn_mode_name(number, "(Mode not available)") is None
-    assert px4.learn_mode_name(px4_custom_mode(4, 3), "") is None  # standard modes come without a name
+    assert px4.learn_mode_name(px4_custom_mode(4, 3), "") is None  # standard modes have no name
     extra = {number: px4.learn_mode_name(number, "Precise landing") or ""}
     assert px4.mode(number, 1, extra).name == "Precise landing"
     assert px4.find_mode("precise landing", extra) == px4.find_mode("EXTERNAL1", extra)
     assert px4.find_mode("EXTERNAL1", extra).name == "Precise landing"
 
 
-def test_mode_orders() -> None:
+def test_mode_order_parameters() -> None:
     copter = ardupilot("copter")
     order = copter.mode_order(copter.find_mode("GUIDED"))
     assert order == ModeOrder((1, 4, 0), 1, 4)
@@ -169,14 +165,14 @@ def test_mode_orders() -> None:
     assert (message.target_system, message.base_mode, message.custom_mode) == (7, 1, px4_custom_mode(4, 5))
 
 
-def test_a_mode_does_not_change_with_arming() -> None:
+def test_mode_equality_ignores_arming() -> None:
     copter = ardupilot("copter")
     assert copter.mode(4, 81) == copter.mode(4, 209)
     assert len({copter.mode(4, 81), copter.mode(4, 209)}) == 1
     assert str(copter.mode(4, 81)) == "GUIDED"
 
 
-def test_an_unknown_autopilot_is_described_by_its_base_mode() -> None:
+def test_unknown_autopilot_mode_from_base_mode() -> None:
     other = autopilot_for(heartbeat(2, autopilot=0))
     names = {other.mode_of(heartbeat(2, 0, base_mode)).name for base_mode in (0, 4, 8, 16, 64)}
     assert names == {"PREFLIGHT", "AUTO", "GUIDED", "STABILIZE", "MANUAL"}
@@ -185,27 +181,27 @@ def test_an_unknown_autopilot_is_described_by_its_base_mode() -> None:
     assert other.take_off(10, None, is_vtol=False) is None
 
 
-def test_an_ardupilot_of_unknown_type_still_is_ardupilot() -> None:
+def test_unknown_ardupilot_type_is_ardupilot() -> None:
     other = autopilot_for(heartbeat(200))
     assert other.home_is_item_0
     assert other.mode(5, 1).name == "MODE 5"
 
 
 @pytest.mark.parametrize("others", [0, 1, 2, 32, 128, 1 | 2 | 32 | 128])
-def test_of_the_flags_of_base_mode_the_most_automatic_names_it(others: int) -> None:
-    """AUTO 4, GUIDED 8, STABILIZE 16, MANUAL 64; the others say nothing of the mode."""
+def test_base_mode_name_is_most_automatic_flag(others: int) -> None:
+    """AUTO is 4, GUIDED 8, STABILIZE 16, MANUAL 64; the other flags do not depend on the mode."""
     told = {flags: base_mode_name(flags | others) for flags in (0, 4, 8, 16, 64)}
     assert told == {0: "PREFLIGHT", 4: "AUTO", 8: "GUIDED", 16: "STABILIZE", 64: "MANUAL"}
     assert [base_mode_name(flags | others) for flags in (92, 88, 80)] == ["AUTO", "GUIDED", "STABILIZE"]
 
 
-def test_armed_is_one_flag_of_base_mode() -> None:
+def test_armed_flag_of_base_mode() -> None:
     assert [is_armed(flags) for flags in range(256)] == [False] * 128 + [True] * 128
 
 
 @pytest.mark.parametrize("number", [0, (1 << 32) - 1])
-def test_a_custom_mode_has_32_bits(number: int) -> None:
+def test_custom_mode_must_fit_32_bits(number: int) -> None:
     assert autopilot_for(heartbeat(2)).find_mode(number).custom_mode == number
     for wrong in (-1, 1 << 32):
-        with pytest.raises(InvalidArgument, match=f"mode = {wrong}: .* from 0 to 4294967295"):
+        with pytest.raises(InvalidArgument, match=f"mode = {wrong} .* from 0 to 4294967295"):
             autopilot_for(heartbeat(2)).find_mode(wrong)

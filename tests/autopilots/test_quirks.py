@@ -1,4 +1,4 @@
-"""What differs between autopilots beside their modes: take-off, health, texts, versions, streams."""
+"""Differences between autopilots other than modes: take-off, health, texts, versions and streams."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_copter_takes_off_in_guided_above_home() -> None:
     assert not copter.take_off_needs_home()
 
 
-def test_px4_takes_off_above_the_sea_and_loiters() -> None:
+def test_px4_takes_off_above_sea_level_and_loiters() -> None:
     plan = px4.take_off(20, 488, is_vtol=False)
     assert plan is not None
     assert plan.mode is None
@@ -46,7 +46,7 @@ def test_px4_takes_off_above_the_sea_and_loiters() -> None:
         px4.take_off(20, None, is_vtol=False)
 
 
-def test_planes_take_off_in_their_own_mode_unless_they_hover() -> None:
+def test_plane_takes_off_in_takeoff_mode_unless_vtol() -> None:
     plan = plane.take_off(50, None, is_vtol=False)
     assert plan is not None
     assert plan.mode is not None
@@ -58,12 +58,12 @@ def test_planes_take_off_in_their_own_mode_unless_they_hover() -> None:
 
 
 @pytest.mark.parametrize(("number", "vehicle_type"), [(3, 10), (3, 12), (3, 5), (12, 10), (12, 12), (0, 2)])
-def test_what_stays_down_stays_down(number: int, vehicle_type: int) -> None:
+def test_surface_vehicles_have_no_take_off(number: int, vehicle_type: int) -> None:
     assert autopilot(number, vehicle_type).take_off(10, 0, is_vtol=False) is None
 
 
 @pytest.mark.parametrize(("status", "landed"), [(3, 1), (4, 2), (5, None), (0, None)])
-def test_copter_and_plane_tell_landed_by_system_status(status: int, landed: int | None) -> None:
+def test_landed_state_from_system_status(status: int, landed: int | None) -> None:
     for each in (copter, plane):
         assert each.landed_state_of(Heartbeat(2, 3, 81, 4, status)) == landed
     assert px4.landed_state_of(Heartbeat(2, 12, 81, 4, status)) is None
@@ -73,12 +73,12 @@ def test_copter_and_plane_tell_landed_by_system_status(status: int, landed: int 
 # --------------------------------------------------------------------------------------- health
 
 
-def test_failing_is_what_is_present_enabled_and_not_healthy() -> None:
+def test_failing_sensors_are_present_enabled_and_unhealthy() -> None:
     present, enabled, healthy = GPS | RC | GYRO, GPS | GYRO | PREARM_CHECK, GYRO
     assert copter.failing_sensors(present | PREARM_CHECK, enabled, healthy) == ("GPS",)
 
 
-def test_px4_calls_missing_what_is_enabled_without_being_present() -> None:
+def test_px4_missing_sensors_are_enabled_but_absent() -> None:
     assert px4.failing_sensors(GPS, GPS | RC, 0) == ("GPS", "RC receiver (missing)")
     assert copter.failing_sensors(GPS, GPS | RC, 0) == ("GPS",)
 
@@ -88,20 +88,18 @@ def test_px4_calls_missing_what_is_enabled_without_being_present() -> None:
     [
         (copter, True, True, True, True),
         (copter, True, True, False, False),
-        (copter, True, False, True, None),  # all checks are switched off
+        (copter, True, False, True, None),  # all checks are disabled
         (px4, False, False, True, True),
         (px4, False, False, False, False),
     ],
 )
-def test_prearm_bit(
-    each: Autopilot, present: bool, enabled: bool, healthy: bool, passes: bool | None
-) -> None:
+def test_prearm_bit(each: Autopilot, present: bool, enabled: bool, healthy: bool, passes: bool | None) -> None:
     assert each.prearm_checks_pass(*(PREARM_CHECK * bit for bit in (present, enabled, healthy))) is passes
 
 
-def test_estimates_ardupilot_needs_to_arm_in_guided() -> None:
-    assert copter.missing_estimates(831) == ()  # seen in flight
-    assert copter.missing_estimates(1 | 4 | 32 | 512) == ()  # a predicted position is enough on the ground
+def test_ardupilot_missing_estimates() -> None:
+    assert copter.missing_estimates(831) == ()  # reported in flight
+    assert copter.missing_estimates(1 | 4 | 32 | 512) == ()  # on the ground a predicted position is enough
     assert copter.missing_estimates(1 | 4 | 32 | 128) == ("absolute horizontal position",)
     assert copter.missing_estimates(1024) == (
         "attitude",
@@ -112,8 +110,8 @@ def test_estimates_ardupilot_needs_to_arm_in_guided() -> None:
     assert copter.missing_estimates(831 | 0x8000) == ("GPS without glitches",)
 
 
-def test_estimates_px4_needs() -> None:
-    assert px4.missing_estimates(895) == ()  # seen in flight
+def test_px4_missing_estimates() -> None:
+    assert px4.missing_estimates(895) == ()  # reported in flight
     assert px4.missing_estimates(0xFF & ~16) == ("absolute horizontal position",)
     assert px4.missing_estimates(895 | 1024) == ("GPS without glitches",)
 
@@ -130,11 +128,11 @@ def test_estimates_px4_needs() -> None:
         (px4, "PreArm: of another autopilot", None),
     ],
 )
-def test_texts_about_arming(each: Autopilot, text: str, reason: str | None) -> None:
+def test_arming_reason_texts(each: Autopilot, text: str, reason: str | None) -> None:
     assert each.arming_reason(text) == reason
 
 
-def test_texts_about_other_refusals() -> None:
+def test_refusal_texts() -> None:
     assert copter.is_refusal("Mode change to AUTO failed: init failed")
     assert copter.is_refusal("PreArm: RC not found")
     assert px4.is_refusal("Mission start denied! No valid mission")
@@ -176,7 +174,7 @@ def test_git_hashes() -> None:
     assert px4.version_of(version(0, bytes(8))).git_hash == ""
 
 
-def test_parameter_encoding_by_capabilities_and_without() -> None:
+def test_parameter_encoding_from_capabilities() -> None:
     assert px4.encodes_parameters_bytewise(0xE8FF)
     assert not copter.encodes_parameters_bytewise(0xFBEF & ~16)
     assert (px4.encodes_parameters_bytewise(None), copter.encodes_parameters_bytewise(None)) == (True, False)
@@ -186,7 +184,7 @@ def test_parameter_encoding_by_capabilities_and_without() -> None:
 # -------------------------------------------------------------------------------------- streams
 
 
-def test_stream_groups_of_ardupilot() -> None:
+def test_ardupilot_stream_groups() -> None:
     groups: dict[type[Message], int] = {
         messages.SysStatus: 2,
         messages.GpsRawInt: 2,
@@ -202,7 +200,7 @@ def test_stream_groups_of_ardupilot() -> None:
     assert px4.stream_groups == {}
 
 
-def test_each_autopilot_sends_its_own_message_of_the_estimator() -> None:
+def test_estimator_message_of_each_autopilot() -> None:
     assert px4.sends(messages.EstimatorStatus)
     assert not px4.sends(messages.EkfStatusReport)
     assert not copter.sends(messages.EstimatorStatus)

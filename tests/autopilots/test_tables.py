@@ -1,4 +1,4 @@
-"""Double entry: what is told of each autopilot is told here a second time, so that no slip of a digit goes unseen."""
+"""Repeats the facts of each autopilot's class, so that a mistyped digit fails a test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from for_each import for_each
 from aerokit.autopilots import Autopilot, Mode, ModeTable, Reposition, SetpointRules, autopilot_for
 from aerokit.autopilots import ardupilot as ardupilot_modes
 from aerokit.autopilots.px4 import MODES, px4_custom_mode
-from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ESTIMATES, SENSORS, names_of, version_text
+from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ESTIMATES, SENSORS, bit_names, version_text
 from aerokit.mavlink import enums, messages
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat
@@ -44,14 +44,14 @@ NOT_OF_THE_STANDARD = {
         ("TrackerMode", ardupilot_modes.TRACKER),
     ],
 )
-def test_modes_of_ardupilot_are_those_of_the_standard(name: str, table: ModeTable) -> None:
+def test_ardupilot_modes_match_standard(name: str, table: ModeTable) -> None:
     theirs = {each.value: SPELT_OTHERWISE.get(each.name, each.name) for each in getattr(enums, name)} | {
         number: text for (kind, number), text in NOT_OF_THE_STANDARD.items() if kind == name
     }
     assert dict(table.numbers) == theirs
 
 
-def test_modes_of_px4() -> None:
+def test_px4_modes_table() -> None:
     main = "MANUAL ALTCTL POSCTL AUTO ACRO OFFBOARD STABILIZED RATTITUDE SIMPLE TERMINATION ALTITUDE_CRUISE"
     auto = "READY TAKEOFF LOITER MISSION RTL LAND RTGS FOLLOWME PRECLAND VTOL_TAKEOFF"
     expected = {px4_custom_mode(number): name for number, name in enumerate(main.split(), 1)}
@@ -67,7 +67,7 @@ def test_modes_of_px4() -> None:
         assert px4.learn_mode_name(px4_custom_mode(4, sub), "Mine") == (None if sub == 10 else "Mine")
 
 
-def test_a_mode_is_its_name_and_its_number() -> None:
+def test_mode_has_name_and_number() -> None:
     assert Mode("AUTO", 3) == Mode("AUTO", 3, 209)
     assert Mode("AUTO", 3) != Mode("AUTO", 10)
     assert Mode("AUTO", 3) != Mode("MISSION", 3)
@@ -77,10 +77,10 @@ def test_a_mode_is_its_name_and_its_number() -> None:
 # -------------------------------------------------------------------------------------- bits
 
 
-def test_bits_have_their_names() -> None:
+def test_bit_names_match_standard() -> None:
     assert list(SENSORS) == [1 << bit for bit in range(31)]
     assert list(ESTIMATES) == [1 << bit for bit in range(10)]
-    assert names_of(0x8000_0000 | 4 | 0x0200_0000, SENSORS) == ("compass", "battery")
+    assert bit_names(0x8000_0000 | 4 | 0x0200_0000, SENSORS) == ("compass", "battery")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_bits_have_their_names() -> None:
         (255, ""),
     ],
 )
-def test_kinds_of_versions_begin_at_their_numbers(kind: int, suffix: str) -> None:
+def test_version_types_match_standard(kind: int, suffix: str) -> None:
     assert version_text(0x0102_0300 | kind) == (f"1.2.3{suffix}", (1, 2, 3))
 
 
@@ -109,13 +109,13 @@ def test_kinds_of_versions_begin_at_their_numbers(kind: int, suffix: str) -> Non
         (0, {1: "attitude", 32: "absolute altitude"}),
     ],
 )
-def test_each_estimate_that_is_needed_is_named_when_it_lacks(autopilot: int, needed: dict[int, str]) -> None:
+def test_missing_estimate_is_named(autopilot: int, needed: dict[int, str]) -> None:
     for bit in (1, 2, 4, 8, 32, 64, 128, 256):
         missing = of(autopilot, 2).missing_estimates(0x3FF & ~bit)
         assert missing == ((needed[bit],) if bit in needed else ())
 
 
-def test_the_summary_of_the_checks_is_its_own_bit_alone() -> None:
+def test_prearm_check_is_single_bit() -> None:
     for autopilot in (3, 12):
         each = of(autopilot, 2)
         assert each.failing_sensors(0x7FFF_FFFF, 0x7FFF_FFFF, 0x7FFF_FFFF & ~(1 << 28 | 1)) == ("gyroscope",)
@@ -126,7 +126,7 @@ def test_the_summary_of_the_checks_is_its_own_bit_alone() -> None:
 # ---------------------------------------------------------------------------------- take-off
 
 
-def test_take_off_asks_for_an_altitude_and_nothing_else() -> None:
+def test_take_off_parameters_have_only_altitude() -> None:
     for vehicle_type in (2, 20):
         plan = of(3, vehicle_type).take_off(7.0, None, is_vtol=False)
         assert plan is not None
@@ -141,7 +141,7 @@ def test_take_off_asks_for_an_altitude_and_nothing_else() -> None:
     ("autopilot", "vehicle_type", "name"),
     [(3, 2, "GUIDED"), (3, 1, "FBWA"), (3, 10, "HOLD"), (12, 2, "LOITER"), (3, 12, None), (0, 2, None)],
 )
-def test_where_it_is_armed(autopilot: int, vehicle_type: int, name: str | None) -> None:
+def test_arming_mode_of_each_vehicle(autopilot: int, vehicle_type: int, name: str | None) -> None:
     mode = of(autopilot, vehicle_type).mode_to_arm_in()
     assert (None if mode is None else mode.name) == name
 
@@ -149,7 +149,7 @@ def test_where_it_is_armed(autopilot: int, vehicle_type: int, name: str | None) 
 # ------------------------------------------------------------------------------------ streams
 
 
-def test_every_stream_group_has_its_number() -> None:
+def test_stream_group_numbers() -> None:
     first_of: dict[int, type[Message]] = {
         1: messages.RawImu,
         2: messages.SysStatus,
@@ -164,7 +164,7 @@ def test_every_stream_group_has_its_number() -> None:
     assert set(ARDUPILOT_GROUPS.values()) == set(first_of)
 
 
-# ------------------------------------------------------------------------------------- habits
+# -------------------------------------------------------------------------------- other facts
 
 
 def of(autopilot: int, vehicle_type: int) -> Autopilot:
@@ -172,34 +172,34 @@ def of(autopilot: int, vehicle_type: int) -> Autopilot:
 
 
 UNKNOWN: dict[str, Any] = {
-    **dict.fromkeys(("completes_at_home", "condition_yaw", "has_parameter_hash"), False),
-    **dict.fromkeys(("has_upper_case_parameters", "home_is_item_0", "judges_by_mode"), False),
-    **dict.fromkeys(("lands_after_return", "logs_by_messages", "mission_starts_by_command"), False),
+    **dict.fromkeys(("mission_completes_at_home", "condition_yaw", "has_parameter_hash"), False),
+    **dict.fromkeys(("has_upper_case_parameters", "home_is_item_0", "prearm_depends_on_mode"), False),
+    **dict.fromkeys(("lands_after_return", "prefers_log_messages", "mission_starts_by_command"), False),
     **dict.fromkeys(("repeats_item_reached", "runs_prearm_checks"), False),
-    **dict.fromkeys(("sets_current_by_command", "silent_without_logs", "stays_on_the_ground"), False),
-    **dict.fromkeys(("takes_file_sessions", "tells_mission_checksum", "writes_partial_missions"), False),
+    **dict.fromkeys(("sets_current_by_command", "silent_without_logs", "is_surface_vehicle"), False),
+    **dict.fromkeys(("accepts_ftp_session_ids", "reports_mission_checksum", "writes_partial_missions"), False),
     "arrival_radius_m": 2.0,
     "first_log_id": 0,
     "parameter_interval_s": None,
     "reposition": None,
     "mission_download_window": 1,
     "mission_upload_window": 1,
-    "replaced_as_they_come": {0, 1, 2},
+    "overwrites_plans_in_place": {0, 1, 2},
     "unknown_currents_ca": {-1},
-    "landing_ends_in": None,
+    "mode_when_landed": None,
     "reposition_purpose": "setpoint",
     "setpoints": SetpointRules(False, False, False, False, False, False, False, False),
 }
 ARDUPILOT = UNKNOWN | {
-    **dict.fromkeys(("completes_at_home", "has_upper_case_parameters", "home_is_item_0"), True),
-    **dict.fromkeys(("logs_by_messages", "mission_starts_by_command", "runs_prearm_checks"), True),
+    **dict.fromkeys(("mission_completes_at_home", "has_upper_case_parameters", "home_is_item_0"), True),
+    **dict.fromkeys(("prefers_log_messages", "mission_starts_by_command", "runs_prearm_checks"), True),
     **dict.fromkeys(("sets_current_by_command",), True),
-    **dict.fromkeys(("takes_file_sessions", "writes_partial_missions"), True),
+    **dict.fromkeys(("accepts_ftp_session_ids", "writes_partial_missions"), True),
     "first_log_id": 1,
     "mission_download_window": 10,
     "mission_upload_window": 6,
     "parameter_interval_s": 0.02,
-    "replaced_as_they_come": {0, 2},
+    "overwrites_plans_in_place": {0, 2},
 }
 STEERED = ARDUPILOT | {
     "reposition": Reposition(relative_altitude=True, yaw=False, speed=False),
@@ -215,19 +215,19 @@ PLANE = STEERED | {
 }
 ROVER = STEERED | {
     "arrival_radius_m": 4.0,
-    "stays_on_the_ground": True,
+    "is_surface_vehicle": True,
     "setpoints": SetpointRules(True, True, True, False, True, False, True, False),
 }
 SUB = STEERED | {
     "condition_yaw": True,
-    "landing_ends_in": "ALT_HOLD",
+    "mode_when_landed": "ALT_HOLD",
     "setpoints": SetpointRules(True, True, True, False, True, False, False, True),
 }
 PX4 = UNKNOWN | {
-    **dict.fromkeys(("has_parameter_hash", "judges_by_mode", "lands_after_return"), True),
-    **dict.fromkeys(("repeats_item_reached", "silent_without_logs", "tells_mission_checksum"), True),
+    **dict.fromkeys(("has_parameter_hash", "prearm_depends_on_mode", "lands_after_return"), True),
+    **dict.fromkeys(("repeats_item_reached", "silent_without_logs", "reports_mission_checksum"), True),
     "mission_upload_window": 6,
-    "replaced_as_they_come": set(),
+    "overwrites_plans_in_place": set(),
     "unknown_currents_ca": {-1, -100},
     "reposition": Reposition(relative_altitude=False, yaw=True, speed=True),
     "reposition_purpose": "hold",
@@ -252,11 +252,11 @@ PX4_DOWN = PX4 | {"lands_after_return": False}
         (12, 2, "PX4", PX4),
         (12, 22, "PX4", PX4),
         (12, 1, "PX4", PX4_DOWN | {"arrival_radius_m": 120.0}),
-        *((12, kind, "PX4", PX4_DOWN | {"stays_on_the_ground": True}) for kind in (10, 11)),
+        *((12, kind, "PX4", PX4_DOWN | {"is_surface_vehicle": True}) for kind in (10, 11)),
         (12, 12, "PX4", PX4_DOWN),
     ],
 )
-def test_habits(autopilot: int, vehicle_type: int, firmware: str, habits: dict[str, Any]) -> None:
+def test_autopilot_attributes(autopilot: int, vehicle_type: int, firmware: str, habits: dict[str, Any]) -> None:
     each = of(autopilot, vehicle_type)
     assert each.firmware == firmware
     assert {name: getattr(each, name) for name in habits} == habits

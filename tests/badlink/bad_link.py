@@ -1,4 +1,4 @@
-"""A simulated vehicle behind a bad radio, a program on it, and what one transfer cost: on virtual time.
+"""A simulated vehicle behind a bad radio, and the cost of one transfer over it, on virtual time.
 
 `attempt` does one transfer and gives an `Attempt`: how it ended, how long it took, what was sent for it, and what was
 left on either side.
@@ -24,25 +24,25 @@ from aerokit.testing import FaultModel, FaultyLink, run_virtual
 DELAY_S = 0.05
 PERFECT = FaultModel(delay_s=DELAY_S)
 GRACE_S = 15.0
-"""So long may what a transfer leaves to the background take, when its messages get lost, too."""
+"""Maximum time for the background work of a transfer whose messages get lost."""
 
 OWN_LIFE = (m.Heartbeat, m.CommandLong, m.Timesync, m.Ping)
-"""What a program sends anyway."""
+"""Messages that a program sends anyway."""
 
 
 @dataclass(frozen=True)
 class Radio:
-    """A kind of radio: both directions alike but for what is said otherwise."""
+    """A kind of radio. Both directions are alike unless stated otherwise."""
 
     name: str
     model: FaultModel = PERFECT
     half_duplex: bool = False
     port_bytes_per_s: float | None = None
-    """What the vehicle takes its port to be able to carry; None: it has flow control."""
+    """Rate that the vehicle assumes for its port; None: flow control."""
     outage_after_s: float | None = None
     """Seconds from the beginning of the transfer, after which nothing gets through."""
     outage_s: float = 0.0
-    """For so long; infinite: the link dies."""
+    """Length of the outage; infinite: the link fails for good."""
 
     def with_loss(self, share: float) -> Radio:
         return replace(self, model=self.model.replace(loss=share))
@@ -61,7 +61,7 @@ NARROW = Radio(
 
 @dataclass
 class Program:
-    """What a transfer is done with."""
+    """Objects with which a transfer is run."""
 
     vehicle: aerokit.Vehicle
     simulated: Any
@@ -69,7 +69,7 @@ class Program:
     radio: FaultyLink
     opened_at: float
     known: Any = None
-    """What was found out while the radio was good."""
+    """Result of the preparation, while the radio was good."""
 
     def turn_bad(self, radio: Radio) -> None:
         """From now on."""
@@ -82,7 +82,7 @@ class Program:
 
 @dataclass
 class Attempt:
-    """What came of one transfer."""
+    """Result of one transfer."""
 
     seed: int
     error: Exception | None
@@ -143,9 +143,7 @@ async def _attempt(
         outcome.seconds = loop.time() - begun
         outcome.heard = program.radio.incoming.frames - heard
         outcome.left = await _what_is_left(program, held, leftovers)
-        outcome.sent = Counter(
-            type(each).NAME for _, each in program.wire.sent if not isinstance(each, OWN_LIFE)
-        )
+        outcome.sent = Counter(type(each).NAME for _, each in program.wire.sent if not isinstance(each, OWN_LIFE))
     return outcome
 
 
@@ -170,7 +168,7 @@ def _held(program: Program) -> tuple[int, int, int, int]:
     return (
         attached_sinks(connection),
         waiting_on_cells(program.vehicle),
-        len(connection.deadlines._due),
+        len(connection.deadlines._deadlines),
         len(asyncio.all_tasks()),
     )
 
@@ -183,9 +181,7 @@ async def _what_is_left(
     until = asyncio.get_running_loop().time() + GRACE_S
     while True:
         left = [
-            f"{now - then} {name}"
-            for name, then, now in zip(names, held, _held(program), strict=True)
-            if now > then
+            f"{now - then} {name}" for name, then, now in zip(names, held, _held(program), strict=True) if now > then
         ]
         left += leftovers(program.simulated)
         if not left or asyncio.get_running_loop().time() >= until:

@@ -26,16 +26,16 @@ LOG_DATA, LOG_BLOCK = 90, 12 + 97
 
 @dataclass(frozen=True)
 class Ideal:
-    """What one transfer has to move at least."""
+    """Minimum traffic of one transfer."""
 
     round_trips: int
-    """That have to follow each other."""
+    """Round trips that must follow each other."""
     up: int = 0
     """Bytes to the vehicle."""
     down: int = 0
     """Bytes from the vehicle."""
     vehicle_s: float = 0.0
-    """What the vehicle takes at its own pace to send its part."""
+    """Time that the vehicle itself takes to send its part."""
 
     def seconds(self, radio: Radio) -> float:
         """Over this kind of radio, were it without faults."""
@@ -53,7 +53,7 @@ class Ideal:
 
 
 def parameter_list(count: int, *, per_second: float) -> Ideal:
-    """The request, and what comes of it."""
+    """The request and its answer."""
     return Ideal(1, PARAM_REQUEST, count * PARAM_VALUE, count / per_second)
 
 
@@ -63,7 +63,7 @@ def parameter_writes(count: int) -> Ideal:
 
 
 def parameter_reads(count: int) -> Ideal:
-    """As for writes."""
+    """Like writes."""
     return Ideal(math.ceil(count / QUEUE), count * PARAM_REQUEST, count * PARAM_VALUE)
 
 
@@ -86,7 +86,7 @@ def checksum() -> Ideal:
 
 
 def directory(pages: int) -> Ideal:
-    """A page tells where the next one begins; the last answer is that there is nothing more."""
+    """Each page has the start of the next one; the last answer is an end-of-file error."""
     return Ideal(pages + 1, (pages + 1) * FTP_REQUEST, pages * FTP_BLOCK)
 
 
@@ -106,6 +106,6 @@ def log_list(count: int, *, per_second: float) -> Ideal:
 
 
 def log_read(size: int, *, blocks_per_second: float = math.inf) -> Ideal:
-    """One request, and what comes of it."""
+    """One request and its answer."""
     blocks = math.ceil(size / LOG_DATA)
     return Ideal(1, SHORT, blocks * LOG_BLOCK, max(0, blocks - 1) / blocks_per_second)

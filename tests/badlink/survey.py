@@ -25,7 +25,7 @@ from verdicts import Verdict, judge
 LOSSES = (0.0, 0.05, 0.1, 0.2, 0.3)
 SIZES = {"tiny": TINY, "small": SMALL, "real": REAL}
 RADIOS = (NARROW, WIDE)
-MOST = {0.05: 2.0, 0.2: 4.0}
+MAX_RATIO = {0.05: 2.0, 0.2: 4.0}
 """Times the ideal, promised for `NARROW`, whose bandwidth is the limit. On `WIDE` it is a matter of single losses."""
 
 
@@ -86,8 +86,8 @@ def _complaints(radio: Radio, loss: float, verdicts: Sequence[Verdict]) -> Itera
         for fault in verdict.faults:
             yield f"{where}, seed {verdict.seed}: {fault}"
     ratio = statistics.median(verdict.ratio for verdict in verdicts)
-    if radio is NARROW and ratio > MOST.get(loss, float("inf")):
-        yield f"{where}: {ratio:.2f} times the ideal, more than {MOST[loss]:g}"
+    if radio is NARROW and ratio > MAX_RATIO.get(loss, float("inf")):
+        yield f"{where}: {ratio:.2f} times the ideal, more than {MAX_RATIO[loss]:g}"
 
 
 if __name__ == "__main__":

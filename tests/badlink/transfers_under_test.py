@@ -14,7 +14,7 @@ from ideals import Ideal
 
 from aerokit.errors import FileTimeout, MissionTimeout, ParameterTimeout
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, RallyPoints, rally_point, waypoint
-from aerokit.missions.compare import Storage
+from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter
 from aerokit.sim.logs import SimulatedLog
@@ -28,7 +28,7 @@ HOLES = (ParameterTimeout, MissionTimeout, FileTimeout)
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is transferred."""
+    """Size of the transfer."""
 
     parameters: int | None
     """None: as many as the real vehicle has."""
@@ -52,11 +52,11 @@ class Case:
     check: Callable[[Any, SimulatedCopter, Sizes], None]
     ideal: Callable[[SimulatedCopter, Sizes], Ideal]
     pieces: Callable[[SimulatedCopter, Sizes], int]
-    """How many parts there are that can get lost: the bound of messages is made of it."""
+    """Number of parts that can get lost, for the limit of messages."""
     prepare: Callable[[SimulatedCopter, Sizes], None] = lambda copter, sizes: None
-    """What the vehicle holds."""
+    """Content of the vehicle."""
     before: Work | None = None
-    """What the program has done while the radio was good."""
+    """Preparation, while the radio is good."""
 
     def most_messages(self, copter: SimulatedCopter, sizes: Sizes, *, link_dies: bool = False) -> int:
         """At 30 % loss each way half of all attempts fail; in ten seconds of silence there are some twenty attempts."""
@@ -64,7 +64,7 @@ class Case:
 
 
 def make_copter(case: Case, sizes: Sizes, radio: Radio) -> SimulatedCopter:
-    """A copter with what is to be transferred, that knows how much its port can carry."""
+    """A copter with the data to be transferred, and the real rate of its port."""
     copter = SimulatedCopter(
         boot_time_s=0.0,
         parameter_count=sizes.parameters,
@@ -76,7 +76,7 @@ def make_copter(case: Case, sizes: Sizes, radio: Radio) -> SimulatedCopter:
 
 
 def leftovers(copter: SimulatedCopter) -> Iterator[str]:
-    """What the vehicle still holds for a client that has gone."""
+    """State that the vehicle still holds for a client that has gone."""
     if copter.ftp.open_sessions:
         yield f"{copter.ftp.open_sessions} FTP sessions"
     if copter.missions.transfer_is_open:
@@ -88,7 +88,7 @@ def leftovers(copter: SimulatedCopter) -> Iterator[str]:
 
 
 def names_what_is_missing(error: Exception | None) -> bool:
-    """A typed error that says which parts did not come; or which request, when it is not known yet what there is."""
+    """A typed error that names the missing parts, or the request if the parts are not known yet."""
     if not isinstance(error, HOLES):
         return False
     return bool(error.missing) or any(words in str(error) for words in NO_ANSWER)
@@ -193,22 +193,16 @@ PARAMETERS = [
 
 
 def mission(sizes: Sizes) -> Mission:
-    return Mission(
-        [waypoint(47.0 + n * 1e-4, 8.5, altitude_relative_m=20 + n % 50) for n in range(sizes.items)]
-    )
+    return Mission([waypoint(47.0 + n * 1e-4, 8.5, altitude_relative_m=20 + n % 50) for n in range(sizes.items)])
 
 
 def fence(sizes: Sizes) -> Fence:
     corners = [Position(47.0 + n * 1e-4, 8.5 + (n % 2) * 1e-4) for n in range(min(sizes.items, 60))]
-    return Fence(
-        polygons=[FencePolygon(corners)], circles=[FenceCircle(Position(47.5, 8.6), 100.0, inclusion=False)]
-    )
+    return Fence(polygons=[FencePolygon(corners)], circles=[FenceCircle(Position(47.5, 8.6), 100.0, inclusion=False)])
 
 
 def rally(sizes: Sizes) -> RallyPoints:
-    return RallyPoints(
-        [rally_point(47.0 + n * 1e-3, 8.5, altitude_relative_m=30) for n in range(min(sizes.items, 20))]
-    )
+    return RallyPoints([rally_point(47.0 + n * 1e-3, 8.5, altitude_relative_m=30) for n in range(min(sizes.items, 20))])
 
 
 PLANS: dict[str, Callable[[Sizes], Any]] = {"mission": mission, "fence": fence, "rally": rally}
@@ -242,14 +236,14 @@ def check_vehicle_holds(kind: str) -> Callable[[Any, SimulatedCopter, Sizes], No
 
     def check(_: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
         held = plan_type.from_items(copter.missions.items(number), home_is_item_0=kind == "mission")
-        assert PLANS[kind](sizes).differences(held, Storage.ARDUPILOT) == ()
+        assert PLANS[kind](sizes).differences(held, ItemStorage.ARDUPILOT) == ()
 
     return check
 
 
 def check_plan(kind: str) -> Callable[[Any, SimulatedCopter, Sizes], None]:
     def check(plan: Any, copter: SimulatedCopter, sizes: Sizes) -> None:
-        assert PLANS[kind](sizes).differences(plan, Storage.ARDUPILOT) == ()
+        assert PLANS[kind](sizes).differences(plan, ItemStorage.ARDUPILOT) == ()
 
     return check
 
@@ -260,7 +254,7 @@ def read_plan(kind: str, copter: SimulatedCopter, sizes: Sizes) -> Ideal:
 
 
 def plan_cases(kind: str) -> Iterator[Case]:
-    """By items and as a file, up and down; what was uploaded is read back."""
+    """By items and as a file, up and down; an upload is read back."""
 
     def count(copter: SimulatedCopter, sizes: Sizes) -> int:
         return 2 * len(items_of(kind, sizes))
@@ -269,9 +263,7 @@ def plan_cases(kind: str) -> Iterator[Case]:
         f"{kind} upload by items",
         upload_plan(kind, "items"),
         check_vehicle_holds(kind),
-        lambda copter, sizes: (
-            ideals.items_written(len(items_of(kind, sizes))) + read_plan(kind, copter, sizes)
-        ),
+        lambda copter, sizes: ideals.items_written(len(items_of(kind, sizes))) + read_plan(kind, copter, sizes),
         count,
     )
     yield Case(
@@ -286,9 +278,7 @@ def plan_cases(kind: str) -> Iterator[Case]:
         f"{kind} upload as a file",
         upload_plan(kind, "ftp"),
         check_vehicle_holds(kind),
-        lambda copter, sizes: (
-            ideals.file_write(10 + 38 * len(items_of(kind, sizes))) + read_plan(kind, copter, sizes)
-        ),
+        lambda copter, sizes: ideals.file_write(10 + 38 * len(items_of(kind, sizes))) + read_plan(kind, copter, sizes),
         count,
     )
     yield Case(

@@ -1,4 +1,4 @@
-"""One transfer judged: exact or honest, bounded, nothing left, and how long it took beside the ideal."""
+"""Verdict on one transfer: exact or an honest error, bounded, nothing left, and its time relative to the ideal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aerokit.errors import AerokitError
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of one transfer."""
+    """Result of one transfer."""
 
     case: str
     seed: int
@@ -21,10 +21,10 @@ class Verdict:
     """None: the content is exact."""
     seconds: float
     ratio: float
-    """How many times the ideal it took."""
+    """Time relative to the ideal."""
     messages: int
     faults: list[str] = field(default_factory=list)
-    """What must not be."""
+    """Violations."""
 
     @property
     def is_exact(self) -> bool:

@@ -7,7 +7,7 @@ from contextvars import ContextVar
 
 
 class AsyncLibraryNotFoundError(RuntimeError):
-    """No library is running here."""
+    """Raised when no async library is running."""
 
 
 current_async_library_cvar: ContextVar[str | None] = ContextVar("current_async_library_cvar", default=None)

@@ -23,8 +23,8 @@ from served_copter import served
 import aerokit
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint
 from aerokit.sim import SimulatedCopter
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
-from aerokit.sim.track import true_point
+from aerokit.sim.motion import GlobalPoint, LocalFrame
+from aerokit.testing.track import true_point
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is installed by `nox -s browser`")
 CHROMIUM = os.environ.get("AEROKIT_CHROMIUM") or shutil.which("chromium")
@@ -127,16 +127,16 @@ def wait_done(page: Any, text: str) -> None:
     page.locator(".toast.done", has_text=text).first.wait_for(timeout=60_000)
 
 
-def test_a_flight_by_the_page(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     (first, second), address = copters
-    with serving(address) as told, opened(browser, told["page"]) as page:
-        assert told["token"] not in page.url  # it was taken out of the address
+    with serving(address) as server, opened(browser, server["page"]) as page:
+        assert server["token"] not in page.url  # it was taken out of the address
         page.get_by_role("tab", name="Mission").click()
         page.locator("#panel tr").nth(5).wait_for()
         assert page.locator("#tiles-of-state dd").first.inner_text() == "STABILIZE"
 
         page.click("button[data-order='arm']")
-        assert "Vehicle 1" in page.locator("dialog .whom").inner_text()
+        assert "Vehicle 1" in page.locator("dialog .target").inner_text()
         picture(page, "dialog")
         page.click("dialog button >> text=Cancel")
         assert not first.is_armed
@@ -154,10 +154,8 @@ def test_a_flight_by_the_page(browser: Any, copters: tuple[list[SimulatedCopter]
         fly_to_a_click(page, first)
         order(page, "land")
         wait_done(page, "land")
-        page.get_by_role("tab", name="Orders").click()
-        page.locator(
-            "#panel .text", has_text="go to: latitude -35."
-        ).wait_for()  # it is drawn with the next frame
+        page.get_by_role("tab", name="OrderRunner").click()
+        page.locator("#panel .text", has_text="go to: latitude -35.").wait_for()  # it is drawn with the next frame
         picture(page, "orders")
 
 
@@ -178,9 +176,7 @@ def values_have_units(page: Any) -> None:
     picture(page, "state")
     page.set_viewport_size({"width": 1300, "height": 820})
     page.evaluate("document.querySelectorAll('#tiles-of-state dd')[7].textContent = '10 · RTK fixed (12 s)'")
-    assert page.locator("#tiles-of-state dd").evaluate_all(
-        "all => all.every(e => e.scrollWidth <= e.clientWidth)"
-    )
+    assert page.locator("#tiles-of-state dd").evaluate_all("all => all.every(e => e.scrollWidth <= e.clientWidth)")
     picture(page, "narrow")
     page.set_viewport_size({"width": 1360, "height": 820})
     page.get_by_role("tab", name="Mission").click()
@@ -199,11 +195,9 @@ def fly_to_a_click(page: Any, copter: SimulatedCopter) -> None:
     assert place.longitude_deg == pytest.approx(float(asked[2]), abs=3e-5)
 
 
-def test_parameters_are_set_behind_a_confirmation(
-    browser: Any, copters: tuple[list[SimulatedCopter], str]
-) -> None:
+def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     _, address = copters
-    with serving(address) as told, opened(browser, told["page"]) as page:
+    with serving(address) as server, opened(browser, server["page"]) as page:
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.get_by_role("tab", name="Parameters").click()
         page.fill("input[type=search]", "wpnav_speed")
@@ -216,11 +210,9 @@ def test_parameters_are_set_behind_a_confirmation(
         picture(page, "parameters")
 
 
-def test_what_vehicles_say_is_no_html_and_old_values_look_old(
-    browser: Any, copters: tuple[list[SimulatedCopter], str]
-) -> None:
+def test_page_escapes_texts_and_marks_old_values(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     (_, second), address = copters
-    with serving(address) as told, opened(browser, told["page"]) as page:
+    with serving(address) as server, opened(browser, server["page"]) as page:
         page.get_by_role("tab", name="Messages").click()
         second.send_text(4, HOSTILE)
         page.locator(".vehicle", has_text="2 ArduCopter").click()
@@ -231,26 +223,24 @@ def test_what_vehicles_say_is_no_html_and_old_values_look_old(
         page.locator("#tiles-of-state dd.old").first.wait_for()
         page.locator(".vehicle .dot.silent").wait_for()
         order(page, "arm")
-        page.locator(".toast.failed", has_text="not heard").wait_for()
+        page.locator(".toast.failed", has_text="is silent").wait_for()
         assert not second.is_armed
         picture(page, "silent")
         second.faults.silent = False
 
 
-def test_on_a_phone_without_a_token_and_read_only(
-    browser: Any, copters: tuple[list[SimulatedCopter], str]
-) -> None:
+def test_page_on_phone_without_token_and_read_only(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     _, address = copters
-    with serving(address, "--read-only") as told, opened(browser, told["url"], 390, 844) as page:
-        page.locator("#server", has_text="reading only").wait_for()
+    with serving(address, "--read-only") as server, opened(browser, server["url"], 390, 844) as page:
+        page.locator("#server", has_text="read-only").wait_for()
         assert page.locator("#orders button:enabled").count() == 0
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         picture(page, "phone")
 
 
-def test_a_server_that_ends(browser: Any) -> None:
-    with serving("--sim") as told:
-        started = opened(browser, told["url"])
+def test_page_after_server_end_shows_banner(browser: Any) -> None:
+    with serving("--sim") as server:
+        started = opened(browser, server["url"])
         page = started.__enter__()
     page.locator("#banner", has_text="No connection").wait_for()
     page.locator("#tiles-of-state dd.old").first.wait_for()

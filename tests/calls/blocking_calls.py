@@ -65,9 +65,7 @@ def blocking_names() -> Iterator[str]:
             function = inspect.getattr_static(cls, name)
             if not name.startswith("_") and isinstance(function, FunctionType):
                 code = inspect.unwrap(function).__code__
-                if {"_loop", "_block", "_twin_block"} & set(
-                    code.co_names
-                ) and f"{cls.__name__}.{name}" not in CLOSING:
+                if {"_loop", "_block", "_twin_block"} & set(code.co_names) and f"{cls.__name__}.{name}" not in CLOSING:
                     yield f"{cls.__name__}.{name}"
 
 
@@ -157,7 +155,7 @@ def _directory(stage: Any) -> None:
 def _post(stage: Any) -> None:
     with stage.vehicle.posted("arm", armed=True) as order:
         order.command(MavCmd.COMPONENT_ARM_DISARM, 1)
-        order.until_told(2)
+        order.wait_confirmed(2)
 
 
 def _post_mode(stage: Any) -> None:
@@ -182,7 +180,7 @@ def _in_control(do: Callable[[Any], object]) -> Do:
 
 
 def _until_lost(stage: Any) -> None:
-    """Nobody takes it: the wait is ended by the other thread."""
+    """Wait until the other thread ends the wait."""
     with stage.vehicle.gimbal.control() as block:
         claim = messages.CommandLong(1, 1, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 0, 254, 190, -1, -1, 0, 0, 0)
         stage.vehicle.send(claim)
@@ -230,7 +228,7 @@ WRITTEN: dict[str, Do] = {
     "PostedOrder.command": _post,
     "PostedOrder.command_int": _post_place,
     "PostedOrder.set_mode": _post_mode,
-    "PostedOrder.until_told": _post,
+    "PostedOrder.wait_confirmed": _post,
     "Guided.velocity": _stream("velocity", lambda _: VelocitySetpoint(north_m_s=1.0)),
     "Guided.body_velocity": _stream("body_velocity", lambda _: BodyVelocitySetpoint(forward_m_s=1.0)),
     "Guided.acceleration": _stream("acceleration", lambda _: AccelerationSetpoint(north_m_s2=0.2)),
@@ -263,6 +261,6 @@ WRITTEN: dict[str, Do] = {
 
 
 def blocking_calls() -> dict[str, Do]:
-    """By name; the rows of the other table that are coroutine functions themselves are not for the twin."""
+    """Return the calls by name; coroutine functions of the other table have no twin."""
     shared = {name: call.do for name, call in CALLS.items() if not inspect.iscoroutinefunction(call.do)}
     return {**shared, **WRITTEN, **BLOCKING, **COMPONENTS_BLOCKING}

@@ -1,4 +1,4 @@
-"""Which errors the docstrings of the public functions promise: their ``Raises:``, and what their prose says of them."""
+"""Errors documented in the docstrings of public functions: in ``Raises:`` and in prose."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from aerokit import errors
 __all__ = ["documented"]
 
 NAMES = {*errors.__all__, "OSError"}
-AS_OTHERS = re.compile(
-    r"(?:[Rr]aises as|else as|[Ee]rrors as for|errors are those of|is as for|see) :meth:`([\w.]+)`"
-)
+AS_OTHERS = re.compile(r"(?:[Rr]aises as|else as|[Ee]rrors as for|errors are those of|is as for|see) :meth:`([\w.]+)`")
 FOR_ALL = re.compile(r"(Every method raises:|All methods take|NotSupported is\s+raised for).*", re.DOTALL)
-"""What the docstring of a class says of all its methods."""
+"""Errors that a class docstring documents for all its methods."""
 
 
 def documented() -> set[tuple[str, str]]:
@@ -47,7 +45,7 @@ def _of_all_methods(cls: type) -> set[str]:
 
 
 def _of_class(cls: type) -> set[str]:
-    """What its docstring says of the object itself, of entering and leaving it."""
+    """Return the errors documented for the object itself, for entering and leaving it."""
     return _named_in(FOR_ALL.sub("", inspect.getdoc(cls) or ""))
 
 

@@ -15,7 +15,7 @@ from aerokit.sync.loop_thread import LoopThread
 __all__ = ["AT_ITS_END", "Interrupter"]
 
 AT_ITS_END = 1 << 30
-"""Interrupted when the work on the loop is done and the caller has not heard of it."""
+"""Interrupt when the work on the loop is done and the caller does not know yet."""
 PATIENCE_S = 200.0
 """For tests that hang."""
 
@@ -29,9 +29,9 @@ class Interrupter:
         self._turn = threading.Condition()
         self._has_interrupted = False
         self._wait_for = LoopThread.wait_for
-        for name in ("run", "run_to_its_end"):
+        for name in ("run", "run_shielded"):
             monkeypatch.setattr(LoopThread, name, self._watching(getattr(LoopThread, name)))
-        monkeypatch.setattr(LoopThread, "hold_open", self._holding_open(LoopThread.hold_open))
+        monkeypatch.setattr(LoopThread, "open_context", self._holding_open(LoopThread.open_context))
         interrupter = self
         monkeypatch.setattr(LoopThread, "wait_for", lambda loop, *what: interrupter._wait(loop, *what))
 
@@ -51,18 +51,16 @@ class Interrupter:
         return self._has_interrupted
 
     def _watching(self, run: Callable[..., Any]) -> Callable[..., Any]:
-        def watching(
-            loop: LoopThread, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any
-        ) -> Any:
+        def watching(loop: LoopThread, function: Callable[..., Awaitable[object]], *args: Any, **kwargs: Any) -> Any:
             self._begun += 1
             return run(loop, lambda: self._watched(lambda: function(*args, **kwargs)))
 
         return watching
 
-    def _holding_open(self, hold_open: Callable[..., Any]) -> Callable[..., Any]:
+    def _holding_open(self, open_context: Callable[..., Any]) -> Callable[..., Any]:
         def watching(loop: LoopThread, context: AbstractAsyncContextManager[Any]) -> Any:
             self._begun += 1
-            return hold_open(loop, _Entered(context, self._watched))
+            return open_context(loop, _Entered(context, self._watched))
 
         return watching
 
@@ -80,12 +78,10 @@ class Interrupter:
             self._turn.notify_all()
 
     def _wait(self, loop: LoopThread, *what: Any) -> None:
-        """As the program's own wait; but Ctrl-C comes when the work stands at the await, if it comes there."""
+        """Wait like the program, but raise Ctrl-C when the work reaches the await."""
         if self._at and not self._has_interrupted:
             with self._turn:
-                is_there = self._turn.wait_for(
-                    lambda: self.count >= self._at or self._ended == self._begun, PATIENCE_S
-                )
+                is_there = self._turn.wait_for(lambda: self.count >= self._at or self._ended == self._begun, PATIENCE_S)
             assert is_there, "nothing happens on the loop"
             if self.count >= self._at or self._at == AT_ITS_END:
                 self._has_interrupted = True

@@ -45,7 +45,7 @@ def _stream_never(stage: Stage) -> None:
 
 
 def _now(function: Callable[[Stage], object]) -> Do:
-    """What does not wait."""
+    """Wrap a call that does not wait."""
 
     async def do(stage: Stage) -> object:
         return function(stage)
@@ -64,7 +64,7 @@ def _look_north(stage: Stage) -> Any:
 async def _post(stage: Stage, subjects: list[Any], command: int = 400, **options: Any) -> None:
     with stage.vehicle.posted(*subjects, **options) as order:
         await order.command(command, 1)
-        await order.until_told(2)
+        await order.wait_confirmed(2)
 
 
 async def _post_int(stage: Stage, frame: int = 0) -> None:
@@ -121,9 +121,7 @@ def _actions() -> Table:
         ("Vehicle.command_int", "InvalidArgument"): P(_method("command_int", 1, frame=999)),
         ("Vehicle.command_int", "CommandRejected"): P(command_int, before=refused(Cmd.DO_SET_HOME)),
         ("Vehicle.command_int", "CommandTimeout"): P(command_int, before=ignored(Cmd.DO_SET_HOME)),
-        ("Vehicle.arm", "OperationRejected"): later(
-            _method("arm"), pilot, 0.1, grounded, before=ignored(arm)
-        ),
+        ("Vehicle.arm", "OperationRejected"): later(_method("arm"), pilot, 0.1, grounded, before=ignored(arm)),
         ("Vehicle.arm", "OperationTimeout"): P(_method("arm", timeout=1.5), grounded, accepted(arm)),
         ("Vehicle.arm", "HeartbeatTimeout"): later(
             _method("arm", timeout=30), falls_silent, 1.0, grounded, before=accepted(arm)
@@ -136,17 +134,13 @@ def _actions() -> Table:
         ("Vehicle.reboot", "OperationRejected"): P(_method("reboot"), armed),
         ("Vehicle.reboot", "OperationTimeout"): P(_method("reboot", timeout=2), grounded, accepted(reboot)),
         ("Vehicle.reboot", "LinkLost"): later(_method("reboot"), lost, 0.05, grounded, alone=True),
-        ("Vehicle.wait_ready", "OperationTimeout"): P(
-            _method("wait_ready", timeout=1), before=_forget("home")
-        ),
+        ("Vehicle.wait_ready", "OperationTimeout"): P(_method("wait_ready", timeout=1), before=_forget("home")),
         ("Vehicle.send", "InvalidArgument"): P(_now(lambda s: s.vehicle.send(messages.Ping(0, 0, 999, 0)))),
         ("Vehicle.send", "ConnectionClosed"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0))),
         ("Vehicle.send", "LinkLost"): _ended(lambda s: s.vehicle.send(messages.Ping(0, 0, 0, 0)), lost),
         ("Vehicle.subscribe", "InvalidArgument"): P(_now(lambda s: s.vehicle.subscribe())),
         ("Vehicle.streams", "InvalidArgument"): P(_now(_stream_never)),
-        ("Vehicle.message", "InvalidArgument"): P(
-            _now(lambda s: s.vehicle.message(messages.Attitude, rate_hz=5000))
-        ),
+        ("Vehicle.message", "InvalidArgument"): P(_now(lambda s: s.vehicle.message(messages.Attitude, rate_hz=5000))),
         ("Vehicle.setup_signing", "NotSupported"): P(_sign, grounded, _old, alone=True),
         ("Vehicle.setup_signing", "OperationRejected"): P(_sign, armed),
         ("Vehicle.setup_signing", "OperationTimeout"): P(_sign, grounded, falls_silent),
@@ -166,12 +160,8 @@ def _actions() -> Table:
         ),
         ("Vehicle.posted", "InvalidArgument"): P(lambda s: _post(s, [])),
         ("PostedOrder.command", "InvalidArgument"): P(lambda s: _post(s, ["arm"], -1, armed=True)),
-        ("PostedOrder.command", "CommandRejected"): P(
-            lambda s: _post(s, ["arm"], armed=True), grounded, refused(arm)
-        ),
-        ("PostedOrder.command", "CommandTimeout"): P(
-            lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)
-        ),
+        ("PostedOrder.command", "CommandRejected"): P(lambda s: _post(s, ["arm"], armed=True), grounded, refused(arm)),
+        ("PostedOrder.command", "CommandTimeout"): P(lambda s: _post(s, ["arm"], armed=True), grounded, ignored(arm)),
         ("PostedOrder.command", "OperationRejected"): P(_post_overruled),
         ("PostedOrder.command_int", "OperationRejected"): P(lambda s: _post_overruled(s, as_int=True)),
         ("PostedOrder.command_int", "InvalidArgument"): P(lambda s: _post_int(s, 999)),
@@ -181,30 +171,25 @@ def _actions() -> Table:
         ("PostedOrder.set_mode", "CommandRejected"): P(_post_mode, before=refused(Cmd.DO_SET_MODE)),
         ("PostedOrder.set_mode", "CommandTimeout"): P(_post_mode, grounded, ignored(Cmd.DO_SET_MODE)),
         ("PostedOrder.set_mode", "OperationTimeout"): P(_post_mode, grounded, accepted(Cmd.DO_SET_MODE)),
-        ("PostedOrder.until_told", "OperationTimeout"): P(
+        ("PostedOrder.wait_confirmed", "OperationTimeout"): P(
             lambda s: _post(s, ["arm"], armed=True), grounded, accepted(arm)
         ),
-        ("PostedOrder.until_told", "CommandRejected"): later(
+        ("PostedOrder.wait_confirmed", "CommandRejected"): later(
             lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
         ),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), falls_silent, 3.0
         ),
-        ("Vehicle.go_to", "InvalidArgument"): P(
-            _method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne
-        ),
-        ("Vehicle.go_to", "ValueUnknownError"): P(
-            _method("go_to", Position(0, 0)), airborne, _forget("position")
-        ),
+        ("Vehicle.go_to", "InvalidArgument"): P(_method("go_to", Position(0, 0, altitude_relative_m=9e9)), airborne),
+        ("Vehicle.go_to", "ValueUnknownError"): P(_method("go_to", Position(0, 0)), airborne, _forget("position")),
         ("Vehicle.take_off", "InvalidArgument"): P(_method("take_off", -1)),
         ("Vehicle.take_off", "NotSupported"): P(_method("take_off", 5), armed, no_modes, alone=True),
         ("Vehicle.take_off", "OperationRejected"): P(_method("take_off", 5), grounded),
+        ("Vehicle.take_off", "CommandRejected"): P(_method("take_off", 5), armed, refused(Cmd.NAV_TAKEOFF)),
         ("Vehicle.take_off", "CommandTimeout"): P(_method("take_off", 5), armed, ignored(Cmd.NAV_TAKEOFF)),
         ("Vehicle.take_off", "HeartbeatTimeout"): later(_method("take_off", 50), falls_silent, 1.0, armed),
         ("Vehicle.take_off", "OperationTimeout"): P(_method("take_off", 50, timeout=2), armed),
-        ("Vehicle.take_off", "ValueUnknownError"): P(
-            _method("take_off", 5), armed, _forget("home"), on="px4"
-        ),
+        ("Vehicle.take_off", "ValueUnknownError"): P(_method("take_off", 5), armed, _forget("home"), on="px4"),
     }
     for name, do, repeated in (
         ("Vehicle.set_mode", _method("set_mode", "LOITER"), mode),
@@ -318,17 +303,13 @@ def _parts() -> Table:
         ("SetpointStream.set", "InvalidArgument"): P(_set_too_much, airborne),
         ("SetpointStream.fly", stopped): later(lambda s: _fly(s), pilot, 1.0),
         ("StateCell.fresh", "StaleValueError"): P(_old_value, grounded),
-        ("StateCell.fresh", "ValueUnknownError"): P(
-            _now(lambda s: s.vehicle.home.fresh(1)), before=_forget("home")
-        ),
+        ("StateCell.fresh", "ValueUnknownError"): P(_now(lambda s: s.vehicle.home.fresh(1)), before=_forget("home")),
         ("StateCell.wait_until", "OperationTimeout"): P(
             lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
         ),
         ("Subscription.get", "OperationTimeout"): P(lambda s: _read(s, timeout=1)),
         ("Subscription.get", "InvalidArgument"): P(_read_closed),
-        ("Subscription.get", "ConnectionClosed"): later(
-            _read, lambda s: s.vehicle.connection.close(), 0.1, alone=True
-        ),
+        ("Subscription.get", "ConnectionClosed"): later(_read, lambda s: s.vehicle.connection.close(), 0.1, alone=True),
         ("Subscription.get", "LinkLost"): later(_read, lost, 0.1, alone=True),
     }
 
@@ -393,9 +374,7 @@ def _connections() -> Table:
         ("open_connection", "LinkOpenError"): P(lambda s: _open(s, "tcp:127.0.0.1:9")),
         ("open_connection", "BusyError"): P(lambda s: _used(s, now=True)),
         ("open_connection", "ConnectionClosed"): P(lambda s: _used(s, now=False)),
-        ("Connection.check_types", "InvalidArgument"): P(
-            _now(lambda s: s.vehicle.connection.check_types(()))
-        ),
+        ("Connection.check_types", "InvalidArgument"): P(_now(lambda s: s.vehicle.connection.check_types(()))),
         ("Connection.subscribe", "InvalidArgument"): P(_now(lambda s: s.vehicle.connection.subscribe())),
         ("Connection.record", "LinkOpenError"): P(_now(lambda s: s.vehicle.connection.record(nowhere))),
         ("Connection.record", "BusyError"): P(_record_twice, alone=True),
@@ -414,9 +393,7 @@ def _connections() -> Table:
         rows[f"Connection.{name}", "ConnectionClosed"] = _ended(function)
         rows[f"Connection.{name}", "LinkLost"] = _ended(function, lost)
     for error, end in (("ConnectionClosed", lambda s: s.vehicle.connection.close()), ("LinkLost", lost)):
-        rows["Connection.vehicles", error] = P(
-            lambda s: anext(s.vehicle.connection.vehicles()), before=end, alone=True
-        )
+        rows["Connection.vehicles", error] = P(lambda s: anext(s.vehicle.connection.vehicles()), before=end, alone=True)
     return rows
 
 

@@ -139,7 +139,7 @@ async def _get(stage: Stage, device_id: int) -> None:
 
 
 def _many(stage: Stage) -> None:
-    """Heard of from everywhere."""
+    """Announce many gimbals."""
     for number in range(7, 200):
         stage.vehicle.gimbal  # noqa: B018 - it begins to listen
         told = messages.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
@@ -168,19 +168,13 @@ def _table() -> Table:
         ("Gimbal.look_at", "InvalidArgument"): P(lambda s: _look(s, tolerance_deg=99), airborne),
         ("Gimbal.look_at_system", "InvalidArgument"): P(_call("look_at_system", 0)),
         ("Gimbal.look_at", "NotSupported"): P(_place_of, airborne),
-        ("Gimbal.look_at", "ValueUnknownError"): P(
-            _look_north, airborne, lambda s: s.vehicle.home.forget(), on="px4"
-        ),
+        ("Gimbal.look_at", "ValueUnknownError"): P(_look_north, airborne, lambda s: s.vehicle.home.forget(), on="px4"),
         ("Gimbal.look_at_system", "NotSupported"): P(_call("look_at_system", 2), on="px4"),
         ("Gimbal.retract", "NotSupported"): P(_call("retract"), on="px4"),
         ("Gimbal.release", "CommandRejected"): P(_call("release"), before=refused(Cmd.DO_MOUNT_CONTROL)),
         ("Gimbal.release", "CommandTimeout"): P(_call("release"), grounded, ignored(Cmd.DO_MOUNT_CONTROL)),
-        ("Gimbal.stop_looking", "CommandRejected"): P(
-            _call("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)
-        ),
-        ("Gimbal.stop_looking", "CommandTimeout"): P(
-            _call("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)
-        ),
+        ("Gimbal.stop_looking", "CommandRejected"): P(_call("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)),
+        ("Gimbal.stop_looking", "CommandTimeout"): P(_call("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)),
         ("Gimbal.stop_looking", "GimbalTaken"): _taken(_call("stop_looking")),
         ("Gimbal.information", "CommandRejected"): P(
             _call("information"), before=refused(Cmd.REQUEST_MESSAGE), alone=True
@@ -190,21 +184,15 @@ def _table() -> Table:
         ),
         ("Gimbal.rates", "InvalidArgument"): P(_rates(pitch_deg_s=9e9)),
         ("GimbalRates", "InvalidArgument"): P(_rates(yaw_deg_s=math.nan)),
-        ("GimbalRates", "NotSupported"): P(
-            _rates(), before=refused(PITCHYAW, MavResult.UNSUPPORTED), alone=True
-        ),
+        ("GimbalRates", "NotSupported"): P(_rates(), before=refused(PITCHYAW, MavResult.UNSUPPORTED), alone=True),
         ("GimbalRates", "CommandRejected"): P(_rates(), before=refused(PITCHYAW)),
         ("GimbalRates", "CommandTimeout"): P(_rates(), grounded, ignored(PITCHYAW)),
         ("GimbalRates", "GimbalTaken"): P(_rates_after_it_was_taken, grounded, _fitted()),
         ("GimbalRates.set", "InvalidArgument"): P(_rates(_setting(9e9)), before=_fitted()),
         ("GimbalRates.set", "SetpointStreamStopped"): P(_rates(_setting(0.0, after_s=2.0)), before=_fitted()),
-        ("GimbalRates.set", "GimbalTaken"): P(
-            lambda s: _fed_after_it_was_taken(s, _setting(1.0)), grounded, _fitted()
-        ),
+        ("GimbalRates.set", "GimbalTaken"): P(lambda s: _fed_after_it_was_taken(s, _setting(1.0)), grounded, _fitted()),
         ("GimbalRates.turn", "InvalidArgument"): P(_rates(_turning(9e9, 0, 1)), before=_fitted()),
-        ("GimbalRates.turn", "SetpointStreamStopped"): P(
-            _rates(_turning(0, 0, 1, after_s=2.0)), before=_fitted()
-        ),
+        ("GimbalRates.turn", "SetpointStreamStopped"): P(_rates(_turning(0, 0, 1, after_s=2.0)), before=_fitted()),
         ("GimbalRates.turn", "GimbalTaken"): P(
             lambda s: _fed_after_it_was_taken(s, _turning(0, 0, 1)), grounded, _fitted()
         ),
@@ -221,9 +209,7 @@ def _table() -> Table:
         ("GimbalControl.until_lost", "ConnectionClosed"): P(
             lambda s: _ended(s, _closed), grounded, _fitted(), alone=True
         ),
-        ("GimbalControl.until_lost", "LinkLost"): P(
-            lambda s: _ended(s, lost), grounded, _fitted(), alone=True
-        ),
+        ("GimbalControl.until_lost", "LinkLost"): P(lambda s: _ended(s, lost), grounded, _fitted(), alone=True),
         ("Gimbals.get", "InvalidArgument"): P(lambda s: _get(s, 0)),
         ("Gimbals.get", "BusyError"): P(lambda s: _get(s, 250), before=_many, alone=True),
         ("Gimbals.discover", "ConnectionClosed"): P(lambda s: _discover(s, _closed), alone=True),

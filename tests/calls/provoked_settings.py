@@ -15,7 +15,7 @@ from aerokit.sim.components.camera_body import DEFINITION_PATH
 
 __all__ = ["SETTINGS"]
 
-PATIENCE: dict[str, Any] = {"patience_s": 1.0}
+PATIENCE: dict[str, Any] = {"idle_timeout_s": 1.0}
 
 
 def _call(name: str, *args: Any, **options: Any) -> Do:
@@ -61,7 +61,7 @@ def _loses_files(camera: SimulatedCamera) -> None:
 
 
 def _shrinks(camera: SimulatedCamera) -> None:
-    """Shorter each time it is opened than it says."""
+    """Serve a file that is shorter each time it is opened than announced."""
     tree: Any = camera.files
     tree.size = lambda path: 100_000
     camera.vehicle.call_later(20.0, lambda: vars(tree).pop("size"))
@@ -87,9 +87,7 @@ SETTINGS: Table = {
     ("Settings.fetch_definition", "FileError"): P(_call("fetch_definition", "mftp:///nowhere")),
     ("Settings.fetch_definition", "FileTimeout"): P(_call("fetch_definition", **PATIENCE), _loses_files),
     ("Settings.fetch_definition", "RemoteProtocolError"): P(_call("fetch_definition"), _shrinks),
-    ("Settings.fetch_definition", "OperationRejected"): P(
-        _call("fetch_definition", "http://127.0.0.1:1/camera.xml")
-    ),
+    ("Settings.fetch_definition", "OperationRejected"): P(_call("fetch_definition", "http://127.0.0.1:1/camera.xml")),
     ("Settings.download", "ParameterTimeout"): P(_call("download", **PATIENCE), _silent),
     ("Settings.download", "OperationTimeout"): P(_call("download", **HURRY), _silent),
     **{

@@ -28,7 +28,7 @@ from aerokit.mavlink.enums import MavCmd
 __all__ = ["TRANSFERS"]
 
 P, Cmd = Provocation, MavCmd
-PATIENCE: dict[str, Any] = {"patience_s": 1.0}
+PATIENCE: dict[str, Any] = {"idle_timeout_s": 1.0}
 HURRY: dict[str, Any] = {"timeout": 0.3}
 NOWHERE = "/nowhere/at/all"
 
@@ -100,28 +100,18 @@ def _parameters() -> Table:
         ("Parameters.download", "RemoteProtocolError"): P(
             _of("parameters", "download", method="ftp", refresh=True), before=NONSENSE
         ),
-        ("Parameters.changed_from_default", "NotSupported"): P(
-            _of("parameters", "changed_from_default"), on="px4"
-        ),
+        ("Parameters.changed_from_default", "NotSupported"): P(_of("parameters", "changed_from_default"), on="px4"),
         ("Parameters.load_metadata", "FileFormatError"): P(_load),
         ("Parameters.upload", "FileFormatError"): P(_of("parameters", "upload", _damaged)),
         ("Parameters.upload", "ParameterRejected"): P(_upload_unknown),
         ("Parameters.temporarily", "RollbackFailed"): P(
-            lambda s: _silent_in(
-                s, s.vehicle.parameters.temporarily({s.parameter: s.other_value() + 1}, **PATIENCE)
-            )
+            lambda s: _silent_in(s, s.vehicle.parameters.temporarily({s.parameter: s.other_value() + 1}, **PATIENCE))
         ),
-        ("Transaction", "RollbackFailed"): P(
-            lambda s: _silent_in(s, s.vehicle.parameters.transaction(**PATIENCE))
-        ),
+        ("Transaction", "RollbackFailed"): P(lambda s: _silent_in(s, s.vehicle.parameters.transaction(**PATIENCE))),
         ("Transaction.set", "InvalidArgument"): P(lambda s: _in_transaction(s, s.parameter, math.nan)),
         ("Transaction.set", "ParameterRejected"): P(lambda s: _in_transaction(s, "NOSUCH_PARAM", 1)),
-        ("Transaction.set", "ParameterTimeout"): P(
-            lambda s: _in_transaction(s, s.parameter, 1), before=falls_silent
-        ),
-        ("Transaction.set", "VerificationFailed"): P(
-            lambda s: _in_transaction(s, s.parameter, 3), before=_clamp
-        ),
+        ("Transaction.set", "ParameterTimeout"): P(lambda s: _in_transaction(s, s.parameter, 1), before=falls_silent),
+        ("Transaction.set", "VerificationFailed"): P(lambda s: _in_transaction(s, s.parameter, 3), before=_clamp),
     }
     for name, args, wrong, unknown in (
         ("get", (_name,), ("",), ("NOSUCH_PARAM",)),
@@ -169,7 +159,7 @@ def _answering(kind: type[Any], result: int, mission_type: int) -> Callable[[Sta
 
 
 def _fewer(mission_type: int) -> Callable[[Stage], None]:
-    """It says that it holds nothing."""
+    """Make the vehicle report an empty list."""
 
     def trouble(stage: Stage) -> None:
         def handle(_: Any, channel: Any) -> None:
@@ -211,10 +201,8 @@ def _plans(part: str) -> Table:
     ):
         key = f"{owner}.{name}"
         rows |= {
-            (key, "InvalidArgument"): P(_of(part, name, *args, patience_s=-1)),
-            (key, "MissionRejected"): P(
-                _of(part, name, *args, **options), grounded, _answering(asked, 1, kind)
-            ),
+            (key, "InvalidArgument"): P(_of(part, name, *args, idle_timeout_s=-1)),
+            (key, "MissionRejected"): P(_of(part, name, *args, **options), grounded, _answering(asked, 1, kind)),
             (key, "MissionTimeout"): P(_of(part, name, *args, **options, **PATIENCE), grounded, falls_silent),
             (key, "OperationTimeout"): P(_of(part, name, *args, **options, **HURRY), grounded, falls_silent),
         }
@@ -225,9 +213,7 @@ def _plans(part: str) -> Table:
                 (key, "FileError"): P(_of(part, name, *args, **ftp), grounded, REFUSING),
                 (key, "FileTimeout"): P(_of(part, name, *args, **ftp, **PATIENCE), grounded, falls_silent),
             }
-    rows[f"{owner}.download", "RemoteProtocolError"] = P(
-        _of(part, "download", method="ftp"), grounded, NONSENSE
-    )
+    rows[f"{owner}.download", "RemoteProtocolError"] = P(_of(part, "download", method="ftp"), grounded, NONSENSE)
     return rows
 
 
@@ -259,18 +245,12 @@ def _flown() -> Table:
         ("MissionControl.wait_finished", "OperationRejected"): later(
             _of(mission, "wait_finished"), pilot, 1.0, on_mission
         ),
-        ("MissionControl.wait_finished", "OperationTimeout"): P(
-            _of(mission, "wait_finished", timeout=1), on_mission
-        ),
+        ("MissionControl.wait_finished", "OperationTimeout"): P(_of(mission, "wait_finished", timeout=1), on_mission),
         ("MissionControl.wait_finished", "HeartbeatTimeout"): later(
             _of(mission, "wait_finished"), falls_silent, 1.0, on_mission
         ),
-        ("FenceControl.enable", "CommandRejected"): P(
-            _of("fence", "enable"), grounded, refused(Cmd.DO_FENCE_ENABLE)
-        ),
-        ("FenceControl.enable", "CommandTimeout"): P(
-            _of("fence", "enable"), grounded, ignored(Cmd.DO_FENCE_ENABLE)
-        ),
+        ("FenceControl.enable", "CommandRejected"): P(_of("fence", "enable"), grounded, refused(Cmd.DO_FENCE_ENABLE)),
+        ("FenceControl.enable", "CommandTimeout"): P(_of("fence", "enable"), grounded, ignored(Cmd.DO_FENCE_ENABLE)),
     }
     for name in ("start", "resume"):
         key = f"MissionControl.{name}"
@@ -281,12 +261,8 @@ def _flown() -> Table:
             (key, "NotSupported"): P(_of(mission, name), on_mission, no_modes, alone=True),
         }
         if name == "resume":
-            rows[key, "CommandRejected"] = P(
-                _of(mission, name), on_mission, _both(refused(start), refused(mode))
-            )
-            rows[key, "OperationTimeout"] = P(
-                _of(mission, name), on_mission, _both(ignored(start), ignored(mode))
-            )
+            rows[key, "CommandRejected"] = P(_of(mission, name), on_mission, _both(refused(start), refused(mode)))
+            rows[key, "OperationTimeout"] = P(_of(mission, name), on_mission, _both(ignored(start), ignored(mode)))
     return rows
 
 
@@ -300,9 +276,7 @@ def _both(*troubles: Callable[[Stage], object]) -> Callable[[Stage], object]:
 def _files() -> Table:
     rows: Table = {
         ("Files.write", "VerificationFailed"): P(_of("files", "write", "/x", b"abc"), before=FORGETTING),
-        ("Files.upload", "VerificationFailed"): P(
-            _of("files", "upload", Stage.local_file, "/x"), before=FORGETTING
-        ),
+        ("Files.upload", "VerificationFailed"): P(_of("files", "upload", Stage.local_file, "/x"), before=FORGETTING),
         ("Files.download", "OSError"): P(_of("files", "download", lambda s: s.file, NOWHERE)),
         ("Files.upload", "OSError"): P(_of("files", "upload", NOWHERE, "/x")),
     }
@@ -339,16 +313,14 @@ def _deaf_to_erase(stage: Stage) -> None:
 def _logs() -> Table:
     rows: Table = {
         ("Logs.list", "FileTimeout"): P(_of("logs", "list", **PATIENCE), grounded, falls_silent),
-        ("Logs.erase", "FileTimeout"): P(_of("logs", "erase", patience_s=2), grounded, _deaf_to_erase),
+        ("Logs.erase", "FileTimeout"): P(_of("logs", "erase", idle_timeout_s=2), grounded, _deaf_to_erase),
         ("Logs.download", "OSError"): P(_of("logs", "download", 1, NOWHERE), grounded),
     }
     for name, after in (("download", (Stage.local,)), ("read", ())):
         rows |= {
             (f"Logs.{name}", "InvalidArgument"): P(_of("logs", name, -1, *after)),
             (f"Logs.{name}", "FileError"): P(_of("logs", name, 77, *after), grounded),
-            (f"Logs.{name}", "FileTimeout"): P(
-                _of("logs", name, 1, *after, **PATIENCE), grounded, falls_silent
-            ),
+            (f"Logs.{name}", "FileTimeout"): P(_of("logs", name, 1, *after, **PATIENCE), grounded, falls_silent),
         }
     return rows
 

@@ -1,4 +1,4 @@
-"""What a program may call, read from the library itself, so that what is added later is found."""
+"""The public calls, read from the library itself, so that new ones are found."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from aerokit.connection.bus import Subscription
 from aerokit.connection.cells import Changes, StateCell
 from aerokit.connection.connection import Connection
 from aerokit.vehicle.camera.cameras import Camera
-from aerokit.vehicle.camera.part import CameraBlock
-from aerokit.vehicle.camera.shooting import PhotoInterval
+from aerokit.vehicle.camera.link import CameraBlock
+from aerokit.vehicle.camera.photos import PhotoInterval
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.posted import PostedOrder
 from aerokit.vehicle.components.component import Component
@@ -26,7 +26,7 @@ from aerokit.vehicle.gimbal.rates import GimbalRates
 from aerokit.vehicle.missions.mission import MissionControl
 from aerokit.vehicle.missions.plans import FenceControl, RallyControl
 from aerokit.vehicle.parameters.parameters import Parameters
-from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
+from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
 
 __all__ = ["CLASSES", "FUNCTIONS", "Member", "awaited", "members", "own_classes_in"]
 
@@ -44,7 +44,7 @@ CLASSES: tuple[type, ...] = (
     PhotoInterval,
     PostedOrder,
     Parameters,
-    Temporarily,
+    TemporaryParameters,
     Transaction,
     Settings,
     MissionControl,
@@ -61,7 +61,7 @@ CLASSES: tuple[type, ...] = (
 FUNCTIONS: tuple[Callable[..., Any], ...] = (aerokit.connect, aerokit.open_connection)
 
 ENTERED = ("__aenter__", "__anext__")
-"""Who has one of these awaits something without being a coroutine."""
+"""A member of one of these classes is awaited although it is not a coroutine function."""
 
 
 class Member(NamedTuple):
@@ -73,7 +73,7 @@ class Member(NamedTuple):
 
     @property
     def qualified(self) -> str:
-        """As programs know it: of the class that they have, not of that which defines it."""
+        """The qualified name by the class that programs use, not by the defining class."""
         return self.name if self.owner is None else f"{self.owner.__name__}.{self.name}"
 
     @property
@@ -107,7 +107,7 @@ def members() -> Iterator[Member]:
 
 
 def awaited() -> dict[str, Member]:
-    """What a program awaits, enters or iterates, by its qualified name."""
+    """Return everything that a program awaits, enters or iterates, by qualified name."""
     return {each.qualified: each for each in members() if each.is_awaited}
 
 

@@ -1,4 +1,4 @@
-"""What a call could leave behind: tasks, timers, sinks, waiters, locks, rates, open files."""
+"""Things that a call could leave behind: tasks, timers, sinks, waiters, locks, rates, open files."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from call_stage import Stage
 from flight_harness import make_parts
 
 from aerokit.connection import loop_watch
-from aerokit.vehicle.session.commands import UNDER_WAY_S
+from aerokit.vehicle.session.commands import PENDING_ACK_TIMEOUT_S
 
 __all__ = ["SETTLED_S", "look", "what_is_left"]
 
 SETTLED_S = 20.0
-"""An order to arm that was given up is watched for 15 s, and answered then."""
-LOOK_S = 0.25
+"""An abandoned arm command is monitored for 15 s, and acknowledged then."""
+POLL_INTERVAL_S = 0.25
 
 
 def look(stage: Stage) -> Counter[str]:
-    """What is there now, by name."""
+    """Return the present counts by name."""
     return Counter(_all(stage))
 
 
 async def what_is_left(stage: Stage, before: Counter[str]) -> Counter[str]:
-    """What is more than before, and stays; waits until nothing is, or the dust has settled."""
+    """Return what remains in addition to ``before``, after waiting for it to go or settle."""
     waited = 0.0
     while (left := look(stage) - before) and waited < SETTLED_S:
-        await anyio.sleep(LOOK_S)
-        waited += LOOK_S
+        await anyio.sleep(POLL_INTERVAL_S)
+        waited += POLL_INTERVAL_S
     return left
 
 
@@ -41,38 +41,36 @@ def _all(stage: Stage) -> Iterator[str]:
     make_parts(vehicle)
     yield from _tasks()
     yield from _timers()
-    talks = [vehicle._talk, *(each._talk for each in vehicle._components._made.values())]
-    streams = [stream for talk in talks for stream in talk.rates._streams.values()]
+    talks = [vehicle._session, *(each._session for each in vehicle._components._by_id.values())]
+    streams = [stream for session in talks for stream in session.rates._streams.values()]
     counters = [stream.on_frame for stream in streams]  # they stay, one for each stream
     for key, sinks in connection.bus._sinks.items():
         yield from _times(f"sink of message {key}", [sink for _, sink in sinks if sink not in counters])
-    yield from (
-        f"sink of {key.__name__}" for key, sinks in connection.bus._event_sinks.items() for _ in sinks
-    )
-    yield from _times("end of the connection", connection._ending._enders)
-    yield from _times("deadline", connection.deadlines._due)
+    yield from (f"sink of {key.__name__}" for key, sinks in connection.bus._event_sinks.items() for _ in sinks)
+    yield from _times("end of the connection", connection._end_signal._callbacks)
+    yield from _times("deadline", connection.deadlines._deadlines)
     for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality):
         yield from _times(f"waiter on {cell.name}", cell._sinks)
     for stream in streams:
-        yield from _times(f"wish for {stream.message_type.NAME}", stream.wishes)
+        yield from _times(f"wish for {stream.message_type.NAME}", stream.requests)
     yield from _times(
-        "answer under way", [key for key in vehicle._talk.commands._under_way if _is_awaited(vehicle, key)]
+        "answer under way", [key for key in vehicle._session.commands._under_way if _is_awaited(vehicle, key)]
     )
-    yield from _times("command that waits", vehicle._talk.commands._runs)
+    yield from _times("command that waits", vehicle._session.commands._runs)
     yield from _times("order", vehicle._arbiter._orders[1:])
     yield from _times("sending", vehicle._arbiter._sent)
-    yield from _times("held parameter", vehicle.parameters._holds._blocks)
+    yield from _times("held parameter", vehicle.parameters._registry._blocks)
     closing = vehicle.files._channel._closing.values()
     yield from _times("file that is being closed", [each for each in closing if not each.ended.is_set()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
-    yield from _times("set-point stream", range(vehicle._holding.end_stream is not None))
+    yield from _times("set-point stream", range(vehicle._flight_cleanup.stop_stream is not None))
     yield from (f"lock {name}" for name, lock in _locks("vehicle", vehicle, set()) if lock.locked())
 
 
 def _is_awaited(vehicle: Any, key: tuple[int, int]) -> bool:
-    oldest = vehicle.connection.now() - UNDER_WAY_S
-    expected = vehicle._talk.commands._under_way.get((vehicle.component_id, key[1]), ())
+    oldest = vehicle.connection.now() - PENDING_ACK_TIMEOUT_S
+    expected = vehicle._session.commands._under_way.get((vehicle.component_id, key[1]), ())
     return any(at >= oldest for at in expected)
 
 
@@ -89,14 +87,13 @@ def _tasks() -> Iterator[str]:
 
 
 def _timers() -> Iterator[str]:
-    """Those of sleeping tasks and of the simulator come and go; the tasks are counted. The loop's own watch is always
-    under way, and in the list of timers but for the turn in which it is due."""
+    """Count timers, except those of sleeping tasks and of the simulator, which come and go. The loop's own watch is
+    always active, and in the list of timers except in the iteration in which it is due.
+    """
     loop: Any = asyncio.get_running_loop()
     for timer in loop._scheduled:
         module = getattr(timer._callback, "__module__", "")
-        is_ours = (
-            module.startswith(("aerokit.vehicle", "aerokit.connection")) and module != loop_watch.__name__
-        )
+        is_ours = module.startswith(("aerokit.vehicle", "aerokit.connection")) and module != loop_watch.__name__
         if is_ours and not timer.cancelled():
             yield f"timer {timer._callback.__qualname__}"
 

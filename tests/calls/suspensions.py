@@ -12,17 +12,15 @@ import anyio
 __all__ = ["Cancelled", "Counted", "Point", "cancel_at", "points_of"]
 
 IN_THE_MIDDLE_S = 0.02
-"""Waits that are longer are cut off in their middle, too: what comes from the vehicle meanwhile wakes nobody."""
-LONGEST_S = 900.0
+"""Longer waits are cancelled in their middle as well, because messages of the vehicle wake no task."""
+MAX_WAIT_S = 900.0
 Cancel = Callable[[], object]
 
 
 class Counted:
-    """Awaits a coroutine, and notes how long each of its suspensions was; ``on_suspension`` is told of each."""
+    """Awaits a coroutine and records the duration of each suspension; ``on_suspension`` is called for each."""
 
-    def __init__(
-        self, work: Awaitable[object], on_suspension: Callable[[int], object] = lambda count: None
-    ) -> None:
+    def __init__(self, work: Awaitable[object], on_suspension: Callable[[int], object] = lambda count: None) -> None:
         self._work, self._on_suspension = work, on_suspension
         self.waits: list[float] = []
 
@@ -56,7 +54,7 @@ def _throw(step: Generator[Any, Any, object], error: BaseException) -> Callable[
 
 @dataclass(frozen=True)
 class Point:
-    """When to cancel: ``after_s`` seconds into the k-th suspension; ``how``: ``"task"`` or ``"scope"``."""
+    """A point of cancellation: ``after_s`` seconds into the k-th suspension; ``how`` is ``"task"`` or ``"scope"``."""
 
     suspension: int
     after_s: float = 0.0
@@ -64,9 +62,10 @@ class Point:
 
 
 def points_of(waits: list[float], most: int | None) -> list[Point]:
-    """Where a call with these suspensions is to be cancelled: both ways in turn.
+    """Return the points at which to cancel a call with these suspensions, in both ways alternately.
 
-    Each of the first dozen, then ever fewer, and the middle of long ones; ``most``: so many of them, evenly spread.
+    Each of the first dozen, then increasingly fewer, and the middle of long ones; ``most`` limits them, evenly
+    spread.
     """
     found: list[tuple[int, float]] = []
     suspension, stride = 1, 1
@@ -83,10 +82,10 @@ def points_of(waits: list[float], most: int | None) -> list[Point]:
 
 @dataclass
 class Cancelled:
-    """What came of a call that was cancelled."""
+    """Result of a cancelled call."""
 
     at: float | None = None
-    """When it was, None: it had ended before."""
+    """Time of the cancellation, None if the call had ended before."""
     ended_at: float = 0.0
     error: BaseException | None = None
     was_scope_caught: bool = False
@@ -121,8 +120,8 @@ async def cancel_at(work: Awaitable[object], point: Point | None) -> Cancelled:
 
     counted = outcome.counted = Counted(work, suspended)
     task = loop.create_task(run(), name="the call")
-    _, endless = await asyncio.wait([task], timeout=LONGEST_S)
-    assert not endless, f"it does not end within {LONGEST_S:g} s: {point}"
+    _, endless = await asyncio.wait([task], timeout=MAX_WAIT_S)
+    assert not endless, f"it does not end within {MAX_WAIT_S:g} s: {point}"
     outcome.ended_at = loop.time()
     if not task.cancelled():
         outcome.error = task.exception()

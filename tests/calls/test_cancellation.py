@@ -23,23 +23,20 @@ from suspensions import Cancelled, Point, cancel_at, points_of
 from aerokit.testing import run_virtual
 
 POINTS = int(os.environ.get("AEROKIT_CANCEL_POINTS", "4"))
-"""At so many awaits of each call; 0: at all. The default run has one, and few of them on PX4."""
+"""Number of awaits per call at which to cancel; 0: all. The default run has one, and few on PX4."""
 ENDS_S = 2.0
 BY_DEFAULT = {
-    *(
-        (owner, "ardupilot")
-        for owner in ("Vehicle", "Parameters", "MissionControl", "StateCell", "functions")
-    ),
+    *((owner, "ardupilot") for owner in ("Vehicle", "Parameters", "MissionControl", "StateCell", "functions")),
     *((owner, "px4") for owner in ("Guided", "Camera")),
 }
 
 
-def test_each_public_coroutine_is_in_the_table() -> None:
+def test_public_coroutines_are_all_in_table() -> None:
     assert [name for name in awaited() if name not in CALLS] == []
     assert [name for name in CALLS if name not in awaited()] == []
 
 
-def test_each_part_of_a_vehicle_is_looked_at(tmp_path: Path) -> None:
+def test_public_classes_are_all_covered(tmp_path: Path) -> None:
     async def look_for_them() -> None:
         async with open_stage("ardupilot", tmp_path) as stage:
             assert [each for each in own_classes_in(stage.vehicle) if each not in CLASSES] == []
@@ -88,7 +85,7 @@ async def faults_of(stage: Stage, name: str, autopilot: str, points: int) -> Asy
 
 
 async def run(stage: Stage, name: str, point: Point | None) -> Cancelled:
-    """From its place, and with everything back in order behind it."""
+    """Run it from its starting state, and restore everything afterwards."""
     call = CALLS[name]
     await call.place(stage)
     call.before(stage)
@@ -122,7 +119,7 @@ def fault_of(outcome: Cancelled, point: Point) -> str:
         return "" if outcome.error is None else f"ended with {outcome.error!r}"
     if outcome.ended_at - outcome.at > ENDS_S:
         return f"ended {outcome.ended_at - outcome.at:.1f} s after it was cancelled"
-    if point.how == "scope":  # a shielded end that comes at once is not cancelled any more
+    if point.how == "scope":  # A shielded cleanup that completes at once is not cancelled.
         return "" if outcome.error is None else f"ended with {outcome.error!r}"
     ended = isinstance(outcome.error, asyncio.CancelledError)
     return "" if ended else f"swallowed the cancellation: {outcome.error!r}"

@@ -27,7 +27,7 @@ from aerokit.testing import run_virtual
 
 PROVOCATIONS = provocations() | FLIGHT | GIMBALS | TRANSFERS | SETTINGS | CAMERA | COMPONENTS
 PROMISED = documented()
-LONGEST_S = 200.0
+MAX_WAIT_S = 200.0
 BY_DEFAULT = ("Vehicle", "Guided", "Parameters", "MissionControl", "Files", "Gimbal")
 
 
@@ -51,13 +51,13 @@ def rows() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("pairs", list(rows()))
-def test_it_is_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
+def test_loop_watch_error_is_raised(pairs: list[tuple[str, str]], tmp_path: Path) -> None:
     faults = run_virtual(faults_of(pairs, tmp_path))
     assert not faults, "\n".join(faults)
 
 
 async def faults_of(pairs: list[tuple[str, str]], folder: Path) -> list[str]:
-    """What is wrong with these; those of one autopilot share a flight."""
+    """Return the errors that were not provoked; calls on one autopilot share a flight."""
     found = []
     for on in ("ardupilot", "px4"):
         together = [each for each in pairs if PROVOCATIONS[each].on == on and not PROVOCATIONS[each].alone]
@@ -76,7 +76,7 @@ async def fault_of(stage: Stage, name: str, error: str) -> list[str]:
     try:
         await row.place(stage)
         row.before(stage)
-        with anyio.fail_after(LONGEST_S):
+        with anyio.fail_after(MAX_WAIT_S):
             await row.do(stage)
     except Exception as raised:
         return [] if is_it(raised, name, error) else [f"raised {type(raised).__name__}: {raised}"]
@@ -91,19 +91,17 @@ async def fault_of(stage: Stage, name: str, error: str) -> list[str]:
 
 
 async def settle(stage: Stage) -> None:
-    """The vehicle is heard again, what was left to be confirmed is, and it stands."""
+    """Wait until the vehicle is received again, pending confirmations have arrived, and it stands."""
     await anyio.sleep(4.0)
     await stage.vehicle.home.wait_until(lambda _: True, timeout=30)
-    stage.vehicle._late_arming.stop()
+    stage.vehicle._arm_cleanup.stop()
 
 
 def is_it(raised: Exception, name: str, error: str) -> bool:
     """This error, or a special case of it that is not promised by itself."""
     known = {cls.__name__ for cls in type(raised).__mro__} & NAMES
     return error in known and not any(
-        (name, each) in PROMISED
-        and each != error
-        and issubclass(getattr(errors, each, OSError), _class(error))
+        (name, each) in PROMISED and each != error and issubclass(getattr(errors, each, OSError), _class(error))
         for each in known
     )
 

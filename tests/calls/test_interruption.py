@@ -34,19 +34,19 @@ REBOOTING_S = 2.0
 ENDURING_MAH = 1e6
 """It flies by the clock of the wall, twenty times as fast, until this machine is through with all calls."""
 PATIENCE_S = 200.0
-"""For what is left to go: an order to arm is watched, and answered."""
+"""Seconds for pending work: an abandoned arm command is monitored, and acknowledged."""
 
 
 @dataclass
 class BlockingStage(Stage):
-    """With the twin's vehicle."""
+    """A stage with the blocking vehicle."""
 
     address: str = ""
 
 
 @pytest.fixture(scope="module")
 def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingStage, Stage]]:
-    """For the twin's calls, and for what is done on its loop."""
+    """Stages for the blocking calls, and for the work on their loop."""
     copter = SimulatedCopter(
         boot_time_s=0.0,
         logs=LOGS,
@@ -60,9 +60,7 @@ def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingS
         aerokit.sync.connect(address, reconnect=True) as vehicle,
     ):
         vehicle.wait_ready()
-        blocking = BlockingStage(
-            copter, cast(Any, vehicle), cast(Any, None), folder, cameras[0], address=address
-        )
+        blocking = BlockingStage(copter, cast(Any, vehicle), cast(Any, None), folder, cameras[0], address=address)
         blocking.put(blocking.file)
         vehicle.message(messages.ScaledPressure)  # for as long as the vehicle lives
         vehicle.camera.wait_found()
@@ -72,7 +70,7 @@ def stages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BlockingS
         yield blocking, Stage(copter, vehicle.aio, cast(Any, None), folder, cameras[0])
 
 
-def test_each_call_of_the_twin_is_in_the_table() -> None:
+def test_blocking_calls_are_all_in_table() -> None:
     calls = blocking_calls()
     assert [name for name in blocking_names() if name not in calls] == []
     assert [name for name in calls if name not in set(blocking_names())] == []
@@ -99,7 +97,7 @@ def test_interrupted(name: str, stages: tuple[BlockingStage, Stage], monkeypatch
         was_interrupted = interrupter.interrupted(attempt, at)
         assert was_interrupted or at != AT_ITS_END
         call.after(stage)
-        if name == "Vehicle.reboot":  # given up, it may be carried out just now
+        if name == "Vehicle.reboot":  # Abandoned, it may be executing at this moment.
             loop.run(anyio.sleep, REBOOTING_S)
         assert (_left(loop, stage, before), at) == (Counter(), at)
         loop.run(stage.answers)

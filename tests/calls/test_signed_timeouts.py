@@ -1,4 +1,4 @@
-"""A vehicle that signs, met without a key: every public call that runs out of time says so in its first line."""
+"""A signing vehicle, connected to without a key: every public call that times out says so in its first line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from aerokit.testing import run_virtual
 
 KEY = SigningKey.from_passphrase("another one's")
 HEARTBEAT_S = 1.5
-LONGEST_S = 400.0
+MAX_WAIT_S = 400.0
 WHY = "frames are signed and no key was given"
 
 
@@ -35,7 +35,7 @@ WHY = "frames are signed and no key was given"
         7,
     ),
 )
-def test_timeout_of_a_vehicle_that_signs_says_so(names: list[str], autopilot: str, tmp_path: Path) -> None:
+def test_timeout_with_rejected_signatures_says_so(names: list[str], autopilot: str, tmp_path: Path) -> None:
     async def all_of_them() -> dict[str, str]:
         texts: dict[str, str] = {}
         async with open_stage(autopilot, tmp_path) as stage:
@@ -50,7 +50,7 @@ def test_timeout_of_a_vehicle_that_signs_says_so(names: list[str], autopilot: st
 
 
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
-def test_timeout_of_each_cell_of_a_vehicle_that_signs_says_so(autopilot: str, tmp_path: Path) -> None:
+def test_cell_timeout_with_rejected_signatures_says_so(autopilot: str, tmp_path: Path) -> None:
     async def wait_for_each() -> dict[str, str]:
         async with open_stage(autopilot, tmp_path) as stage:
             sign(stage, KEY)
@@ -86,14 +86,14 @@ async def text_of(cell: StateCell[Any]) -> str:
 
 
 async def timeout_of(stage: Stage, name: str) -> str:
-    """What the call's time-out says; empty: it ends otherwise."""
+    """Return the text of the call's time-out; empty if it ends otherwise."""
     call = CALLS[name]
     await call.place(stage)
     call.before(stage)
     sign(stage, KEY)
     await anyio.sleep(HEARTBEAT_S)
     try:
-        with anyio.move_on_after(LONGEST_S):
+        with anyio.move_on_after(MAX_WAIT_S):
             await call.do(stage)
     except OperationTimeout as error:
         return str(error)

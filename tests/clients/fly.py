@@ -1,6 +1,6 @@
-"""Let clients that know nothing of aerokit fly the simulated vehicles, each in a process of its own; print a table.
+"""Flies the simulated vehicles with other client libraries, each in a process of its own; prints a table.
 
-``python fly.py [--speedup 3] [--client pymavlink …] [--kind copter …]``; ends with 1 when one of them failed.
+``python fly.py [--speedup 3] [--client pymavlink …] [--kind copter …]``; exit code 1 if one of them failed.
 """
 
 # ruff: noqa: T201
@@ -22,7 +22,7 @@ from steps import STEPS
 HERE = Path(__file__).parent
 CLIENTS = {"pymavlink": "pymavlink", "mavsdk": "mavsdk", "mavproxy": "MAVProxy"}
 KINDS = ("copter", "px4")
-LONGEST_S = 300
+MAX_DURATION_S = 300
 
 
 def free_port() -> int:
@@ -48,15 +48,13 @@ def play(client: str, kind: str, speedup: float) -> tuple[list[str], str]:
     with served(kind, port, speedup), tempfile.TemporaryDirectory() as folder:
         try:
             done = subprocess.run(
-                command, cwd=folder, timeout=LONGEST_S, check=False, text=True, stdin=subprocess.DEVNULL,
+                command, cwd=folder, timeout=MAX_DURATION_S, check=False, text=True, stdin=subprocess.DEVNULL,
                 capture_output=True,
             )  # fmt: skip
         except subprocess.TimeoutExpired as error:
             output = error.stdout or b""
-            return _steps(output.decode() if isinstance(output, bytes) else output), f"over {LONGEST_S} s"
-    return _steps(done.stdout), "" if done.returncode == 0 else done.stderr[
-        -2000:
-    ] or f"exit {done.returncode}"
+            return _steps(output.decode() if isinstance(output, bytes) else output), f"over {MAX_DURATION_S} s"
+    return _steps(done.stdout), "" if done.returncode == 0 else done.stderr[-2000:] or f"exit {done.returncode}"
 
 
 def _steps(output: str) -> list[str]:
@@ -83,9 +81,7 @@ def main() -> int:
             print(f"{name}\t{kind}\t{'passed' if is_good else 'FAILED'}\t{took:.0f} s\t{words}", flush=True)
             if not is_good:
                 print(error or "not every step was done", flush=True)
-    print(
-        f"{len(arguments.client or CLIENTS) * len(arguments.kind or KINDS) - failed} passed, {failed} failed"
-    )
+    print(f"{len(arguments.client or CLIENTS) * len(arguments.kind or KINDS) - failed} passed, {failed} failed")
     return 1 if failed else 0
 
 

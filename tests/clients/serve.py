@@ -6,7 +6,7 @@ import argparse
 import asyncio
 
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, open_simulator
-from aerokit.sim.kinds import wait_longer
+from aerokit.sim.kinds import scale_timeouts
 
 VEHICLES: dict[str, type[SimulatedCopter] | type[SimulatedPx4]] = {
     "copter": SimulatedCopter,
@@ -15,7 +15,7 @@ VEHICLES: dict[str, type[SimulatedCopter] | type[SimulatedPx4]] = {
 
 
 async def serve(vehicle: SimulatedVehicle, port: int, speedup: float) -> None:
-    wait_longer([vehicle], speedup)
+    scale_timeouts([vehicle], speedup)
     async with open_simulator(vehicle, f"udpout:127.0.0.1:{port}", speedup=speedup):
         await asyncio.Event().wait()
 

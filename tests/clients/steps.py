@@ -1,7 +1,7 @@
-"""What the clients share: the flight they fly, and how they tell what they did. Nothing of aerokit.
+"""Shared code of the clients: the flight, and the report of its steps. Uses nothing of aerokit.
 
-A client is started as ``python with_….py KIND PORT`` and listens on the UDP port. It prints a line for each step
-that is done and ends with 0 when all are.
+A client is started as ``python with_….py KIND PORT`` and listens on the UDP port. It prints a line for each completed
+step and ends with 0 when all are done.
 """
 
 # ruff: noqa: T201
@@ -16,8 +16,8 @@ __all__ = ["STEPS", "Item", "Steps", "mission", "wait_for"]
 
 STEPS = ("connect", "parameters", "upload", "download", "arm", "take off", "fly", "land")
 HOMES = {"copter": (-35.3632610, 149.1652299), "px4": (47.397742, 8.545594)}
+# Minimum number of parameters.
 PARAMETERS = {"copter": 1300, "px4": 850}
-"""At least so many are to arrive."""
 ALTITUDE_M = 10.0
 GLOBAL, GLOBAL_RELATIVE = 0, 3
 WAYPOINT, RETURN, TAKEOFF = 16, 20, 22
@@ -46,7 +46,7 @@ def mission(kind: str) -> list[Item]:
 
 
 class Steps:
-    """Tells on standard output what was done and how long it took."""
+    """Prints completed steps and their durations."""
 
     def __init__(self) -> None:
         self._began = time.monotonic()

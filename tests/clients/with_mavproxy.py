@@ -1,4 +1,4 @@
-"""MAVProxy flies the vehicle by the commands that its users type; what it prints tells how far it is."""
+"""Flies the vehicle with MAVProxy by the commands that its users type; its output shows the progress."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PX4_MISSION, PX4_LAND = "long DO_SET_MODE 1 4 4", "long DO_SET_MODE 1 4 6"
 
 
 class Console:
-    """MAVProxy in a process: what is typed and what it prints."""
+    """MAVProxy in a process: typed commands and printed output."""
 
     def __init__(self, port: int) -> None:
         command = [
@@ -42,7 +42,7 @@ class Console:
             self.text += text
 
     def type(self, line: str) -> None:
-        """What is printed before is not looked at any more."""
+        """Type a line; earlier output is ignored from then on."""
         assert self._process.stdin is not None
         self._seen = len(self.text)
         self._process.stdin.write(line + "\n")
@@ -50,19 +50,17 @@ class Console:
 
     @property
     def answer(self) -> str:
-        """What was printed since the last line was typed."""
+        """Return the output since the last line was typed."""
         return self.text[self._seen :]
 
     def wait(self, pattern: str, timeout: float = 60.0) -> re.Match[str]:
-        wait_for(
-            lambda: re.search(pattern, self.answer) is not None, f"{pattern} in {self.text[-1500:]}", timeout
-        )
+        wait_for(lambda: re.search(pattern, self.answer) is not None, f"{pattern} in {self.text[-1500:]}", timeout)
         found = re.search(pattern, self.answer)
         assert found is not None
         return found
 
     def look(self, pattern: str, timeout: float) -> re.Match[str] | None:
-        """What is printed until then."""
+        """Return the output until then."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             if found := re.search(pattern, self.answer):
@@ -89,7 +87,7 @@ class Console:
 
 
 def write_mission(kind: str, path: Path) -> int:
-    """As a file of waypoints; its first line is home for both autopilots, and is not sent to PX4 by itself."""
+    """Write a waypoint file; its first line is home for both autopilots, and is not sent to PX4 as an item."""
     lines = ["QGC WPL 110"]
     items = mission(kind)
     for number, item in enumerate(items):
@@ -120,7 +118,7 @@ def fly(kind: str, console: Console) -> None:
     steps.done("arm")
     if kind == "copter":
         console.insist(f"takeoff {ALTITUDE_M}", r"TAKEOFF: ACCEPTED")
-    else:  # MAVProxy sends no place with its take-off, which PX4 wants
+    else:  # MAVProxy's take-off has no position, which PX4 requires.
         console.insist(PX4_MISSION, r"Mode MISSION|MISSION>")
     console.type("watch GLOBAL_POSITION_INT")
     wait_for(lambda: console.altitude_m() > ALTITUDE_M - 1, f"altitude: {console.text[-1000:]}")

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 async def insist(action: Callable[[], Awaitable[T]]) -> T:
-    """Until the vehicle is ready for it."""
+    """Repeat until the vehicle is ready for it."""
     refusal: MavsdkError | None = None
     for _ in range(60):
         try:
@@ -59,7 +59,7 @@ async def fly(kind: str, port: int) -> None:
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     await mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
     system = None
-    while system is None:  # until LONGEST_S of fly.py
+    while system is None:  # until MAX_DURATION_S of fly.py
         system = await mavsdk.first_autopilot(timeout_s=30.0)
     steps.done("connect")
     param, raw = ParamAsync(system), MissionRawAsync(system)
@@ -79,18 +79,14 @@ async def fly(kind: str, port: int) -> None:
     steps.done("download", len(back))
 
     await telemetry.set_rate_position(5.0)  # ArduPilot streams no position unasked, and MAVSDK does not ask
-    if (
-        kind == "px4"
-    ):  # of ArduPilot, real or not, MAVSDK learns no more of its health than that home is known
+    if kind == "px4":  # With ArduPilot, real or simulated, MAVSDK's health contains no more than a known home.
         await until(telemetry.subscribe_health_all_ok(), bool)
     await insist(lambda: action.set_takeoff_altitude(ALTITUDE_M))
     await insist(action.arm)
     await until(telemetry.subscribe_armed(), bool)
     steps.done("arm")
     await insist(action.takeoff)
-    there = await until(
-        telemetry.subscribe_position(), lambda each: each.relative_altitude_m > ALTITUDE_M - 1
-    )
+    there = await until(telemetry.subscribe_position(), lambda each: each.relative_altitude_m > ALTITUDE_M - 1)
     steps.done("take off", f"{there.relative_altitude_m:.1f} m")
     await insist(raw.start_mission)
     await until(telemetry.subscribe_position(), near_the_end(kind))
@@ -101,7 +97,7 @@ async def fly(kind: str, port: int) -> None:
 
 
 def near_the_end(kind: str) -> Callable[[Any], bool]:
-    """Whether a position is within some 3 m of the last waypoint."""
+    """Return True if a position is within about 3 m of the last waypoint."""
     last = mission(kind)[-1]
     return lambda here: (
         abs(here.latitude_deg - last.latitude) < 3e-5 and abs(here.longitude_deg - last.longitude) < 3e-5

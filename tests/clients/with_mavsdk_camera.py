@@ -25,7 +25,7 @@ from aerokit.errors import AerokitError, OperationTimeout
 from aerokit.sim import SimulatedCamera, SimulatedCopter, open_simulator
 
 SYSTEM, CAMERA = 1, 100
-LONGEST_S = 60.0
+MAX_DURATION_S = 60.0
 
 
 def free_port() -> int:
@@ -45,7 +45,7 @@ async def first(values: AsyncIterator[Any], condition: Callable[[Any], bool] = l
 
 
 async def step(name: str, work: Awaitable[object]) -> bool:
-    """Say what came of one step; the next ones are tried in any case."""
+    """Report the result of one step; the next ones run in any case."""
     try:
         result = await asyncio.wait_for(work, 20.0)
     except Exception as error:  # of either library
@@ -113,7 +113,9 @@ async def their_client() -> list[bool]:
             await plugin.track_stop(CAMERA)
 
         async def storage() -> str:
-            """Not format_storage: MAVSDK 4.1 takes IN_PROGRESS for a refusal, and aborts the program at the result."""
+            """Without format_storage: MAVSDK 4.1 takes IN_PROGRESS for a refusal, and aborts the program at the
+            result.
+            """
             told = await plugin.get_storage(CAMERA)
             await plugin.reset_settings(CAMERA)
             return f"{told.total_storage_mib:.0f} MiB"
@@ -148,9 +150,7 @@ class TheirCamera:
     async def set_up(self) -> None:
         flags = {"image_in_video_mode_supported": True, "video_in_image_mode_supported": True}
         await self.plugin.set_information(
-            of_server.Information(
-                "MAVSDK", "Server", "1.2.3", 3.0, 3.7, 2.8, 640, 480, 0, 0, "", *flags.values()
-            )
+            of_server.Information("MAVSDK", "Server", "1.2.3", 3.0, 3.7, 2.8, 640, 480, 0, 0, "", *flags.values())
         )
         await self.plugin.set_video_streaming(of_server.VideoStreaming(True, "rtsp://127.0.0.1:8554/b"))
         await self.plugin.set_in_progress(False)
@@ -260,7 +260,7 @@ async def our_client() -> list[bool]:
             return f"{camera.status.value.available_mib} MiB"
 
         async def mode() -> str:
-            """Their server accepts it, hands it to its program, and tells "photo" for ever."""
+            """MAVSDK's server accepts the mode, passes it to its program, and keeps reporting "photo"."""
             try:
                 await camera.set_mode("video", timeout=2.0)
             except OperationTimeout as error:
@@ -275,9 +275,7 @@ async def our_client() -> list[bool]:
             await camera.focus_to(20.0)
             await camera.auto_focus()
             names = [name for name, _ in theirs.heard]
-            assert {"zoom_range", "zoom_in_start", "zoom_stop", "focus_range", "focus_auto"} <= set(names), (
-                names
-            )
+            assert {"zoom_range", "zoom_in_start", "zoom_stop", "focus_range", "focus_auto"} <= set(names), names
 
         async def tracking() -> None:
             await camera.track_point(0.25, 0.5, radius=0.1)

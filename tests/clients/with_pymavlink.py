@@ -63,7 +63,7 @@ class Client:
 
 
 def all_parameters(client: Client) -> int:
-    """PARAM_REQUEST_LIST, and PARAM_REQUEST_READ for what is missing."""
+    """Download by PARAM_REQUEST_LIST, and PARAM_REQUEST_READ for missing ones."""
     client.link.mav.param_request_list_send(client.link.target_system, 1)
     got: dict[int, float] = {}
     count = 1
@@ -98,9 +98,7 @@ def download(client: Client) -> int:
     assert count == len(items), count
     for number in range(count):
         link.mav.mission_request_int_send(link.target_system, 1, number, M.MAV_MISSION_TYPE_MISSION)
-        got = client.wait(
-            "MISSION_ITEM_INT", until=lambda each, number=number: each.seq == number, timeout=10
-        )
+        got = client.wait("MISSION_ITEM_INT", until=lambda each, number=number: each.seq == number, timeout=10)
         assert got.command == items[number].command, got
         if number:
             assert abs(got.x - items[number].latitude * 1e7) <= 1, got
@@ -115,9 +113,7 @@ def take_off(client: Client) -> None:
         return
     here = client.wait("GLOBAL_POSITION_INT")
     nan = float("nan")
-    client.insist(
-        M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M
-    )
+    client.insist(M.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, here.lat / 1e7, here.lon / 1e7, here.alt / 1000 + ALTITUDE_M)
 
 
 def fly(client: Client) -> None:

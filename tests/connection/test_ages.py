@@ -18,7 +18,7 @@ from aerokit import LinkState, open_connection
 from aerokit import messages as m
 from aerokit.connection.cells import StateCell
 from aerokit.connection.connection import Connection
-from aerokit.connection.loop_watch import QUIET_TURNS, LoopWatch, asleep_s
+from aerokit.connection.loop_watch import IDLE_ITERATIONS, LoopWatch, suspended_s
 from aerokit.errors import LinkLost, StaleValueError
 from aerokit.events import ComputerSlept, VehicleRebooted, VehicleSilent
 from aerokit.mavlink.encoder import FrameEncoder
@@ -61,7 +61,7 @@ async def ages_of(connection: Connection, wire: Wire, hear: int = 1) -> list[flo
     return ages
 
 
-async def test_what_is_read_after_a_pause_is_as_old_as_the_pause() -> None:
+async def test_arrival_after_pause_is_start_of_pause() -> None:
     wire = Wire()
     async with open_connection(wire) as connection:
         await anyio.sleep(5.03)
@@ -70,7 +70,7 @@ async def test_what_is_read_after_a_pause_is_as_old_as_the_pause() -> None:
         assert await ages_of(connection, wire, hear=50) == pytest.approx([3.73] * 50, abs=0.11)
 
 
-async def test_as_old_until_all_that_waited_has_been_read() -> None:
+async def test_arrival_stays_old_until_waiting_data_is_read() -> None:
     """The timer that notices the pause may come before the sockets have been read."""
     wire = Wire()
     async with open_connection(wire) as connection:
@@ -78,7 +78,7 @@ async def test_as_old_until_all_that_waited_has_been_read() -> None:
         block_loop(3.7)
         await anyio.lowlevel.checkpoint()
         assert all(age > 3.5 for age in await ages_of(connection, wire, hear=50))
-        for _ in range(QUIET_TURNS + 2):
+        for _ in range(IDLE_ITERATIONS + 2):
             await anyio.lowlevel.checkpoint()
         for later_s in (0, 0.05, 1):
             await anyio.sleep(later_s)
@@ -86,7 +86,7 @@ async def test_as_old_until_all_that_waited_has_been_read() -> None:
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
-async def test_as_old_however_long_reading_takes(scheme: str) -> None:
+async def test_arrival_stays_old_while_reading_takes_long(scheme: str) -> None:
     """On virtual time; the sockets are real, and hold more than is read in one turn."""
     encoder, ages = FrameEncoder(1, 1), list[float]()
     kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
@@ -109,7 +109,7 @@ async def test_as_old_however_long_reading_takes(scheme: str) -> None:
     assert min(ages) > 3.6
 
 
-async def test_a_short_pause_is_the_error_of_all_ages() -> None:
+async def test_short_pause_bounds_the_error_of_ages() -> None:
     wire = Wire()
     async with open_connection(wire) as connection:
         await anyio.sleep(1)
@@ -118,7 +118,7 @@ async def test_a_short_pause_is_the_error_of_all_ages() -> None:
         assert age <= 0.3
 
 
-async def test_a_value_from_before_the_pause_is_not_fresh(grounded: Flight) -> None:
+async def test_value_from_before_pause_is_not_fresh(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     cell = vehicle.message(m.Attitude)
     await anyio.sleep(1)
@@ -136,23 +136,23 @@ async def test_a_value_from_before_the_pause_is_not_fresh(grounded: Flight) -> N
     assert vehicle.heartbeat_age < 1.2
 
 
-async def test_a_pause_is_neither_silence_nor_a_reboot_nor_a_long_way(grounded: Flight) -> None:
+async def test_pause_causes_no_silence_reboot_or_distance(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     await anyio.sleep(3)
     round_trip = vehicle.link_quality.value.round_trip_s
     assert round_trip is not None
     assert round_trip < 0.1
     with vehicle.subscribe(VehicleSilent, VehicleRebooted, capacity=5) as events:
-        vehicle._talk.link_watch.ask()
+        vehicle._session.link_watch.request_time()
         block_loop(10)
         await anyio.sleep(0.3)
-        assert vehicle._talk.link_watch.round_trip_s == pytest.approx(round_trip, abs=0.05)
+        assert vehicle._session.link_watch.round_trip_s == pytest.approx(round_trip, abs=0.05)
         assert vehicle.link_state.value is LinkState.CONNECTED
         await anyio.sleep(5)
         assert events.get_nowait() is None
 
 
-async def test_nothing_is_watched_after_the_end() -> None:
+async def test_closed_watch_reports_nothing() -> None:
     wire = Wire()
     async with open_connection(wire) as connection:
         connection.link_lost(LinkLost("unplugged"))
@@ -171,7 +171,7 @@ def every_cell(vehicle: aerokit.Vehicle) -> list[StateCell[Any]]:
     return [each for each in cells if each.name not in OURS and each._closed_by is None]
 
 
-async def test_every_cell_after_a_pause_is_as_old_as_its_message(grounded: Flight) -> None:
+async def test_cells_after_pause_are_as_old_as_their_message(grounded: Flight) -> None:
     """Each message that any cell comes from has waited in the socket while the loop was blocked."""
     vehicle, wire, dice = grounded.vehicle, grounded.wire, random.Random(7)
     component = vehicle.component(154)
@@ -185,9 +185,7 @@ async def test_every_cell_after_a_pause_is_as_old_as_its_message(grounded: Fligh
     known = {kind: [anything(kind, dice) for _ in range(6)] for kind in kinds if kind is not m.Heartbeat}
     known[m.Heartbeat] = [m.Heartbeat(2, 3, 81, 4, 3, 3), m.Heartbeat(26, 8, 0, 0, 4, 3)]
     known[m.Heartbeat] += [m.Heartbeat(30, 8, 0, 0, 4, 3)]
-    frames = [
-        encoder.encode(message) for messages in known.values() for message in messages for encoder in encoders
-    ]
+    frames = [encoder.encode(message) for messages in known.values() for message in messages for encoder in encoders]
     before = {cell: cell._arrivals for cell in every_cell(vehicle)}
     block_loop(3.7)
     for frame in frames:
@@ -199,14 +197,12 @@ async def test_every_cell_after_a_pause_is_as_old_as_its_message(grounded: Fligh
     assert {"cameras", "components", "mission.current", "gimbal.attitude", "HEARTBEAT"} <= names
 
 
-async def test_values_are_older_after_the_computer_slept(
-    grounded: Flight, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_values_are_older_after_the_computer_slept(grounded: Flight, caplog: pytest.LogCaptureFixture) -> None:
     """The loop's clock stood still meanwhile, and a HEARTBEAT had waited."""
     vehicle, asleep = grounded.vehicle, [0.0]
-    watch = vehicle.connection._intake._loop_watch
-    watch._asleep = lambda: asleep[0]
-    watch._slept_before = 0.0
+    watch = vehicle.connection._receiver._loop_watch
+    watch._suspended = lambda: asleep[0]
+    watch._suspended_before = 0.0
     await anyio.sleep(1.0)
     assert vehicle.armed.age < 1.1
     ages: list[float] = []
@@ -224,13 +220,13 @@ async def test_values_are_older_after_the_computer_slept(
     assert vehicle.armed.age < 1.5
 
 
-def test_time_asleep_is_a_clock_of_the_system() -> None:
-    before = asleep_s()
-    assert asleep_s() - before == pytest.approx(0.0, abs=0.01)
+def test_suspended_time_comes_from_a_system_clock() -> None:
+    before = suspended_s()
+    assert suspended_s() - before == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.anyio
-async def test_process_interrupted_between_two_clocks_has_not_slept() -> None:
+async def test_preemption_between_two_clocks_is_not_sleep() -> None:
     readings, slept = iter([5.0, 4.5, 5.0, 4.5, 5.0, 5.3]), list[float]()
     watch = LoopWatch(lambda _: None, slept.append, lambda: next(readings))
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Tasks beside a block: gone with it, and their mistakes are told."""
+"""Background tasks of a block: they end with it, and their exceptions are reported."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import sys
 import anyio
 import pytest
 
-from aerokit.connection.tasks import Background, to_its_end
+from aerokit.connection.tasks import BackgroundTasks, run_shielded
 
 pytestmark = pytest.mark.anyio
 
 
-async def test_they_run_until_the_end() -> None:
-    background, ticks = Background(lambda error: pytest.fail(repr(error))), list[float]()
+async def test_tasks_run_until_cancelled() -> None:
+    background, ticks = BackgroundTasks(lambda error: pytest.fail(repr(error))), list[float]()
 
     async def tick() -> None:
         while True:
@@ -32,9 +32,9 @@ async def test_they_run_until_the_end() -> None:
     assert len(ticks) == 3
 
 
-async def test_a_mistake_is_told_and_the_others_go_on() -> None:
+async def test_exception_is_reported_and_other_tasks_continue() -> None:
     mistakes: list[Exception] = []
-    background = Background(mistakes.append)
+    background = BackgroundTasks(mistakes.append)
 
     async def fail() -> None:
         raise ZeroDivisionError("ours")
@@ -47,9 +47,9 @@ async def test_a_mistake_is_told_and_the_others_go_on() -> None:
     await background.aclose()
 
 
-async def test_whoever_ends_them_may_be_cancelled_meanwhile() -> None:
+async def test_aclose_survives_cancellation_of_its_caller() -> None:
     """They are gone all the same, and the cancellation is not swallowed."""
-    background, cleaned_up = Background(lambda error: pytest.fail(repr(error))), list[str]()
+    background, cleaned_up = BackgroundTasks(lambda error: pytest.fail(repr(error))), list[str]()
 
     async def slow_to_end() -> None:
         try:
@@ -72,8 +72,8 @@ async def test_whoever_ends_them_may_be_cancelled_meanwhile() -> None:
     assert len(background) == 0
 
 
-async def test_one_of_them_may_end_them_all() -> None:
-    background = Background(lambda error: pytest.fail(repr(error)))
+async def test_task_may_cancel_all_tasks() -> None:
+    background = BackgroundTasks(lambda error: pytest.fail(repr(error)))
 
     async def end_all() -> None:
         background.cancel()
@@ -88,7 +88,7 @@ async def test_one_of_them_may_end_them_all() -> None:
 # ------------------------------------------------------------------------- what must not be cut short
 
 
-async def test_work_goes_to_its_end_however_often_its_caller_is_cancelled() -> None:
+async def test_run_shielded_finishes_despite_repeated_cancellation() -> None:
     done: list[str] = []
 
     async def work() -> None:
@@ -96,7 +96,7 @@ async def test_work_goes_to_its_end_however_often_its_caller_is_cancelled() -> N
             await asyncio.sleep(0)
         done.append("done")
 
-    task = asyncio.get_running_loop().create_task(to_its_end(work()))
+    task = asyncio.get_running_loop().create_task(run_shielded(work()))
     for _ in range(3):
         await asyncio.sleep(0)
         task.cancel()
@@ -105,14 +105,14 @@ async def test_work_goes_to_its_end_however_often_its_caller_is_cancelled() -> N
     assert done == ["done"]
 
 
-async def test_what_such_work_raises_comes_out_and_is_the_cause_of_a_cancellation() -> None:
+async def test_run_shielded_exception_becomes_cause_of_cancellation() -> None:
     async def work() -> None:
         await asyncio.sleep(0)
         raise ValueError("it did not work")
 
     with pytest.raises(ValueError, match="it did not work"):
-        await to_its_end(work())
-    task = asyncio.get_running_loop().create_task(to_its_end(work()))
+        await run_shielded(work())
+    task = asyncio.get_running_loop().create_task(run_shielded(work()))
     await asyncio.sleep(0)
     task.cancel()
     with pytest.raises(asyncio.CancelledError) as cancelled:

@@ -21,13 +21,13 @@ def frame(message: Message, system_id: int = 1) -> Frame:
     return Framer().receive(FrameEncoder(system_id, 1).encode(message))[0]
 
 
-def test_a_frame_nobody_wants_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_without_subscribers_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = Bus()
     monkeypatch.setattr(bus.dialect, "decode", lambda frame: pytest.fail("decoded"), raising=False)
     bus.deliver(frame(HEARTBEAT))
 
 
-def test_a_wanted_frame_is_decoded_once_and_shared() -> None:
+def test_subscribed_frame_is_decoded_once() -> None:
     bus, seen = Bus(), list[Heartbeat]()
     bus.attach(Heartbeat, seen.append)
     bus.attach(Heartbeat, seen.append, system_id=1)
@@ -36,7 +36,7 @@ def test_a_wanted_frame_is_decoded_once_and_shared() -> None:
     assert seen[0] is seen[1]
 
 
-def test_systems_are_kept_apart() -> None:
+def test_subscribers_get_only_their_system() -> None:
     bus, one, two = Bus(), list[Heartbeat](), list[Heartbeat]()
     bus.attach(Heartbeat, one.append, system_id=1)
     bus.attach(Heartbeat, two.append, system_id=2)
@@ -44,14 +44,14 @@ def test_systems_are_kept_apart() -> None:
     assert (len(one), len(two)) == (0, 1)
 
 
-def test_what_is_made_for_the_first_message_gets_it_once() -> None:
+def test_create_on_first_delivers_the_first_message_once() -> None:
     bus, heard, made = Bus(), list[Message](), list[object]()
 
     def make() -> None:
         if not made:
             made.append(bus.attach(Heartbeat, heard.append))
 
-    bus.attach_first([Attitude.ID, Heartbeat.ID], make, system_id=1)
+    bus.create_on_first([Attitude.ID, Heartbeat.ID], make, system_id=1)
     bus.deliver(frame(HEARTBEAT, 2))
     assert not made
     for _ in range(2):
@@ -60,7 +60,7 @@ def test_what_is_made_for_the_first_message_gets_it_once() -> None:
     assert set(bus.wanted) == {Heartbeat.ID}
 
 
-def test_what_another_sink_makes_meanwhile_gets_the_first_message_too() -> None:
+def test_sink_attached_by_another_sink_gets_first_message() -> None:
     bus, heard, made = Bus(), list[Message](), list[object]()
 
     def make(*_: object) -> None:
@@ -68,13 +68,13 @@ def test_what_another_sink_makes_meanwhile_gets_the_first_message_too() -> None:
             made.append(bus.attach(Heartbeat, heard.append))
 
     bus.attach(Heartbeat, make, system_id=1)
-    bus.attach_first([Heartbeat.ID], make, system_id=1)
+    bus.create_on_first([Heartbeat.ID], make, system_id=1)
     bus.deliver(frame(HEARTBEAT))
     bus.deliver(frame(HEARTBEAT))
     assert heard == [HEARTBEAT, HEARTBEAT]
 
 
-def test_what_could_not_be_made_is_made_for_the_next_message(caplog: pytest.LogCaptureFixture) -> None:
+def test_failed_creation_is_retried_with_next_message(caplog: pytest.LogCaptureFixture) -> None:
     bus, heard, failures = Bus(), list[Message](), [MemoryError()]
 
     def make() -> None:
@@ -82,14 +82,14 @@ def test_what_could_not_be_made_is_made_for_the_next_message(caplog: pytest.LogC
             raise failures.pop()
         bus.attach(Heartbeat, heard.append)
 
-    bus.attach_first([Heartbeat.ID], make)
+    bus.create_on_first([Heartbeat.ID], make)
     for _ in range(3):
         bus.deliver(frame(HEARTBEAT))
     assert heard == [HEARTBEAT, HEARTBEAT]
     assert len(caplog.records) == 1
 
 
-def test_wanted_is_live_and_shared_with_the_framer() -> None:
+def test_wanted_ids_are_live() -> None:
     bus, framer = Bus(), Framer()
     framer.wanted = bus.wanted
     data = FrameEncoder(1, 1).encode(HEARTBEAT)
@@ -104,7 +104,7 @@ def test_wanted_is_live_and_shared_with_the_framer() -> None:
     assert not bus.wanted
 
 
-def test_a_subscriber_that_raises_is_logged_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
+def test_subscriber_exception_is_logged_and_others_continue(caplog: pytest.LogCaptureFixture) -> None:
     bus, seen = Bus(), list[Heartbeat]()
 
     def raising(message: Heartbeat) -> None:
@@ -115,10 +115,10 @@ def test_a_subscriber_that_raises_is_logged_and_the_others_go_on(caplog: pytest.
     with caplog.at_level(logging.ERROR, "aerokit"):
         bus.deliver(frame(HEARTBEAT))
     assert len(seen) == 1
-    assert "a subscriber" in caplog.text
+    assert "subscriber" in caplog.text
 
 
-def test_detaching_while_a_message_is_delivered() -> None:
+def test_detach_during_delivery() -> None:
     bus, seen = Bus(), list[str]()
 
     def first(message: Heartbeat) -> None:
@@ -132,7 +132,7 @@ def test_detaching_while_a_message_is_delivered() -> None:
     assert seen == ["first", "second", "second"]
 
 
-def test_events_reach_those_who_want_their_class_or_a_class_above() -> None:
+def test_events_reach_subscribers_of_base_classes() -> None:
     bus, modes, everything = Bus(), list[ModeChanged](), list[Event]()
     detach = bus.attach_event(ModeChanged, modes.append)
     bus.attach_event(Event, everything.append)
@@ -144,7 +144,7 @@ def test_events_reach_those_who_want_their_class_or_a_class_above() -> None:
     assert [event.at for event in everything] == [1.0, 2.0, 3.0]
 
 
-def test_messages_of_other_ids_are_left_alone() -> None:
+def test_messages_of_other_ids_are_not_delivered() -> None:
     bus, seen = Bus(), list[Attitude]()
     bus.attach(Attitude, seen.append)
     bus.deliver(frame(HEARTBEAT))

@@ -27,18 +27,18 @@ def later(delay: float, callback: Callable[..., object], *args: object) -> None:
     asyncio.get_running_loop().call_later(delay, callback, *args)
 
 
-async def test_unknown_value_names_what_it_waits_for() -> None:
+async def test_unknown_value_error_names_the_source_messages() -> None:
     cell = make_cell()
     with pytest.raises(ValueUnknownError, match="altitude is not known yet: no HEARTBEAT has been received"):
         _ = cell.value
     assert (cell.latest, cell.source, cell.is_known, cell.age) == (None, None, False, math.inf)
 
 
-async def test_a_cell_is_no_condition() -> None:
+async def test_cell_as_condition_raises_type_error() -> None:
     armed: Any = make_cell("armed")
     with pytest.raises(TypeError) as caught:
         bool(armed)
-    assert str(caught.value) == "a StateCell is neither true nor false: write .value or .latest behind armed"
+    assert str(caught.value) == "a StateCell has no truth value: use armed.value or armed.latest"
 
 
 async def test_value_age_and_source() -> None:
@@ -50,7 +50,7 @@ async def test_value_age_and_source() -> None:
     assert cell.source == Source(1, 1, "HEARTBEAT")
 
 
-async def test_setting_an_equal_value_makes_it_young_again() -> None:
+async def test_setting_equal_value_resets_the_age() -> None:
     cell = make_cell()
     cell.set(7, HEARTBEAT)
     await asyncio.sleep(2)
@@ -58,7 +58,7 @@ async def test_setting_an_equal_value_makes_it_young_again() -> None:
     assert cell.age == 0.0
 
 
-async def test_fresh_raises_instead_of_returning_yesterdays_value() -> None:
+async def test_fresh_raises_for_old_value() -> None:
     cell = make_cell()
     with pytest.raises(ValueUnknownError):
         cell.fresh(within=1)
@@ -66,19 +66,17 @@ async def test_fresh_raises_instead_of_returning_yesterdays_value() -> None:
     await asyncio.sleep(1)
     assert cell.fresh(within=1) == 7
     await asyncio.sleep(4.2)
-    with pytest.raises(
-        StaleValueError, match=r"altitude is 5\.2 s old, older than the 1 s asked for: no HEARTBEAT"
-    ):
+    with pytest.raises(StaleValueError, match=r"altitude is 5\.2 s old, the limit is 1 s: no HEARTBEAT"):
         cell.fresh(within=1)
 
 
-async def test_wait_until_returns_at_once_when_it_is_true_already() -> None:
+async def test_wait_until_returns_at_once_when_already_true() -> None:
     cell = make_cell()
     cell.set(7, HEARTBEAT)
     assert await cell.wait_until(lambda value: value == 7) == 7
 
 
-async def test_a_value_that_lasted_one_message_is_not_missed() -> None:
+async def test_wait_until_sees_value_of_one_message() -> None:
     cell = make_cell()
 
     def flicker() -> None:
@@ -90,7 +88,7 @@ async def test_a_value_that_lasted_one_message_is_not_missed() -> None:
     assert cell.value == 2
 
 
-async def test_held_for_starts_again_when_the_value_leaves() -> None:
+async def test_held_for_restarts_when_value_changes() -> None:
     cell = make_cell()
     for at, value in ((0, 5), (1, 0), (2, 5), (3, 6)):
         later(at, cell.set, value, HEARTBEAT)
@@ -98,14 +96,14 @@ async def test_held_for_starts_again_when_the_value_leaves() -> None:
     assert since_the_beginning() == pytest.approx(4)
 
 
-async def test_held_for_is_over_between_two_messages() -> None:
+async def test_held_for_may_end_between_messages() -> None:
     cell = make_cell()
     cell.set(5, HEARTBEAT)
     await cell.wait_until(lambda value: value == 5, held_for=0.5)
     assert since_the_beginning() == pytest.approx(0.5)
 
 
-async def test_forgetting_breaks_the_hold() -> None:
+async def test_forget_restarts_held_for() -> None:
     cell = make_cell()
     cell.set(5, HEARTBEAT)
     later(1, cell.forget)
@@ -114,7 +112,7 @@ async def test_forgetting_breaks_the_hold() -> None:
     assert since_the_beginning() == pytest.approx(7)
 
 
-async def test_timeout_says_what_was_seen() -> None:
+async def test_timeout_lists_seen_values() -> None:
     cell = make_cell("mode")
     for at, value in enumerate((3, 3, 4, 5, 6)):
         later(at / 4, cell.set, value, HEARTBEAT)
@@ -125,7 +123,7 @@ async def test_timeout_says_what_was_seen() -> None:
     )
 
 
-async def test_timeout_names_a_value_again_that_has_come_back() -> None:
+async def test_timeout_lists_a_returning_value_again() -> None:
     cell = make_cell("mode")
     for at, value in enumerate((3, 4, 4, 3)):
         later(at / 4, cell.set, value, HEARTBEAT)
@@ -133,7 +131,7 @@ async def test_timeout_names_a_value_again_that_has_come_back() -> None:
         await cell.wait_until(lambda value: value == 99, timeout=2)
 
 
-async def test_timeout_tells_one_value_once() -> None:
+async def test_timeout_lists_equal_values_once() -> None:
     cell = make_cell("mode")
     cell.set(3, HEARTBEAT)
     with pytest.raises(OperationTimeout) as caught:
@@ -141,19 +139,19 @@ async def test_timeout_tells_one_value_once() -> None:
     assert str(caught.value) == "mode: not reached within 2 s; mode is 3, 2.0 s old"
 
 
-async def test_timeout_of_an_unknown_value_says_so() -> None:
-    with pytest.raises(OperationTimeout, match="not known yet, no HEARTBEAT has been received"):
+async def test_timeout_of_unknown_value_says_so() -> None:
+    with pytest.raises(OperationTimeout, match="not known yet: no HEARTBEAT has been received"):
         await make_cell().wait_until(lambda _: True, timeout=1)
 
 
-async def test_timeout_names_the_time_it_had_to_hold() -> None:
+async def test_timeout_names_held_for() -> None:
     cell = make_cell()
     cell.set(1, HEARTBEAT)
     with pytest.raises(OperationTimeout, match="it had to hold for 5 s"):
         await cell.wait_until(lambda value: value == 1, held_for=5, timeout=1)
 
 
-async def test_an_error_in_the_predicate_goes_to_the_one_who_waits() -> None:
+async def test_predicate_exception_is_raised_in_wait_until() -> None:
     cell = make_cell()
     waiting = asyncio.create_task(cell.wait_until(lambda value: 1 // value > 0))
     other = asyncio.create_task(cell.wait_until(lambda value: value == 0))
@@ -164,7 +162,7 @@ async def test_an_error_in_the_predicate_goes_to_the_one_who_waits() -> None:
     assert await other == 0
 
 
-async def test_close_reaches_everyone_who_waits_now_or_later() -> None:
+async def test_close_reaches_current_and_later_waiters() -> None:
     cell = make_cell()
     cell.set(1, HEARTBEAT)
     waiting = asyncio.create_task(cell.wait_until(lambda value: value == 2, held_for=1, timeout=5))
@@ -181,7 +179,7 @@ async def test_close_reaches_everyone_who_waits_now_or_later() -> None:
     assert cell.value == 1
 
 
-async def test_cancelling_leaves_nothing_behind() -> None:
+async def test_cancelled_wait_leaves_nothing_behind() -> None:
     cell = make_cell()
     cell.set(1, HEARTBEAT)
     tasks = [
@@ -197,7 +195,7 @@ async def test_cancelling_leaves_nothing_behind() -> None:
     assert handles == []
 
 
-async def test_cancelled_at_the_moment_of_failure_complains_to_nobody() -> None:
+async def test_cancellation_at_failure_logs_nothing() -> None:
     complaints: list[object] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: complaints.append(context))
     cell = make_cell()
@@ -212,7 +210,7 @@ async def test_cancelled_at_the_moment_of_failure_complains_to_nobody() -> None:
     assert complaints == []
 
 
-async def test_a_slow_reader_gets_the_latest_value_and_sees_how_many_it_missed() -> None:
+async def test_slow_reader_gets_latest_value_and_missed_count() -> None:
     cell = make_cell()
     cell.set(0, HEARTBEAT)
     changes = cell.changes()
@@ -236,13 +234,13 @@ async def test_changes_skip_equal_values_and_updates_do_not() -> None:
     assert since_the_beginning() == pytest.approx(2)
 
 
-async def test_changes_of_an_unknown_cell_begin_with_the_first_value() -> None:
+async def test_changes_of_unknown_cell_start_with_first_value() -> None:
     cell = make_cell()
     later(1, cell.set, 4, HEARTBEAT)
     assert await anext(cell.changes()) == 4
 
 
-async def test_a_loop_left_early_leaves_nothing_behind() -> None:
+async def test_loop_left_early_leaves_nothing_behind() -> None:
     cell = make_cell()
     cell.set(1, HEARTBEAT)
     async for value in cell.changes():
@@ -251,7 +249,7 @@ async def test_a_loop_left_early_leaves_nothing_behind() -> None:
     assert cell._sinks == []
 
 
-async def test_after_forgetting_the_same_value_is_news() -> None:
+async def test_same_value_after_forget_is_a_change() -> None:
     cell = make_cell()
     cell.set(1, HEARTBEAT)
     changes = cell.changes()
@@ -263,7 +261,7 @@ async def test_after_forgetting_the_same_value_is_news() -> None:
     assert await anext(changes) == 1
 
 
-async def test_observers_see_every_change_with_what_was_before() -> None:
+async def test_observers_get_previous_and_new_value() -> None:
     cell = make_cell()
     seen: list[tuple[int | None, int]] = []
     stop = cell.observe(lambda before, after: seen.append((before, after)))
@@ -275,7 +273,7 @@ async def test_observers_see_every_change_with_what_was_before() -> None:
     assert seen == [(None, 1), (1, 2)]
 
 
-async def test_what_an_observer_raises_is_logged_and_the_others_are_told(
+async def test_observer_exception_is_logged_and_others_are_called(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     cell, seen = make_cell(), list[int]()
@@ -292,7 +290,7 @@ async def test_what_an_observer_raises_is_logged_and_the_others_are_told(
 
 
 class LazyFeed:
-    """Works values out when somebody looks, and counts how often it was told of watchers."""
+    """Decodes values on demand, and counts notifications about watchers."""
 
     pending: object = None
 
@@ -309,7 +307,7 @@ class LazyFeed:
         self.told.append(self.cell._is_watched)
 
 
-async def test_what_works_out_values_is_told_who_watches_and_asked_by_who_looks() -> None:
+async def test_feed_is_notified_of_watchers_and_asked_by_readers() -> None:
     feed = LazyFeed()
     stop = feed.cell.observe(lambda _, __: None)
     stop()
@@ -326,7 +324,7 @@ async def test_what_works_out_values_is_told_who_watches_and_asked_by_who_looks(
 
 async def test_repr_is_readable() -> None:
     cell = make_cell()
-    assert repr(cell) == "<StateCell altitude is not known yet, no HEARTBEAT has been received>"
+    assert repr(cell) == "<StateCell altitude is not known yet: no HEARTBEAT has been received>"
     cell.set(3, HEARTBEAT)
     assert repr(cell) == "<StateCell altitude is 3, 0.0 s old>"
 
@@ -342,7 +340,7 @@ def _timers() -> list[asyncio.TimerHandle]:
     return list(loop._scheduled)  # type: ignore[attr-defined]
 
 
-async def test_cell_that_nobody_follows_any_more_is_not_watched() -> None:
+async def test_cell_without_iterators_is_not_watched() -> None:
     """A loop that was left by ``break`` costs nothing afterwards."""
     cell = make_cell()
     cell.set(1, HEARTBEAT)

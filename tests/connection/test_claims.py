@@ -1,4 +1,4 @@
-"""Whose place it is, to the last frame and the last millisecond: routes and claims without a connection."""
+"""Routes and their claims without a connection, exact to the frame and the millisecond."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from test_routes import COPTER, PeersLink
 
 from aerokit import events
 from aerokit.connection import routes as routes_module
-from aerokit.connection.routes import Claim, Routes, boot_time_ms
+from aerokit.connection.routes import RouteClaim, Routes, boot_time_ms
 from aerokit.mavlink import Frame, Framer
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, Heartbeat
 from aerokit.mavlink.statistics import SourceStatistics
 
-LIVE_FOR_S = 30.0
-MOVES_AFTER_S = 3.5
+PEER_TTL_S = 30.0
+ROUTE_TIMEOUT_S = 3.5
 
 HOME, SAME_HOST, ELSEWHERE = "1@copter", "2@copter", "1@stranger"
 
@@ -41,7 +41,7 @@ def attitude(boot_ms: int) -> Attitude:
 
 
 class Stage:
-    """Routes with a vehicle that has been heard from HOME until 1 s, ten frames a second."""
+    """Routes with a vehicle that sent ten frames a second from HOME until 1 s."""
 
     def __init__(self, attached: set[int] | None = None, **options: Any) -> None:
         self.told: list[events.Event] = []
@@ -49,10 +49,10 @@ class Stage:
         attached = {1} if attached is None else attached
         self.routes = Routes(self.link, self.told.append, attached, **options)
         self.copter = Sender()
-        assert self.routes.note(*self._at_home(0.0))
+        assert self.routes.record_heartbeat(*self._at_home(0.0))
         for number in range(9):
             self.copter.say(number / 10)
-        assert self.routes.note(*self._at_home(1.0))
+        assert self.routes.record_heartbeat(*self._at_home(1.0))
 
     @property
     def next_number(self) -> int:
@@ -60,8 +60,8 @@ class Stage:
 
     def claims(self, at: float, ahead: int, peer: str = ELSEWHERE, **kind: Any) -> bool:
         frame, counters = Sender(1, self.next_number + ahead).say(at, **kind)
-        assert self.routes.is_elsewhere(frame, peer)
-        return self.routes.takes_place(frame, peer, counters, is_signed=False)
+        assert self.routes.arrived_on_other_peer(frame, peer)
+        return self.routes.claims_route(frame, peer, counters, is_signed=False)
 
     def _at_home(self, at: float) -> tuple[Frame, str, SourceStatistics]:
         frame, counters = self.copter.say(at)
@@ -73,27 +73,27 @@ def names(told: list[events.Event]) -> list[str]:
 
 
 @pytest.mark.parametrize(("ahead", "takes"), [(0, True), (68, True), (69, False), (-1, False)])
-def test_after_a_silence_numbers_may_be_ahead_by_what_was_sent_meanwhile(ahead: int, takes: bool) -> None:
+def test_after_silence_numbers_may_be_ahead_by_lost_frames(ahead: int, takes: bool) -> None:
     """8 + 1.5 · 10 Hz · 4 s."""
     stage = Stage()
     assert stage.claims(5.0, ahead) is takes
-    assert names(stage.told) == (["VehicleMoved"] if takes else ["HeardTwice", "MoveRefused"])
+    assert names(stage.told) == (["RouteChanged"] if takes else ["DuplicateSender", "RouteChangeRefused"])
 
 
-@pytest.mark.parametrize(("ahead", "told"), [(9, []), (10, ["HeardTwice"]), (-1, ["HeardTwice"])])
-def test_at_once_numbers_may_be_ahead_by_few(ahead: int, told: list[str]) -> None:
+@pytest.mark.parametrize(("ahead", "told"), [(9, []), (10, ["DuplicateSender"]), (-1, ["DuplicateSender"])])
+def test_without_silence_numbers_may_be_slightly_ahead(ahead: int, told: list[str]) -> None:
     """8 + 1.5 · 10 Hz · 0.1 s; of the same host nothing is told while it may be the vehicle itself."""
     stage = Stage()
     assert not stage.claims(1.1, ahead, SAME_HOST)
     assert names(stage.told) == told
 
 
-@pytest.mark.parametrize(("after_s", "takes"), [(MOVES_AFTER_S, False), (MOVES_AFTER_S + 0.01, True)])
-def test_it_is_silent_after_three_and_a_half_seconds(after_s: float, takes: bool) -> None:
+@pytest.mark.parametrize(("after_s", "takes"), [(ROUTE_TIMEOUT_S, False), (ROUTE_TIMEOUT_S + 0.01, True)])
+def test_route_times_out_after_three_and_a_half_seconds(after_s: float, takes: bool) -> None:
     assert Stage().claims(1.0 + after_s, 0) is takes
 
 
-def test_where_numbers_say_nothing_the_clock_counts_alone() -> None:
+def test_clock_decides_where_numbers_are_ambiguous() -> None:
     """After 8 s at 10 Hz the counter may have come round."""
     assert not Stage().claims(9.1, 0)  # and there is no clock
     clocks = {(1, 1): lambda at: 1000 * at}
@@ -107,126 +107,128 @@ def test_where_numbers_say_nothing_the_clock_counts_alone() -> None:
 
 
 @pytest.mark.parametrize(("right", "takes"), [(True, True), (False, False)])
-def test_a_clock_that_is_known_must_be_told(right: bool, takes: bool) -> None:
+def test_known_clock_must_be_confirmed(right: bool, takes: bool) -> None:
     stage = Stage(boot_clocks={(1, 1): lambda at: 1000 * at})
     assert not stage.claims(5.0, 0)  # the heartbeat has no time
     assert stage.claims(5.1, 1, message=attitude(5100 if right else 99_000)) is takes
 
 
-def test_of_a_system_without_a_vehicle_object_anybody_takes_the_place_after_a_silence() -> None:
+def test_system_without_vehicle_object_is_taken_after_silence() -> None:
     assert Stage(attached=set()).claims(5.0, -100)
     assert not Stage(attached=set()).claims(2.0, -100)
     assert Stage(may_move=True).claims(5.0, -100)
     assert Stage().claims(5.0, -100, SAME_HOST)
 
 
-def test_another_port_takes_the_place_with_three_frames_in_the_time_of_three() -> None:
+def test_other_port_takes_route_with_three_frames_in_time() -> None:
     stage, other = Stage(), Sender(1, 0)
     other.encoder.sequence = stage.next_number
     takes = []
     for at in (1.1, 1.2, 1.3, 1.41):
         frame, counters = other.say(at)
-        takes.append(stage.routes.takes_place(frame, SAME_HOST, counters, is_signed=False))
+        takes.append(stage.routes.claims_route(frame, SAME_HOST, counters, is_signed=False))
     assert takes == [False, False, False, True]
-    assert names(stage.told) == ["VehicleMoved"]
+    assert names(stage.told) == ["RouteChanged"]
     assert stage.routes.peers_of(1, 1) == (SAME_HOST,)
     (moved,) = stage.told
-    assert isinstance(moved, events.VehicleMoved)
+    assert isinstance(moved, events.RouteChanged)
     assert moved.at == pytest.approx(1.41)
 
 
-def test_what_was_told_is_told_once_until_the_vehicle_is_heard_again() -> None:
+def test_claims_are_reported_again_after_owner_returns() -> None:
     stage = Stage()
     for at in (5.0, 5.1):
         assert not stage.claims(at, 100)
-    assert names(stage.told) == ["HeardTwice", "MoveRefused"]
-    stage.routes.note(*stage._at_home(5.2))
+    assert names(stage.told) == ["DuplicateSender", "RouteChangeRefused"]
+    stage.routes.record_heartbeat(*stage._at_home(5.2))
     assert not stage.claims(10.0, 100)
-    assert names(stage.told) == ["HeardTwice", "MoveRefused", "MoveRefused"]
+    assert names(stage.told) == ["DuplicateSender", "RouteChangeRefused", "RouteChangeRefused"]
 
 
-def test_a_double_behind_the_same_peer_is_told_once() -> None:
+def test_duplicate_behind_same_peer_is_reported_once() -> None:
     stage = Stage()
     for at in (1.1, 1.2):
-        stage.routes.hear_double(Sender().say(at)[0])
-    assert names(stage.told) == ["HeardTwice"]
+        stage.routes.record_duplicate_sender(Sender().say(at)[0])
+    assert names(stage.told) == ["DuplicateSender"]
 
 
 @pytest.mark.parametrize(
-    ("behind", "after_s", "is_overtaken"),
+    ("behind", "after_s", "is_outdated"),
     [(0, 0.1, False), (1, 0.1, True), (127, 0.1, True), (128, 0.1, False), (-1, 0.1, False), (1, 3.6, False)],
 )
-def test_a_heartbeat_is_overtaken_by_up_to_127_frames(
-    behind: int, after_s: float, is_overtaken: bool
-) -> None:
+def test_heartbeat_is_outdated_by_up_to_127_frames(behind: int, after_s: float, is_outdated: bool) -> None:
     stage = Stage()
     frame, _ = Sender(1, stage.next_number - 1 - behind).say(1.0 + after_s)
-    assert stage.routes.is_overtaken(frame) is is_overtaken
-    assert not stage.routes.is_overtaken(Sender(9).say(1.0)[0])
+    assert stage.routes.is_outdated(frame) is is_outdated
+    assert not stage.routes.is_outdated(Sender(9).say(1.0)[0])
 
 
 # -------------------------------------------------------------------------------------- room
 
 
-def test_a_peer_is_wanted_for_thirty_seconds_and_a_vehicles_always() -> None:
+def test_peer_with_vehicle_object_is_never_evictable() -> None:
     for attached, at, forgotten in (
         ({1}, 1000.0, []),
-        (set[int](), 1.0 + LIVE_FOR_S, []),
-        (set[int](), 1.1 + LIVE_FOR_S, [HOME]),
+        (set[int](), 1.0 + PEER_TTL_S, []),
+        (set[int](), 1.1 + PEER_TTL_S, [HOME]),
     ):
-        assert Stage(attached).routes.least_wanted([HOME], at) == forgotten
-    assert Stage().routes.least_wanted([HOME, ELSEWHERE, SAME_HOST], 1.0) == [ELSEWHERE]
+        assert Stage(attached).routes.evictable_peers([HOME], at) == forgotten
+    assert Stage().routes.evictable_peers([HOME, ELSEWHERE, SAME_HOST], 1.0) == [ELSEWHERE]
 
 
-def test_full_of_routes_the_quiet_ones_go_and_a_vehicles_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(routes_module, "MOST_ROUTES", 3)
+def test_full_table_drops_expired_routes_and_keeps_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(routes_module, "MAX_ROUTES", 3)
     stage = Stage(attached={9})
     routes = stage.routes
-    assert routes.note(Sender(9).say(1.0)[0], ELSEWHERE, None)
-    assert routes.note(Sender(3).say(30.0)[0], ELSEWHERE, None)
-    assert not routes.note(Sender(4).say(30.5)[0], ELSEWHERE, None)
-    assert routes.note(Sender(5).say(32.0)[0], ELSEWHERE, None)
-    known = [system for system in range(10) if routes.is_known((system, 1))]
+    assert routes.record_heartbeat(Sender(9).say(1.0)[0], ELSEWHERE, None)
+    assert routes.record_heartbeat(Sender(3).say(30.0)[0], ELSEWHERE, None)
+    assert not routes.record_heartbeat(Sender(4).say(30.5)[0], ELSEWHERE, None)
+    assert routes.record_heartbeat(Sender(5).say(32.0)[0], ELSEWHERE, None)
+    known = [system for system in range(10) if routes.has_route((system, 1))]
     assert known == [3, 5, 9]
 
 
-def test_full_of_routes_it_is_looked_for_room_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(routes_module, "MOST_ROUTES", 1)
+def test_full_table_is_swept_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(routes_module, "MAX_ROUTES", 1)
     routes = Stage(attached=set()).routes
-    assert not routes.note(Sender(2).say(30.5)[0], ELSEWHERE, None)
-    assert not routes.note(Sender(2).say(31.4)[0], ELSEWHERE, None)
-    assert routes.note(Sender(2).say(31.5)[0], ELSEWHERE, None)
+    assert not routes.record_heartbeat(Sender(2).say(30.5)[0], ELSEWHERE, None)
+    assert not routes.record_heartbeat(Sender(2).say(31.4)[0], ELSEWHERE, None)
+    assert routes.record_heartbeat(Sender(2).say(31.5)[0], ELSEWHERE, None)
 
 
 # ------------------------------------------------------------------------------------- claims
 
 
-def test_a_claim_is_judged_by_its_first_frame_after_the_others_last() -> None:
-    claim, (frame, _) = Claim(), Sender().say(1.0)
-    assert (claim.goes_on, claim.may_go_on) == (False, True)
-    claim.hear(frame, (10, False, True))
-    claim.hear(frame, (10, True, True))
-    assert (claim.goes_on, claim.may_go_on) == (False, False)
-    claim.is_refusal_told = True
-    claim.hear(frame, (11, True, None))
-    assert (claim.goes_on, claim.may_go_on, claim.is_refusal_told) == (False, True, False)
-    claim.hear(frame, (11, True, True))
-    assert claim.goes_on
-    claim.hear(frame, (11, True, False))
-    claim.hear(frame, (11, True, True))
-    assert (claim.goes_on, claim.may_go_on) == (False, False)
+def test_claim_is_judged_by_first_frame_after_owner() -> None:
+    claim, (frame, _) = RouteClaim(), Sender().say(1.0)
+    assert (claim.continues_owner, claim.may_continue_owner) == (False, True)
+    claim.add(frame, (10, False, True))
+    claim.add(frame, (10, True, True))
+    assert (claim.continues_owner, claim.may_continue_owner) == (False, False)
+    claim.is_refusal_reported = True
+    claim.add(frame, (11, True, None))
+    assert (claim.continues_owner, claim.may_continue_owner, claim.is_refusal_reported) == (
+        False,
+        True,
+        False,
+    )
+    claim.add(frame, (11, True, True))
+    assert claim.continues_owner
+    claim.add(frame, (11, True, False))
+    claim.add(frame, (11, True, True))
+    assert (claim.continues_owner, claim.may_continue_owner) == (False, False)
 
 
-def test_a_claim_needs_three_frames_in_the_time_of_three() -> None:
-    claim, (frame, _) = Claim(), Sender().say(1.0)
+def test_claim_needs_three_frames_in_the_time_of_three() -> None:
+    claim, (frame, _) = RouteClaim(), Sender().say(1.0)
     for frames in (1, 2, 3):
-        claim.hear(frame, (10, True, True))
+        claim.add(frame, (10, True, True))
         assert claim.has_replaced(9.0, 10.0) is (frames == 3)
     assert not claim.has_replaced(1.29, 10.0)
     assert claim.has_replaced(1.5, 6.0)
     assert not claim.has_replaced(9.0, 0.0)
 
 
-def test_the_boot_time_of_a_frame() -> None:
+def test_boot_time_of_a_frame() -> None:
     assert boot_time_ms(Sender().say(0.0, attitude(123_456_789))[0]) == 123_456_789
     assert boot_time_ms(Sender().say(0.0, Heartbeat(2, 3, 81, 0, 3))[0]) is None

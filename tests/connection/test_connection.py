@@ -24,7 +24,7 @@ from aerokit.errors import (
     LinkLost,
     LinkOpenError,
 )
-from aerokit.events import HeardTwice, LinkClosed
+from aerokit.events import DuplicateSender, LinkClosed
 from aerokit.mavlink import STANDARD, Dialect
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
@@ -64,20 +64,18 @@ async def far_end() -> AsyncIterator[tuple[MemoryLink, MemoryLink, Ear]]:
 # ------------------------------------------------------------------------------------ what goes out
 
 
-async def test_our_heartbeat_goes_out_at_1_hz_from_the_start() -> None:
+async def test_own_heartbeat_is_sent_at_1_hz_from_start() -> None:
     async with far_end() as (near, _, ear), open_connection(near, source_system=254, source_component=191):
         await anyio.sleep(5.5)
         frames = Framer().receive(ear.data)
-        assert {(frame.system_id, frame.component_id, frame.message_id) for frame in frames} == {
-            (254, 191, 0)
-        }
+        assert {(frame.system_id, frame.component_id, frame.message_id) for frame in frames} == {(254, 191, 0)}
         assert len(frames) == 6
         gaps = [later - earlier for earlier, later in zip(ear.times, ear.times[1:], strict=False)]
         assert gaps == pytest.approx([1.0] * 5)
         assert ear.times[0] < BEGINS_AT + 0.1
 
 
-async def test_our_heartbeat_is_that_of_a_ground_station() -> None:
+async def test_own_heartbeat_is_of_a_ground_station() -> None:
     async with far_end() as (near, _, ear), open_connection(near):
         await anyio.sleep(0.5)
         (frame,) = Framer().receive(ear.data)
@@ -85,7 +83,7 @@ async def test_our_heartbeat_is_that_of_a_ground_station() -> None:
         assert STANDARD.decode(frame) == Heartbeat(6, 8, 0, 0, 4, 3)
 
 
-async def test_our_ids_are_plain_numbers() -> None:
+async def test_own_ids_are_plain_integers() -> None:
     """Python 3.10 writes members of enums by their names: ``MavComponent.MISSIONPLANNER``."""
     link, _ = memory_link_pair()
     connection = Connection(link)
@@ -95,7 +93,7 @@ async def test_our_ids_are_plain_numbers() -> None:
 
 
 @pytest.mark.parametrize(("system_id", "component_id"), [(1, 0), (255, 255)])
-async def test_our_ids_may_be_all_that_there_are(system_id: int, component_id: int) -> None:
+async def test_own_ids_accept_the_full_range(system_id: int, component_id: int) -> None:
     async with far_end() as (near, _, ear):
         async with open_connection(near, source_system=system_id, source_component=component_id):
             await anyio.sleep(0.5)
@@ -112,13 +110,13 @@ async def test_our_ids_may_be_all_that_there_are(system_id: int, component_id: i
         ({"source_component": 256}, "source_component = 256 is not allowed: 0 to 255"),
     ],
 )
-async def test_our_ids_are_bytes(wrong: dict[str, int], text: str) -> None:
+async def test_own_ids_out_of_range_are_refused(wrong: dict[str, int], text: str) -> None:
     link, _ = memory_link_pair()
     with pytest.raises(InvalidArgument, match=f"^{text}$"):
         Connection(link, **wrong)  # type: ignore[arg-type]
 
 
-async def test_what_the_dialect_does_not_know_cannot_be_subscribed_to() -> None:
+async def test_subscribe_refuses_types_outside_the_dialect() -> None:
     few = Dialect("heartbeats", [Heartbeat])
     async with far_end() as (near, _, _), open_connection(near, dialect=few) as connection:
         connection.check_types((Heartbeat, LinkClosed))
@@ -131,7 +129,7 @@ async def test_what_the_dialect_does_not_know_cannot_be_subscribed_to() -> None:
                 connection.check_types(types)
 
 
-async def test_a_message_out_of_range_is_not_sent() -> None:
+async def test_message_with_field_out_of_range_is_not_sent() -> None:
     async with far_end() as (near, _, ear), open_connection(near) as connection:
         await anyio.sleep(0.1)
         before = ear.data
@@ -153,7 +151,7 @@ class Mine(BaseException):
     [ValueError("mine"), KeyboardInterrupt(), SystemExit(3), Mine()],
     ids=lambda error: type(error).__name__,
 )
-async def test_exceptions_of_the_body_come_out_as_they_are(error: BaseException) -> None:
+async def test_exceptions_of_the_block_pass_unchanged(error: BaseException) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
         with pytest.raises(type(error)) as caught:
             async with connect(link):
@@ -161,7 +159,7 @@ async def test_exceptions_of_the_body_come_out_as_they_are(error: BaseException)
         assert caught.value is error
 
 
-async def test_cancellation_of_the_body_is_no_error() -> None:
+async def test_cancellation_of_the_block_is_no_error() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
         with anyio.move_on_after(2) as scope:
             async with connect(link):
@@ -169,7 +167,7 @@ async def test_cancellation_of_the_body_is_no_error() -> None:
         assert scope.cancelled_caught
 
 
-async def test_a_return_out_of_the_block() -> None:
+async def test_return_from_the_block() -> None:
     async def mode() -> str:
         async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
             return vehicle.mode_name
@@ -177,7 +175,9 @@ async def test_a_return_out_of_the_block() -> None:
     assert await mode() == "STABILIZE"
 
 
-async def test_a_mistake_of_ours_ends_the_connection_and_is_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_internal_error_ends_connection_without_exception_group(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
 
         def broken(*_: object) -> None:
@@ -192,7 +192,7 @@ async def test_a_mistake_of_ours_ends_the_connection_and_is_no_group(monkeypatch
 # ----------------------------------------------------------------------------------- how it ends
 
 
-async def test_close_is_idempotent_and_ends_what_waits() -> None:
+async def test_close_is_idempotent_and_ends_waiters() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
 
         async def close() -> None:
@@ -209,7 +209,7 @@ async def test_close_is_idempotent_and_ends_what_waits() -> None:
                 send(COPTER)
 
 
-async def test_a_lost_link_ends_everything_that_waits() -> None:
+async def test_lost_link_ends_all_waiters() -> None:
     closed: list[LinkClosed] = []
     errors: list[type[BaseException]] = []
     async with far_end() as (near, far, _):
@@ -242,7 +242,7 @@ async def test_a_lost_link_ends_everything_that_waits() -> None:
     assert errors == [LinkLost] * 4
 
 
-async def test_closing_is_bounded_when_the_link_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_close_is_bounded_when_the_link_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link:
 
         async def hang() -> None:
@@ -255,7 +255,7 @@ async def test_closing_is_bounded_when_the_link_hangs(monkeypatch: pytest.Monkey
         assert anyio.current_time() - started <= 3
 
 
-async def test_an_error_on_opening_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_failed_open_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
     near, _ = memory_link_pair()
 
     async def refuse(receiver: object) -> None:
@@ -270,7 +270,7 @@ async def test_an_error_on_opening_leaves_nothing_open(monkeypatch: pytest.Monke
 # ------------------------------------------------------------------------------- several vehicles, one link
 
 
-async def test_a_vehicle_has_one_object_on_a_connection() -> None:
+async def test_vehicle_has_one_object_per_connection() -> None:
     copter = SimulatedCopter(boot_time_s=0)
     async with simulated_link(copter) as link, open_connection(link) as connection:
         async with connect(connection) as vehicle:
@@ -282,7 +282,7 @@ async def test_a_vehicle_has_one_object_on_a_connection() -> None:
             assert again.is_armed is False
 
 
-async def test_what_names_its_target_goes_only_where_that_was_heard() -> None:
+async def test_targeted_message_goes_only_to_its_peer() -> None:
     """Three peers on one listening link; a command to system 2 reaches its peer alone, heartbeats reach all."""
     link = SeveralPeers()
     async with open_connection(link) as connection:
@@ -290,8 +290,8 @@ async def test_what_names_its_target_goes_only_where_that_was_heard() -> None:
             link.receive(FrameEncoder(system_id, 1).encode(COPTER), peer)
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two"]
-        heard: list[HeardTwice] = []
-        connection.bus.attach_event(HeardTwice, heard.append)
+        heard: list[DuplicateSender] = []
+        connection.bus.attach_event(DuplicateSender, heard.append)
         link.receive(FrameEncoder(2, 1).encode(COPTER), "elsewhere")  # a second vehicle with the same ids?
         connection.send(CommandLong(2, 1, 400, 0, *(0.0,) * 7))
         assert link.sent_to(76) == ["two", "two"]
@@ -350,7 +350,7 @@ async def use(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.0005, 0.3, 1.0, 1.06, 1.2, 2.0, 3.3, 5.0, 8.0, 12.0])
-async def test_cancelled_at_any_time_it_leaves_nothing_behind(seconds: float) -> None:
+async def test_cancelled_connect_leaves_nothing_behind(seconds: float) -> None:
     tasks_before, threads_before = asyncio.all_tasks(), threading.active_count()
     connection: Connection | None = None
     async with simulated_link(SimulatedCopter(boot_time_s=1)) as link:
@@ -366,22 +366,22 @@ async def test_cancelled_at_any_time_it_leaves_nothing_behind(seconds: float) ->
     if connection is not None:
         assert set(connection.bus.wanted) == {Heartbeat.ID}
         assert not connection.bus._event_sinks
-        assert connection._ending._enders == []
+        assert connection._end_signal._callbacks == []
 
 
-async def test_looking_for_a_vehicle_leaves_no_ear_on_a_connection_that_stays() -> None:
+async def test_vehicle_search_leaves_no_subscriber_behind() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, open_connection(link) as connection:
-        before = dict(connection.bus.wanted), list(connection._ending._enders)
+        before = dict(connection.bus.wanted), list(connection._end_signal._callbacks)
         async with connect(connection):
             pass
-        assert (connection.bus.wanted, connection._ending._enders) == before
+        assert (connection.bus.wanted, connection._end_signal._callbacks) == before
         with pytest.raises(ConnectFailed):
             async with connect(connection, system_id=9, timeout=2):
                 pytest.fail("nobody has this number")
-        assert (connection.bus.wanted, connection._ending._enders) == before
+        assert (connection.bus.wanted, connection._end_signal._callbacks) == before
 
 
-async def test_a_connect_that_fails_leaves_nothing_behind() -> None:
+async def test_failed_connect_leaves_nothing_behind() -> None:
     tasks_before = asyncio.all_tasks()
     async with far_end() as (near, _, _ear):
         with pytest.raises(ConnectFailed):

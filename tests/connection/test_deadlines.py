@@ -32,10 +32,10 @@ class Alarms:
 
     def timers(self) -> int:
         scheduled: list[asyncio.TimerHandle] = self._loop._scheduled  # type: ignore[attr-defined]
-        return sum("_ring" in repr(timer) and not timer.cancelled() for timer in scheduled)
+        return sum("_fire" in repr(timer) and not timer.cancelled() for timer in scheduled)
 
 
-def test_each_rings_once_at_its_time_whatever_the_order() -> None:
+def test_alarms_fire_once_at_their_time_in_any_order() -> None:
     async def program() -> None:
         alarms = Alarms()
         for name, seconds in (("third", 3.0), ("first", 1.0), ("second", 2.0), ("second too", 2.0)):
@@ -48,20 +48,20 @@ def test_each_rings_once_at_its_time_whatever_the_order() -> None:
     run_virtual(program())
 
 
-def test_taken_back_it_does_not_ring_and_a_later_one_does() -> None:
+def test_cancelled_alarm_does_not_fire() -> None:
     async def program() -> None:
         alarms = Alarms()
         first = alarms.at("first", 1.0)
         alarms.at("second", 2.0)
-        alarms.deadlines.take_back(first)
-        alarms.deadlines.take_back(first)
+        alarms.deadlines.cancel(first)
+        alarms.deadlines.cancel(first)
         await asyncio.sleep(10)
         assert alarms.rung == [("second", 2.0)]
 
     run_virtual(program())
 
 
-def test_set_again_it_rings_at_the_new_time_only() -> None:
+def test_alarm_set_again_fires_at_the_new_time() -> None:
     async def program() -> None:
         alarms = Alarms()
         alarms.move(alarms.at("later", 1.0), 4.0)
@@ -72,13 +72,13 @@ def test_set_again_it_rings_at_the_new_time_only() -> None:
     run_virtual(program())
 
 
-def test_an_alarm_may_set_and_take_back_others() -> None:
+def test_alarm_may_set_and_cancel_others() -> None:
     async def program() -> None:
         alarms = Alarms()
         other = alarms.at("other", 2.0)
 
         def alarm() -> None:
-            alarms.deadlines.take_back(other)
+            alarms.deadlines.cancel(other)
             alarms.at("next", 1.5)
 
         alarms.move(alarm, 1.0)
@@ -88,7 +88,7 @@ def test_an_alarm_may_set_and_take_back_others() -> None:
     run_virtual(program())
 
 
-def test_an_alarm_that_sets_itself_for_later_does_not_delay_the_others() -> None:
+def test_alarm_that_sets_itself_does_not_delay_others() -> None:
     async def program() -> None:
         alarms = Alarms()
         times = 0
@@ -107,11 +107,11 @@ def test_an_alarm_that_sets_itself_for_later_does_not_delay_the_others() -> None
     run_virtual(program())
 
 
-def test_requests_that_are_answered_cost_one_timer_and_closing_leaves_none() -> None:
+def test_answered_requests_use_one_timer_that_close_removes() -> None:
     async def program() -> None:
         alarms = Alarms()
         for number in range(100):
-            alarms.deadlines.take_back(alarms.at("answered", 1.0 + number))
+            alarms.deadlines.cancel(alarms.at("answered", 1.0 + number))
         assert alarms.timers() == 1
         alarms.at("open", 1.0)
         alarms.deadlines.close()
@@ -122,7 +122,7 @@ def test_requests_that_are_answered_cost_one_timer_and_closing_leaves_none() -> 
     run_virtual(program())
 
 
-def test_deadlines_that_are_past_on_uvloop_ring() -> None:
+def test_past_deadlines_fire_on_uvloop() -> None:
     uvloop = pytest.importorskip("uvloop")
     rung: list[str] = []
 

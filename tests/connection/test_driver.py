@@ -27,7 +27,7 @@ SYSTEM = 1
 
 
 class Counting(Exchange[int]):
-    """Asks every second until it has heard so many answers; gives up after five questions."""
+    """Sends a request every second until enough answers arrived; fails after five requests."""
 
     expects = (Attitude,)
 
@@ -57,7 +57,7 @@ class Counting(Exchange[int]):
 
 
 class FarEnd:
-    """The other end of the link: hears questions, answers when it is told to."""
+    """The other end of the link: receives requests, and answers on demand."""
 
     def __init__(self, link: MemoryLink) -> None:
         self.link = link
@@ -86,7 +86,7 @@ class Pair:
 
     def attached(self) -> tuple[int, int, int]:
         sinks = sum(len(sinks) for sinks in self.connection.bus._sinks.values())
-        return sinks, len(self.connection._ending._enders), len(self.connection.deadlines._due)
+        return sinks, len(self.connection._end_signal._callbacks), len(self.connection.deadlines._deadlines)
 
     async def run(self, exchange: Exchange[int]) -> int:
         return await run_exchange(self.connection, SYSTEM, exchange)
@@ -109,7 +109,7 @@ def later(seconds: float, action: object) -> None:
     asyncio.get_running_loop().call_later(seconds, action)
 
 
-async def test_it_asks_at_once_and_again_at_its_deadline_until_answered(pair: Pair) -> None:
+async def test_request_is_repeated_at_deadlines_until_answered(pair: Pair) -> None:
     started = anyio.current_time()
     later(2.5, pair.far.answer)
     assert await pair.run(Counting()) == 1
@@ -119,7 +119,7 @@ async def test_it_asks_at_once_and_again_at_its_deadline_until_answered(pair: Pa
     assert len(pair.far.questions) == 3
 
 
-async def test_it_gives_up_when_the_exchange_does(pair: Pair) -> None:
+async def test_run_ends_when_the_exchange_fails(pair: Pair) -> None:
     started = anyio.current_time()
     with pytest.raises(CommandTimeout, match="five times"):
         await pair.run(Counting())
@@ -127,7 +127,7 @@ async def test_it_gives_up_when_the_exchange_does(pair: Pair) -> None:
     assert len(pair.far.questions) == 5
 
 
-async def test_once_it_has_ended_its_deadline_does_not_ring(pair: Pair) -> None:
+async def test_ended_exchange_has_no_deadline(pair: Pair) -> None:
     """The answer and the deadline wait for a loop that was blocked; the answer comes first."""
     exchange = Counting()
 
@@ -140,7 +140,7 @@ async def test_once_it_has_ended_its_deadline_does_not_ring(pair: Pair) -> None:
     assert exchange.asked == 1
 
 
-async def test_other_systems_are_not_heard(pair: Pair) -> None:
+async def test_messages_of_other_systems_are_ignored(pair: Pair) -> None:
     later(0.5, lambda: pair.far.answer(2))
     exchange = Counting()
     with pytest.raises(CommandTimeout):
@@ -148,7 +148,7 @@ async def test_other_systems_are_not_heard(pair: Pair) -> None:
     assert exchange.heard == 0
 
 
-async def test_several_at_a_time_each_with_its_own_end(pair: Pair) -> None:
+async def test_concurrent_exchanges_end_separately(pair: Pair) -> None:
     results: dict[int, int] = {}
 
     async def run(answers: int) -> None:
@@ -165,7 +165,7 @@ async def test_several_at_a_time_each_with_its_own_end(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5, 1.0, 1.5])
-async def test_cancelled_it_ends_at_once_and_asks_no_more(pair: Pair, seconds: float) -> None:
+async def test_cancelled_exchange_sends_nothing_more(pair: Pair, seconds: float) -> None:
     started = anyio.current_time()
     with anyio.move_on_after(seconds) as scope:
         await pair.run(Counting())
@@ -177,7 +177,7 @@ async def test_cancelled_it_ends_at_once_and_asks_no_more(pair: Pair, seconds: f
     assert pair.attached() == pair.before
 
 
-async def test_the_end_of_the_connection_ends_it(pair: Pair) -> None:
+async def test_end_of_connection_ends_exchange(pair: Pair) -> None:
     later(0.5, pair.connection.close)
     with pytest.raises(ConnectionClosed):
         await pair.run(Counting())
@@ -186,13 +186,13 @@ async def test_the_end_of_the_connection_ends_it(pair: Pair) -> None:
     assert len(pair.far.questions) == 1
 
 
-async def test_the_loss_of_the_link_ends_it(pair: Pair) -> None:
+async def test_lost_link_ends_exchange(pair: Pair) -> None:
     later(1.5, pair.far.link.close)
     with pytest.raises(LinkLost):
         await pair.run(Counting())
 
 
-async def test_a_message_that_cannot_be_sent_is_told_at_once(pair: Pair) -> None:
+async def test_unsendable_message_is_raised_at_once(pair: Pair) -> None:
     """Also when it is a later one: nobody else would tell."""
     nonsense = CommandLong(300, 1, 400, 0, *(0.0,) * 7)
     with pytest.raises(InvalidArgument, match="target_system"):
@@ -205,7 +205,7 @@ async def test_a_message_that_cannot_be_sent_is_told_at_once(pair: Pair) -> None
     assert anyio.current_time() == pytest.approx(started + 1)
 
 
-async def test_a_mistake_in_a_step_on_time_is_raised_where_it_is_awaited(pair: Pair) -> None:
+async def test_exception_at_deadline_is_raised_in_result(pair: Pair) -> None:
     class Broken(Counting):
         def expire(self, now: float) -> None:
             raise ZeroDivisionError("ours")
@@ -214,7 +214,7 @@ async def test_a_mistake_in_a_step_on_time_is_raised_where_it_is_awaited(pair: P
         await pair.run(Broken())
 
 
-async def test_a_mistake_in_a_step_on_a_message_does_not_stop_the_clock(pair: Pair) -> None:
+async def test_exception_in_receive_does_not_stop_deadlines(pair: Pair) -> None:
     class Broken(Counting):
         def receive(self, message: Message, now: float) -> None:
             raise ZeroDivisionError("ours")
@@ -224,7 +224,7 @@ async def test_a_mistake_in_a_step_on_a_message_does_not_stop_the_clock(pair: Pa
         await pair.run(Broken())
 
 
-async def test_what_an_exchange_does_not_expect_is_not_decoded_for_it(pair: Pair) -> None:
+async def test_unexpected_messages_are_not_decoded(pair: Pair) -> None:
     assert set(pair.connection.bus.wanted) == {Heartbeat.ID}
     task = asyncio.ensure_future(pair.run(Counting()))
     await anyio.sleep(0.1)

@@ -1,4 +1,4 @@
-"""However a connection ends: the program's exceptions stay its own, who waits is told, whoever comes later too."""
+"""End of a connection: the program's exceptions pass unchanged, waiters get an error, and nothing is left."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ async def vehicle(link: MemoryLink) -> AsyncIterator[Vehicle]:
     ],
     ids=lambda error: type(error).__name__,
 )
-async def test_the_bodys_exception_is_the_one_that_comes_out(link: MemoryLink, error: BaseException) -> None:
+async def test_block_exception_passes_unchanged(link: MemoryLink, error: BaseException) -> None:
     caught: BaseException | None = None
     try:
         async with connect(link):
@@ -76,7 +76,7 @@ async def test_the_bodys_exception_is_the_one_that_comes_out(link: MemoryLink, e
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="asyncio.TaskGroup is new in 3.11")
-async def test_an_exception_group_of_the_program_stays_as_it_is(link: MemoryLink) -> None:
+async def test_exception_group_of_program_passes_unchanged(link: MemoryLink) -> None:
     async def fail() -> None:
         raise ValueError("mine")
 
@@ -88,7 +88,7 @@ async def test_an_exception_group_of_the_program_stays_as_it_is(link: MemoryLink
     assert [repr(error) for error in errors.exceptions] == ["ValueError('mine')"]
 
 
-async def test_an_async_generator_around_it_can_be_closed(link: MemoryLink) -> None:
+async def test_async_generator_around_connection_can_be_closed(link: MemoryLink) -> None:
     connection: Connection | None = None
 
     async def altitudes() -> AsyncIterator[float]:
@@ -106,7 +106,7 @@ async def test_an_async_generator_around_it_can_be_closed(link: MemoryLink) -> N
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="asyncio.timeout and TaskGroup are new in 3.11")
-async def test_inside_the_programs_own_groups_and_timeouts() -> None:
+async def test_connection_inside_task_groups_and_timeouts() -> None:
     runner: Any = asyncio
 
     async def session() -> None:
@@ -130,7 +130,7 @@ async def test_inside_the_programs_own_groups_and_timeouts() -> None:
     assert task.cancelling() == 0
 
 
-async def test_inside_a_group_of_anyio_beside_other_sessions() -> None:
+async def test_connection_inside_anyio_group_beside_others() -> None:
     modes: list[str] = []
 
     async def session(system_id: int) -> None:
@@ -145,7 +145,7 @@ async def test_inside_a_group_of_anyio_beside_other_sessions() -> None:
     assert modes == ["GUIDED"] * 3
 
 
-async def test_our_heartbeat_goes_on_while_a_cancelled_program_lands(link: MemoryLink) -> None:
+async def test_heartbeat_continues_while_cancelled_program_lands(link: MemoryLink) -> None:
     """Without it, the vehicle's failsafe would act in the middle of the clean-up."""
     heartbeats: list[float] = []
 
@@ -153,9 +153,7 @@ async def test_our_heartbeat_goes_on_while_a_cancelled_program_lands(link: Memor
         write = link.write
 
         def noted(data: bytes, peer: object = None) -> None:
-            heartbeats.extend(
-                anyio.current_time() for frame in Framer().receive(data) if frame.message_id == 0
-            )
+            heartbeats.extend(anyio.current_time() for frame in Framer().receive(data) if frame.message_id == 0)
             write(data, peer)
 
         link.write = noted  # type: ignore[method-assign]
@@ -189,15 +187,15 @@ def break_encoder(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def break_framer(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(vehicle.connection._intake.framers, None, object())
+    monkeypatch.setitem(vehicle.connection._receiver.framers, None, object())
 
 
 def break_rates(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle._talk.rates, "_watch", broken)
+    monkeypatch.setattr(vehicle._session.rates, "_watch", broken)
 
 
 def break_link_watch(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle._talk.link_watch, "_report", broken)
+    monkeypatch.setattr(vehicle._session.link_watch, "_report", broken)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +203,7 @@ def break_link_watch(vehicle: Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
     [break_bus, break_encoder, break_framer, break_rates, break_link_watch],
     ids=lambda breaks: breaks.__name__,
 )
-async def test_a_mistake_inside_ends_the_connection_and_says_so(
+async def test_internal_error_ends_connection_with_message(
     link: MemoryLink,
     breaks: Callable[[Vehicle, pytest.MonkeyPatch], None],
     monkeypatch: pytest.MonkeyPatch,
@@ -217,12 +215,12 @@ async def test_a_mistake_inside_ends_the_connection_and_says_so(
             await vehicle.mode.wait_until(lambda mode: mode.name == "NEVER", timeout=10)
         assert caught.value.__cause__ is not None
         await anyio.sleep(1)  # the block is not cancelled
-        with pytest.raises(ConnectionClosed, match="mistake inside aerokit"):
+        with pytest.raises(ConnectionClosed, match="internal error of aerokit"):
             vehicle.send(COPTER)
 
 
-async def test_an_error_of_our_own_kind_that_nobody_catches_ends_it_too(link: MemoryLink) -> None:
-    """Only once it has ended is such an error what a task was told of that."""
+async def test_uncaught_aerokit_error_in_background_ends_connection(link: MemoryLink) -> None:
+    """Only after the end may a background task raise such an error."""
     async with connect(link) as vehicle:
         vehicle.connection.fail(InvalidArgument("from a task"))
         with pytest.raises(ConnectionClosed, match="from a task"):
@@ -232,7 +230,7 @@ async def test_an_error_of_our_own_kind_that_nobody_catches_ends_it_too(link: Me
 # ---------------------------------------------------------------------------- closing
 
 
-async def test_the_block_goes_on_after_close_inside_it(vehicle: Vehicle) -> None:
+async def test_block_continues_after_close(vehicle: Vehicle) -> None:
     started = anyio.current_time()
     vehicle.connection.close()
     vehicle.connection.close()
@@ -244,7 +242,7 @@ async def test_the_block_goes_on_after_close_inside_it(vehicle: Vehicle) -> None
     assert vehicle.mode_name == "STABILIZE"  # what was known can still be read
 
 
-async def test_closing_by_a_sink_in_the_middle_of_a_delivery(link: MemoryLink) -> None:
+async def test_sink_may_close_during_delivery(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
         heard: list[Heartbeat] = []
 
@@ -260,7 +258,7 @@ async def test_closing_by_a_sink_in_the_middle_of_a_delivery(link: MemoryLink) -
 
 
 @pytest.mark.parametrize("how", ["close", "lose"])
-async def test_whatever_waits_ends_at_that_instant(
+async def test_all_waiters_end_at_the_same_time(
     vehicle: Vehicle, link: MemoryLink, copter: SimulatedCopter, how: str
 ) -> None:
     copter.faults.silent = True
@@ -306,7 +304,7 @@ async def follow(vehicle: Vehicle) -> None:
         pass
 
 
-async def test_an_error_raised_often_does_not_gather_tracebacks(vehicle: Vehicle) -> None:
+async def test_repeated_raises_do_not_collect_tracebacks(vehicle: Vehicle) -> None:
     vehicle.connection.close()
     lengths = []
     for _ in range(5):
@@ -317,7 +315,7 @@ async def test_an_error_raised_often_does_not_gather_tracebacks(vehicle: Vehicle
     assert len(set(lengths)) == 1
 
 
-async def test_what_was_queued_is_read_before_the_loss(link: MemoryLink) -> None:
+async def test_queued_items_are_read_before_the_loss(link: MemoryLink) -> None:
     async with connect(link, rates={Attitude: 10}) as vehicle:
         with vehicle.subscribe(Attitude, events.LinkClosed, capacity=100) as items:
             await anyio.sleep(1)
@@ -331,7 +329,7 @@ async def test_what_was_queued_is_read_before_the_loss(link: MemoryLink) -> None
     assert set(seen[:-1]) == {Attitude}
 
 
-async def test_enders_that_raise_do_not_keep_the_end_from_others(
+async def test_end_callback_exception_does_not_affect_others(
     link: MemoryLink, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with open_connection(link) as connection:
@@ -342,13 +340,13 @@ async def test_enders_that_raise_do_not_keep_the_end_from_others(
             connection.close()
         assert [type(error) for error in told] == [ConnectionClosed]
         connection.on_end(told.append)
-        assert len(told) == 2  # who comes late is told at once
+        assert len(told) == 2  # a late callback is called at once
 
 
-async def test_a_link_is_used_once() -> None:
+async def test_link_is_used_once() -> None:
     near, far = memory_link_pair()
     async with open_connection(near):
-        with pytest.raises(BusyError, match="opened once"):
+        with pytest.raises(BusyError, match="opened only once"):
             async with open_connection(near):
                 pytest.fail("it is open already")
     with pytest.raises(ConnectionClosed, match="make a new link"):
@@ -357,7 +355,7 @@ async def test_a_link_is_used_once() -> None:
     far.close()
 
 
-async def test_a_vehicle_whose_block_was_left_on_a_connection_that_stays(link: MemoryLink) -> None:
+async def test_vehicle_after_its_block_on_open_connection(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
         async with connect(connection) as vehicle:
             waiting = asyncio.ensure_future(vehicle.mode.wait_until(lambda _: False))
@@ -373,7 +371,7 @@ async def test_a_vehicle_whose_block_was_left_on_a_connection_that_stays(link: M
 # ------------------------------------------------------------------------------ reentrancy
 
 
-async def test_a_sink_may_subscribe_send_and_detach(link: MemoryLink) -> None:
+async def test_sink_may_subscribe_send_and_detach(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
         heard: list[str] = []
 
@@ -390,7 +388,7 @@ async def test_a_sink_may_subscribe_send_and_detach(link: MemoryLink) -> None:
         assert heard == ["first", "new"]
 
 
-async def test_a_subscription_is_entered_once(link: MemoryLink) -> None:
+async def test_subscription_can_be_entered_once(link: MemoryLink) -> None:
     async with open_connection(link) as connection:
         subscription = connection.subscribe(Heartbeat)
         with subscription, pytest.raises(BusyError, match="entered once"):
@@ -399,7 +397,7 @@ async def test_a_subscription_is_entered_once(link: MemoryLink) -> None:
             subscription.__enter__()
 
 
-async def test_a_subscription_that_is_refused_leaves_nothing_attached(vehicle: Vehicle) -> None:
+async def test_refused_subscription_attaches_nothing(vehicle: Vehicle) -> None:
     before = dict(vehicle.connection.bus.wanted)
     for rate_hz in (0, -1, 1001, float("nan")):
         with pytest.raises(InvalidArgument, match="rate_hz"):
@@ -407,7 +405,7 @@ async def test_a_subscription_that_is_refused_leaves_nothing_attached(vehicle: V
     assert vehicle.connection.bus.wanted == before
 
 
-async def test_an_old_vehicle_speaks_mavlink_1(link: MemoryLink) -> None:
+async def test_vehicle_with_mavlink_1(link: MemoryLink) -> None:
     async with connect(link, mavlink_version=1) as vehicle:
         await vehicle.wait_ready()
         await vehicle.set_mode("GUIDED")

@@ -38,7 +38,7 @@ NEWS = (
     events.LinkInterrupted,
     events.LinkRestored,
     events.VehicleSilent,
-    events.VehicleBack,
+    events.VehicleRecovered,
     events.VehicleRebooted,
     events.LinkClosed,
 )
@@ -71,7 +71,7 @@ class CableEnd(BaseLink):
 
 
 class Cable:
-    """To a simulated vehicle; it can be pulled out and plugged in again."""
+    """Cable to a simulated vehicle, which can be unplugged and plugged in."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -108,16 +108,12 @@ class Cable:
         self.plug_in()
 
     def asked_for(self, kind: type[m.Attitude]) -> int:
-        """How often the vehicle was asked for this message."""
-        return sum(
-            each.command == MavCmd.SET_MESSAGE_INTERVAL and each.param1 == kind.ID for each in self.sent
-        )
+        """Number of requests to the vehicle for this message."""
+        return sum(each.command == MavCmd.SET_MESSAGE_INTERVAL and each.param1 == kind.ID for each in self.sent)
 
 
 @asynccontextmanager
-async def cabled(
-    copter: SimulatedCopter | None = None, **options: Any
-) -> AsyncIterator[tuple[Cable, Vehicle]]:
+async def cabled(copter: SimulatedCopter | None = None, **options: Any) -> AsyncIterator[tuple[Cable, Vehicle]]:
     async with simulated_link(copter or SimulatedCopter(boot_time_s=0)) as link:
         cable = Cable(link)
         await link.open(cable)
@@ -131,7 +127,7 @@ async def cabled(
 # ------------------------------------------------------------------------------ a program goes on
 
 
-async def test_what_is_told_of_an_interruption() -> None:
+async def test_interruption_events() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
         with vehicle.subscribe(*NEWS, capacity=9) as news:
@@ -141,7 +137,7 @@ async def test_what_is_told_of_an_interruption() -> None:
             "LinkInterrupted",
             "VehicleSilent",
             "LinkRestored",
-            "VehicleBack",
+            "VehicleRecovered",
         ]
         interrupted, _, restored, _ = heard
         assert isinstance(interrupted, events.LinkInterrupted)
@@ -151,7 +147,7 @@ async def test_what_is_told_of_an_interruption() -> None:
         assert vehicle.connection.is_open
 
 
-async def test_telemetry_rates_commands_and_parameters_go_on() -> None:
+async def test_rates_commands_and_parameters_continue_after_interruption() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
         asked = cable.asked_for(m.Attitude)
@@ -165,7 +161,7 @@ async def test_telemetry_rates_commands_and_parameters_go_on() -> None:
         assert len(await vehicle.parameters.download()) > 100
 
 
-async def test_what_is_asked_while_the_link_is_away_times_out_and_raises_nothing_else() -> None:
+async def test_calls_during_interruption_only_time_out() -> None:
     async with cabled() as (cable, vehicle):
         cable.pull()
         vehicle.send(m.Ping(0, 0, 0, 0))
@@ -177,7 +173,7 @@ async def test_what_is_asked_while_the_link_is_away_times_out_and_raises_nothing
         await vehicle.command(MavCmd.DO_SEND_BANNER)
 
 
-async def test_a_transfer_and_a_flight_outlive_a_short_interruption() -> None:
+async def test_transfer_and_flight_survive_short_interruption() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()
         await vehicle.set_mode("GUIDED")
@@ -199,7 +195,7 @@ async def test_a_transfer_and_a_flight_outlive_a_short_interruption() -> None:
         assert len(tables[0]) > 100
 
 
-async def test_a_vehicle_that_was_switched_off_with_its_cable() -> None:
+async def test_vehicle_switched_off_with_its_cable() -> None:
     copter = SimulatedCopter(boot_time_s=3)
     async with cabled(copter) as (cable, vehicle):
         await vehicle.wait_ready()
@@ -213,7 +209,7 @@ async def test_a_vehicle_that_was_switched_off_with_its_cable() -> None:
         await vehicle.wait_ready()
 
 
-async def test_a_vehicle_is_looked_for_on_a_link_that_comes_back() -> None:
+async def test_connect_finds_vehicle_on_restored_link() -> None:
     copter = SimulatedCopter(boot_time_s=0)
     copter.faults.silent = True
 
@@ -232,7 +228,7 @@ async def test_a_vehicle_is_looked_for_on_a_link_that_comes_back() -> None:
         link.close()
 
 
-async def test_half_a_frame_and_the_beginning_of_a_new_stream() -> None:
+async def test_partial_frame_before_a_new_stream() -> None:
     link, encoder = OneEnd(), FrameEncoder(1, 1)
     heard: list[int] = []
     async with open_connection(link) as connection:
@@ -272,17 +268,17 @@ class OneEnd(BaseLink):
 # ----------------------------------------------------------------------------------- arguments
 
 
-async def test_a_link_can_be_opened_once_only() -> None:
+async def test_link_object_can_be_opened_only_once() -> None:
     with pytest.raises(InvalidArgument, match="ReconnectingLink"):
         async with connect(OneEnd(), reconnect=True):
             pytest.fail("it could not be opened again")
     async with open_connection(OneEnd()) as connection:
-        with pytest.raises(InvalidArgument, match="say it to open_connection"):
+        with pytest.raises(InvalidArgument, match="pass it to open_connection"):
             async with connect(connection, reconnect=True):
                 pytest.fail("the connection is open already")
 
 
-async def test_a_recording_ends_all_the_same(tmp_path: Any) -> None:
+async def test_recording_ends_despite_reconnect(tmp_path: Any) -> None:
     path = tmp_path / "flight.tlog"
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link, record=path) as vehicle:
         await vehicle.wait_ready()
@@ -314,12 +310,12 @@ class Interrupted:
             self.vehicle.connection.close()
 
 
-def test_cancelled_at_any_turn_of_the_loop_it_leaves_nothing_behind() -> None:
+def test_cancelled_at_any_iteration_leaves_nothing_behind() -> None:
     for turns in range(0, 150, 3):
         run_and_do(Interrupted().run, turns, lambda task: task.cancel())
 
 
-def test_closed_at_any_turn_of_the_loop_it_leaves_nothing_behind() -> None:
+def test_closed_at_any_iteration_leaves_nothing_behind() -> None:
     for turns in range(0, 150, 3):
         program = Interrupted()
         run_and_do(program.run, turns, program.close)
@@ -335,7 +331,7 @@ class TestServers:
     def anyio_backend(self) -> tuple[str, dict[str, Any]]:
         return "asyncio", {}
 
-    async def test_a_server_that_is_started_again(self) -> None:
+    async def test_restarted_server(self) -> None:
         copter = SimulatedCopter(boot_time_s=0)
         async with open_simulator(copter, "tcpin:127.0.0.1:0", speedup=20) as simulator:
             address = simulator.addresses[0]
@@ -352,12 +348,12 @@ class TestServers:
         finally:
             await exit_stack.__aexit__(None, None, None)
 
-    async def test_a_client_that_comes_back_from_another_port_is_heard_at_once(self) -> None:
+    async def test_client_from_other_port_is_accepted_at_once(self) -> None:
         """With ``tcpin:`` the link is never lost; the vehicle's new connection is not a second vehicle."""
-        doubles: list[events.HeardTwice] = []
+        doubles: list[events.DuplicateSender] = []
         encoder = FrameEncoder(1, 1)
         async with open_connection("tcpin:127.0.0.1:0") as connection:
-            connection.bus.attach_event(events.HeardTwice, doubles.append)
+            connection.bus.attach_event(events.DuplicateSender, doubles.append)
             port = int(connection.link.address.rpartition(":")[2])
             with connection.subscribe(m.Heartbeat, capacity=9) as heartbeats:
                 for _ in range(2):
@@ -389,7 +385,7 @@ class Deaf:
         """Nothing to do."""
 
 
-async def test_a_link_that_is_opened_again_is_lost_and_then_connected() -> None:
+async def test_reopened_link_is_lost_and_then_connected() -> None:
     link = OneEnd()
     async with open_connection(link) as connection:
         with connection.subscribe(events.LinkStateChanged, capacity=20) as changes:

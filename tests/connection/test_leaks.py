@@ -55,9 +55,7 @@ async def fly(vehicle: Vehicle) -> None:
     await vehicle.land()
 
 
-each_use = pytest.mark.parametrize(
-    "use", [arm, *map(exhaustive, (nothing, read, fly))], ids=lambda use: use.__name__
-)
+each_use = pytest.mark.parametrize("use", [arm, *map(exhaustive, (nothing, read, fly))], ids=lambda use: use.__name__)
 
 
 class Session:
@@ -88,7 +86,7 @@ class Session:
 
 
 def turns_of(use: Use) -> int:
-    """How many turns of the loop it takes when nobody disturbs it."""
+    """Number of loop iterations of an undisturbed run."""
     turns: list[int] = []
 
     async def measured() -> None:
@@ -109,7 +107,7 @@ def some_of(turns: int, most: int) -> list[int]:
 
 
 @each_use
-def test_cancelled_at_any_turn(use: Use) -> None:
+def test_cancelled_at_any_iteration(use: Use) -> None:
     for turns in some_of(turns_of(use), 40):
         cancelled: list[bool] = []
         task = run_and_do(
@@ -121,7 +119,7 @@ def test_cancelled_at_any_turn(use: Use) -> None:
 
 
 @pytest.mark.parametrize("use", [nothing, exhaustive(fly)], ids=lambda use: use.__name__)
-def test_cancelled_by_a_scope_at_any_turn(use: Use) -> None:
+def test_cancelled_by_scope_at_any_iteration(use: Use) -> None:
     """As asyncio.timeout and anyio.fail_after do it: afterwards the program goes on, with nothing pending."""
     scopes: list[anyio.CancelScope] = []
 
@@ -140,7 +138,7 @@ def test_cancelled_by_a_scope_at_any_turn(use: Use) -> None:
 
 
 @each_use
-def test_the_link_is_lost_at_any_turn(use: Use) -> None:
+def test_link_lost_at_any_iteration(use: Use) -> None:
     for turns in some_of(turns_of(use), 30):
         session = Session(use)
         task = run_and_do(session.run, turns, lambda _, session=session: session.lose_link())  # type: ignore[misc]
@@ -148,14 +146,14 @@ def test_the_link_is_lost_at_any_turn(use: Use) -> None:
 
 
 @each_use
-def test_the_connection_is_closed_at_any_turn(use: Use) -> None:
+def test_connection_closed_at_any_iteration(use: Use) -> None:
     for turns in some_of(turns_of(use), 30):
         session = Session(use)
         task = run_and_do(session.run, turns, lambda _, session=session: session.close())  # type: ignore[misc]
         assert type(task.exception()) in (type(None), ConnectionClosed, SetpointStreamStopped), turns
 
 
-def test_a_connection_that_has_ended_is_garbage() -> None:
+def test_ended_connection_is_garbage() -> None:
     async def program() -> list[weakref.ref[object]]:
         async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
             await arm(vehicle)
@@ -166,7 +164,7 @@ def test_a_connection_that_has_ended_is_garbage() -> None:
     assert [reference() for reference in references] == [None, None]
 
 
-def test_an_exception_of_the_body_does_not_keep_its_frames_in_a_circle() -> None:
+def test_block_exception_keeps_no_reference_cycle() -> None:
     """They are gone as soon as the exception is, not when the garbage collector comes by."""
 
     class Precious:
@@ -196,7 +194,7 @@ def test_an_exception_of_the_body_does_not_keep_its_frames_in_a_circle() -> None
         gc.enable()
 
 
-def test_a_hundred_connections_leave_as_little_as_one() -> None:
+def test_hundred_connections_leave_no_more_than_one() -> None:
     async def program() -> None:
         async with (
             simulated_link(SimulatedCopter(boot_time_s=0)) as link,
@@ -218,7 +216,7 @@ def _attachments(connection: Connection) -> tuple[int, int, int, int]:
     bus = connection.bus
     sinks = sum(len(sinks) for sinks in bus._sinks.values())
     events = sum(len(sinks) for sinks in bus._event_sinks.values())
-    return sinks, events, len(connection._ending._enders), len(connection._background)
+    return sinks, events, len(connection._end_signal._callbacks), len(connection._background)
 
 
 PROGRAM = """
@@ -250,8 +248,8 @@ asyncio.run(main())
     ],
     ids=["return", "exit", "interrupt"],
 )
-def test_a_program_with_an_unanswered_call_exits(tmp_path: Path, ending: str, code: int) -> None:
-    """As a program of its own: with a thread or a shield left over it would hang."""
+def test_program_with_unanswered_call_exits(tmp_path: Path, ending: str, code: int) -> None:
+    """In a separate process, which would hang with a thread or shield left over."""
     file = tmp_path / "program.py"
     file.write_text(PROGRAM.format(ending=ending))
     source = Path(__file__).parents[2] / "src"

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import messages as m
-from aerokit.connection.components import HardwareId
 from aerokit.connection.multilink.duplicates import Copies
-from aerokit.connection.multilink.link_choice import PROOFS, SILENT_S, LinkChoice
-from aerokit.connection.multilink.vehicle_clock import VehicleClock
+from aerokit.connection.multilink.link_choice import MIN_CLOCK_MATCHES, PROBED_TIMEOUT_S, LinkChoice
+from aerokit.connection.multilink.vehicle_clock import HardwareId, VehicleClock
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
 
@@ -40,7 +39,7 @@ STEPS = st.lists(
 
 
 @given(STEPS)
-def test_nothing_goes_over_a_link_that_was_not_shown_to_lead_there(
+def test_unproven_link_is_never_used(
     steps: list[tuple[str, int, float, float]],
 ) -> None:
     """Link 2 leads to another vehicle: its clock is 300 s ahead, or more when ours has paused or rebooted.
@@ -48,30 +47,30 @@ def test_nothing_goes_over_a_link_that_was_not_shown_to_lead_there(
     Both are simulated on one machine, so that they tell the same hardware id.
     """
     choice, now, begin = LinkChoice(needs_proof=True), 1.0, -50.0
-    choice.heard(0, now, is_costly=False)
+    choice.record_heartbeat(0, now, is_costly=False)
     assert choice.choose(now) == "first heard"
     received = 0
     for what, link, later, round_trip in steps:
         now += later
         candidate = (
-            choice.heard(link, now, is_costly=link == 1) if what == "heard" else choice.candidates.get(link)
+            choice.record_heartbeat(link, now, is_costly=link == 1) if what == "heard" else choice.candidates.get(link)
         )
         if candidate is None:
             continue
         if what == "counts":
             received += 5
-            candidate.note_counts(received, 1, now)
+            candidate.record_counts(received, 1, now)
         elif what == "answer":
             told = now + 350.0 if link == 2 else max(0.0, now - begin)
-            choice.note_answer(link, now - round_trip / 2, told, round_trip, now)
+            choice.record_answer(link, now - round_trip / 2, told, round_trip, now)
         elif what == "hardware":
-            choice.note_hardware(link, HardwareId(b"A" * 18, 0))
+            choice.record_hardware(link, HardwareId(b"A" * 18, 0))
         elif what == "pause":
             begin += later
         elif what == "reboot":
             begin = now
         elif what in ("there", "gone"):
-            candidate.is_there = what == "there"
+            candidate.is_available = what == "there"
         elif what in ("stalled", "drained"):
             candidate.is_stalled = what == "stalled"
         before = choice.used
@@ -89,103 +88,103 @@ def test_nothing_goes_over_a_link_that_was_not_shown_to_lead_there(
 
 
 @given(st.floats(0.2, 20.0), st.floats(-1e5, 1e5), st.lists(st.floats(0.0, 0.4), min_size=3, max_size=30))
-def test_a_clock_goes_on_at_whatever_speed(speed: float, begin: float, round_trips: list[float]) -> None:
+def test_clock_continues_at_any_speed(speed: float, begin: float, round_trips: list[float]) -> None:
     """Answers come with delays that are not the same both ways."""
     clock, now = VehicleClock(), 100.0
     for index, round_trip in enumerate(round_trips):
         now += 0.5
         told = begin + speed * (now - round_trip / 2 + (round_trip / 2) * 0.2 * (-1) ** index)
         at = now - round_trip / 2
-        assert clock.agrees(at, told, round_trip) is not False
-        assert not clock.agrees(at, told + 60.0 * max(1.0, speed), round_trip)
-        assert clock.note(at, told, round_trip)
+        assert clock.matches(at, told, round_trip) is not False
+        assert not clock.matches(at, told + 60.0 * max(1.0, speed), round_trip)
+        assert clock.add(at, told, round_trip)
 
 
-def test_a_reboot_takes_the_proof_away_and_the_same_clock_gives_it_back() -> None:
+def test_reboot_resets_proof_until_clock_matches_again() -> None:
     choice = LinkChoice(needs_proof=True)
     for link in (0, 1):
-        choice.heard(link, 0.0, is_costly=False)
+        choice.record_heartbeat(link, 0.0, is_costly=False)
     choice.choose(0.0)
-    for step in range(PROOFS + 1):
+    for step in range(MIN_CLOCK_MATCHES + 1):
         for link in (0, 1):
-            choice.note_answer(link, step, step + 70.0, 0.01, step)
+            choice.record_answer(link, step, step + 70.0, 0.01, step)
     second = choice.candidates[1]
     proofs = [second.is_proven]
-    choice.note_answer(0, 5.0, 1.0, 0.01, 5.0)
+    choice.record_answer(0, 5.0, 1.0, 0.01, 5.0)
     assert [*proofs, second.is_proven] == [True, False]
-    choice.note_answer(0, 6.0, 2.0, 0.01, 6.0)
-    for step in range(PROOFS):
-        choice.note_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
+    choice.record_answer(0, 6.0, 2.0, 0.01, 6.0)
+    for step in range(MIN_CLOCK_MATCHES):
+        choice.record_answer(1, 6.0 + step, 2.0 + step, 0.01, 6.0 + step)
     assert choice.candidates[1].is_proven
 
 
-def test_a_clock_that_paused_goes_on_and_keeps_its_speed() -> None:
+def test_paused_clock_continues_at_the_same_speed() -> None:
     clock = VehicleClock()
     for step in range(10):
-        assert clock.note(step, 70.0 + step, 0.01)
-    assert clock.note(11.5, 79.0 + 1.0, 0.01), "it stood still for 1.5 s"
-    assert clock.agrees(12.5, 81.0, 0.01)
-    assert not clock.agrees(12.5, 82.5, 0.01)
-    assert not clock.note(13.0, 3.0, 0.01), "it has rebooted"
-    assert clock.agrees(14.0, 4.0, 0.01)
+        assert clock.add(step, 70.0 + step, 0.01)
+    assert clock.add(11.5, 79.0 + 1.0, 0.01), "it stood still for 1.5 s"
+    assert clock.matches(12.5, 81.0, 0.01)
+    assert not clock.matches(12.5, 82.5, 0.01)
+    assert not clock.add(13.0, 3.0, 0.01), "it has rebooted"
+    assert clock.matches(14.0, 4.0, 0.01)
 
 
 @given(st.floats(0.2, 20.0), st.floats(0.2, 20.0))
-def test_a_clock_whose_speed_was_changed_is_measured_anew(before: float, after: float) -> None:
+def test_changed_clock_speed_is_measured_again(before: float, after: float) -> None:
     clock, told = VehicleClock(), 0.0
     for step in range(40):
         told += 0.5 * (before if step < 10 else after)
-        clock.note(step / 2, told, 0.01)
-    assert clock.agrees(21.0, told + 1.5 * after, 0.01)
+        clock.add(step / 2, told, 0.01)
+    assert clock.matches(21.0, told + 1.5 * after, 0.01)
 
 
-def test_hardware_alone_proves_who_was_proven_before_a_reboot_and_is_alone() -> None:
+def test_hardware_alone_proves_only_previously_proven_link() -> None:
     """The link in use dies with the reboot, and a pause makes the other one's clock useless."""
     for was_proven in (True, False):
         choice = LinkChoice(needs_proof=True)
         for link in (0, 1):
-            choice.heard(link, 0.0, is_costly=False)
+            choice.record_heartbeat(link, 0.0, is_costly=False)
         choice.choose(0.0)
         for step in range(10):
             for link in (0, 1) if was_proven else (0,):
-                choice.note_answer(link, step, step + 70.0, 0.01, step)
-        choice.note_hardware(0, HardwareId(b"A" * 18, 0))
-        choice.note_answer(0, 10.0, 1.0, 0.01, 10.0)
+                choice.record_answer(link, step, step + 70.0, 0.01, step)
+        choice.record_hardware(0, HardwareId(b"A" * 18, 0))
+        choice.record_answer(0, 10.0, 1.0, 0.01, 10.0)
         second = choice.candidates[1]
         assert (second.is_proven, second.was_proven) == (False, was_proven)
         for step in range(11, 20):
-            choice.note_hardware(1, HardwareId(b"A" * 18, 0))
-            choice.note_answer(1, step, step - 11.0, 0.01, step)
+            choice.record_hardware(1, HardwareId(b"A" * 18, 0))
+            choice.record_answer(1, step, step - 11.0, 0.01, step)
         assert second.is_proven is was_proven
-        choice.note_hardware(1, HardwareId(b"B" * 18, 0))
+        choice.record_hardware(1, HardwareId(b"B" * 18, 0))
         assert not choice.may_be_used(second)
 
 
-def test_who_tells_another_hardware_after_a_reboot_is_not_believed_by_its_clock() -> None:
+def test_other_hardware_after_reboot_outweighs_the_clock() -> None:
     """Two vehicles that are switched off and on together; the link in use dies before ours has told its id again."""
     choice = LinkChoice(needs_proof=True)
     for link in (0, 1):
-        choice.heard(link, 0.0, is_costly=False)
+        choice.record_heartbeat(link, 0.0, is_costly=False)
     choice.choose(0.0)
     for step in range(10):
-        choice.note_answer(0, step, step + 70.0, 0.01, step)
-    choice.note_hardware(0, HardwareId(b"A" * 18, 0))
-    choice.note_answer(0, 10.0, 1.0, 0.01, 10.0)
+        choice.record_answer(0, step, step + 70.0, 0.01, step)
+    choice.record_hardware(0, HardwareId(b"A" * 18, 0))
+    choice.record_answer(0, 10.0, 1.0, 0.01, 10.0)
     for step in range(11, 20):
-        choice.note_hardware(1, HardwareId(b"B" * 18, 0))
-        choice.note_answer(1, step, step - 9.0, 0.01, step)
+        choice.record_hardware(1, HardwareId(b"B" * 18, 0))
+        choice.record_answer(1, step, step - 9.0, 0.01, step)
     assert not choice.may_be_used(choice.candidates[1])
 
 
 def test_silence_counts_from_the_last_frame() -> None:
     choice = LinkChoice(needs_proof=False)
-    first = choice.heard(0, 0.0, is_costly=False)
-    second = choice.heard(1, 0.0, is_costly=False)
+    first = choice.record_heartbeat(0, 0.0, is_costly=False)
+    second = choice.record_heartbeat(1, 0.0, is_costly=False)
     choice.choose(0.0)
-    first.note_round_trip(0.05, 1.0)
-    second.heard_at = 1.0 + SILENT_S
-    assert choice.choose(1.0 + SILENT_S) is None
-    assert choice.choose(1.01 + SILENT_S) == "silent"
+    first.record_round_trip(0.05, 1.0)
+    second.received_at = 1.0 + PROBED_TIMEOUT_S
+    assert choice.choose(1.0 + PROBED_TIMEOUT_S) is None
+    assert choice.choose(1.01 + PROBED_TIMEOUT_S) == "silent"
     assert choice.used is second
     assert math.isclose(choice.fresh_after, 1.0 - 0.025 + 0.05)
 
@@ -198,7 +197,7 @@ def frame_of(sequence: int, at: float, value: int = 0) -> Frame:
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.floats(0.0, 2.0)), max_size=6), st.integers(0, 255))
-def test_of_copies_exactly_one_is_taken(rest: list[tuple[int, float]], sequence: int) -> None:
+def test_one_copy_of_each_frame_is_accepted(rest: list[tuple[int, float]], sequence: int) -> None:
     copies, seen = Copies(), set[int]()
     taken = 0
     for link, delay in sorted(rest, key=lambda each: each[1]):
@@ -207,13 +206,13 @@ def test_of_copies_exactly_one_is_taken(rest: list[tuple[int, float]], sequence:
         seen.add(link)
         if not copies.is_copy(frame_of(sequence, 10.0 + delay), link):
             taken += 1
-            copies.take()
+            copies.accept()
         else:
-            assert copies.was_taken
+            assert copies.was_accepted
     assert taken == (1 if seen else 0)
 
 
-def test_the_same_bytes_over_the_same_link_or_much_later_are_no_copy() -> None:
+def test_equal_bytes_same_link_or_later_are_not_copies() -> None:
     copies = Copies()
     assert not copies.is_copy(frame_of(7, 0.0), 0)
     assert not copies.is_copy(frame_of(7, 0.1), 0)

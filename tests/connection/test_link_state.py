@@ -9,7 +9,7 @@ from flight_harness import Flight
 from aerokit import LinkState, connect, events, open_connection
 from aerokit.connection.bus import Bus, Subscription
 from aerokit.connection.cells import StateCell
-from aerokit.connection.link_state import LinkStateWatch
+from aerokit.connection.heartbeats import LinkStateTracker
 from aerokit.errors import BusyError, ConnectionClosed, LinkLost
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.transport import memory_link_pair
@@ -26,7 +26,7 @@ def told(changes: Subscription[events.LinkStateChanged]) -> list[tuple[int, Link
     return found
 
 
-async def test_the_way_from_connected_to_lost_is_a_state_and_an_event(grounded: Flight) -> None:
+async def test_states_from_connected_to_lost_with_events(grounded: Flight) -> None:
     vehicle, connection = grounded.vehicle, grounded.vehicle.connection
     with connection.subscribe(events.LinkStateChanged, capacity=20) as changes:
         assert (vehicle.link_state.value, connection.link_state.value) == (CONNECTED, CONNECTED)
@@ -49,14 +49,14 @@ async def test_the_way_from_connected_to_lost_is_a_state_and_an_event(grounded: 
         ]
 
 
-def test_silence_begins_after_three_and_a_half_seconds_without_a_frame() -> None:
+def test_silence_starts_after_three_and_a_half_seconds() -> None:
     bus, now = Bus(), 0.0
     seen: list[events.LinkStateChanged] = []
     bus.attach_event(events.LinkStateChanged, seen.append)
-    watch = LinkStateWatch(StateCell("link_state", lambda: now, "frame"), bus, system_id=7)
+    watch = LinkStateTracker(StateCell("link_state", lambda: now, "frame"), bus, system_id=7)
     states = []
     for now, frames in ((0.0, 0), (1.0, 0), (9.0, 1), (12.5, 1), (12.6, 1), (99.0, 1), (99.1, 2), (102.6, 2)):
-        watch.count(now, frames)
+        watch.update(now, frames)
         states.append(watch.state)
     assert states == [None, None, CONNECTED, CONNECTED, SILENT, SILENT, CONNECTED, CONNECTED]
     assert seen == [
@@ -65,7 +65,7 @@ def test_silence_begins_after_three_and_a_half_seconds_without_a_frame() -> None
     ]
 
 
-async def test_after_the_link_is_lost_the_vehicle_is_silent(grounded: Flight) -> None:
+async def test_vehicle_is_silent_after_link_loss(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     vehicle.connection.link_lost(LinkLost("unplugged"))
     assert vehicle.is_silent
@@ -76,7 +76,7 @@ async def test_after_the_link_is_lost_the_vehicle_is_silent(grounded: Flight) ->
         await vehicle.link_state.wait_until(lambda state: state is CONNECTED)
 
 
-async def test_what_the_program_closes_itself_is_lost_without_an_event() -> None:
+async def test_closed_connection_is_lost_without_event() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, open_connection(link) as connection:
         with connection.subscribe(events.LinkStateChanged, capacity=20) as changes:
             async with connect(connection) as vehicle:
@@ -87,17 +87,17 @@ async def test_what_the_program_closes_itself_is_lost_without_an_event() -> None
         assert told(changes) == []
 
 
-async def test_nobody_there_is_silence() -> None:
+async def test_no_sender_means_silent() -> None:
     near, _ = memory_link_pair()
     async with open_connection(near) as connection:
         assert connection.link_state.value is CONNECTED
         await connection.link_state.wait_until(lambda state: state is SILENT, timeout=5)
 
 
-async def test_a_link_that_is_in_use_is_left_alone(grounded: Flight) -> None:
+async def test_link_in_use_is_not_closed(grounded: Flight) -> None:
     """The second one is refused; the first flies on."""
     vehicle = grounded.vehicle
-    with pytest.raises(BusyError, match="a link is opened once"):
+    with pytest.raises(BusyError, match="a link can be opened only once"):
         async with connect(vehicle.connection.link):
             pytest.fail("it is in use")
     before = vehicle.mode.updated_at

@@ -1,4 +1,4 @@
-"""Others who speak in a vehicle's name, or fill what there is of room: a link whose peers are "port@host"."""
+"""Duplicate senders and full tables, on a link whose peers are named ``PORT@HOST``."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from test_routes import ATTITUDE, COPTER, PeersLink, command
 import aerokit
 from aerokit import Signing, SigningKey, events, open_connection
 from aerokit.connection.connection import Connection
-from aerokit.connection.frame_receiver import MOST_STRANGERS
-from aerokit.connection.routes import MOST_CLAIMS, Routes
+from aerokit.connection.frame_receiver import MAX_UNVERIFIED_PEERS
+from aerokit.connection.routes import MAX_CLAIMS, Routes
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, SystemTime
 
-MOST_PEERS = 256
-MOST_ROUTES = 1024
-MOST_SENDERS = 2048
+MAX_PEERS = 256
+MAX_ROUTES = 1024
+MAX_SENDERS = 2048
 
 pytestmark = pytest.mark.anyio
 
@@ -30,7 +30,7 @@ ARMED = Heartbeat(2, 3, 81 | 128, 4, 4)
 
 
 class KeptPeers(PeersLink):
-    """Remembers whom the connection keeps, as UdpListen does."""
+    """Remembers the peers that the connection keeps, like UdpListen."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -77,7 +77,7 @@ async def link() -> KeptPeers:
 
 @asynccontextmanager
 async def flown(link: KeptPeers, **options: object) -> AsyncIterator[tuple[aerokit.Vehicle, Copter]]:
-    """A vehicle that has been heard from "14550@copter" for some seconds, armed."""
+    """An armed vehicle that was received from "14550@copter" for some seconds."""
     async with open_connection(link, **options) as connection:  # type: ignore[arg-type]
         copter = Copter(link)
         copter.say("14550@copter", ARMED)
@@ -98,7 +98,7 @@ def signed_by(key: SigningKey) -> FrameEncoder:
 
 def told(connection: Connection) -> list[events.Event]:
     heard: list[events.Event] = []
-    for kind in (events.HeardTwice, events.VehicleMoved, events.MoveRefused, events.ArmedChanged):
+    for kind in (events.DuplicateSender, events.RouteChanged, events.RouteChangeRefused, events.ArmedChanged):
         connection.bus.attach_event(kind, heard.append)
     return heard
 
@@ -113,13 +113,13 @@ def peer_of(vehicle: aerokit.Vehicle, link: KeptPeers) -> object:
 # -------------------------------------------------------------------------------------- room
 
 
-async def test_who_sends_noise_holds_no_place_and_pushes_nobody_out(link: KeptPeers) -> None:
+async def test_noise_evicts_no_peer(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         connection = vehicle.connection
         for port in range(300):
             connection.bytes_received(b"\xfd", f"{port}@stranger")
         assert link.kept == ["14550@copter"]
-        assert len(list(connection.statistics())) == 1 + MOST_STRANGERS
+        assert len(list(connection.statistics())) == 1 + MAX_UNVERIFIED_PEERS
         intruder = Copter(link, 77)
         intruder.say("666@stranger", DISARMED, DISARMED)
         assert is_armed(vehicle)
@@ -128,19 +128,19 @@ async def test_who_sends_noise_holds_no_place_and_pushes_nobody_out(link: KeptPe
         assert peer_of(vehicle, link) == "14550@copter"
 
 
-async def test_a_peer_with_a_live_route_is_never_forgotten_for_another_one(link: KeptPeers) -> None:
+async def test_peer_with_live_route_is_never_evicted(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, _):
         connection = vehicle.connection
         await anyio.sleep(100)
-        for port in range(2 * MOST_PEERS):
+        for port in range(2 * MAX_PEERS):
             connection.bytes_received(FrameEncoder(250, 1).encode(ATTITUDE), f"{port}@stranger")
         assert "14550@copter" in link.kept
-        assert len(link.kept) == MOST_PEERS
+        assert len(link.kept) == MAX_PEERS
 
 
-async def test_while_all_places_are_taken_by_the_living_nobody_new_is_heard(link: KeptPeers) -> None:
+async def test_new_sender_is_ignored_while_table_is_full(link: KeptPeers) -> None:
     async with open_connection(link) as connection:
-        for port in range(MOST_PEERS):
+        for port in range(MAX_PEERS):
             link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
         heard: list[Message] = []
         connection.bus.attach(Attitude, heard.append)
@@ -148,50 +148,50 @@ async def test_while_all_places_are_taken_by_the_living_nobody_new_is_heard(link
         assert heard == []
         await anyio.sleep(31)
         link.hear("late@comer", (251, 1), ATTITUDE)
-        assert (len(heard), len(link.kept)) == (1, MOST_PEERS)
+        assert (len(heard), len(link.kept)) == (1, MAX_PEERS)
 
 
-async def test_who_is_not_listened_to_takes_no_place_among_the_counted(link: KeptPeers) -> None:
+async def test_ignored_sender_gets_no_counters(link: KeptPeers) -> None:
     async with open_connection(link) as connection:
-        for port in range(MOST_PEERS):
+        for port in range(MAX_PEERS):
             link.hear(f"{port}@swarm", (1 + port % 250, 1 + port // 250), COPTER)
-        for port in range(MOST_SENDERS):
+        for port in range(MAX_SENDERS):
             link.hear(f"{port}@late", (251, 1), ATTITUDE)
         for component_id in range(100, 200):
             link.hear("0@swarm", (1, component_id), COPTER)
         counted = [source for each in connection.statistics() for source in each.sources]
-        assert len(counted) == MOST_PEERS + 100
+        assert len(counted) == MAX_PEERS + 100
 
 
-async def test_who_is_forgotten_gives_back_its_places_among_the_counted(link: KeptPeers) -> None:
+async def test_evicted_peer_frees_its_counters(link: KeptPeers) -> None:
     async with open_connection(link) as connection:
-        for port in range(MOST_SENDERS // 8):
+        for port in range(MAX_SENDERS // 8):
             for component_id in range(1, 9):
                 link.hear(f"{port}@swarm", (1 + port % 250, component_id + 8 * (port // 250)), ATTITUDE)
         for port in range(100):
             link.hear(f"{port}@new", (251, 1), ATTITUDE)
         counted = sum(len(each.sources) for each in connection.statistics())
-        assert counted == MOST_SENDERS - 100 * 8 + 99  # the first new one came when all places were taken
+        assert counted == MAX_SENDERS - 100 * 8 + 99  # the first new one came when all places were taken
 
 
-async def test_of_who_was_pushed_out_nothing_is_kept(link: KeptPeers) -> None:
+async def test_evicted_peer_leaves_nothing_behind(link: KeptPeers) -> None:
     async with open_connection(link) as connection:
-        for port in range(2 * MOST_STRANGERS):
+        for port in range(2 * MAX_UNVERIFIED_PEERS):
             connection.bytes_received(b"\xfd", f"{port}@stranger")
-        assert len(connection._intake._peers._limit._statistics) == MOST_STRANGERS
+        assert len(connection._receiver._peers._limit._statistics) == MAX_UNVERIFIED_PEERS
 
 
-async def test_a_frame_in_pieces_makes_a_peer_too(link: KeptPeers) -> None:
+async def test_split_frame_makes_a_peer(link: KeptPeers) -> None:
     """A bridge between a serial line and UDP cuts frames anywhere."""
     async with open_connection(link) as connection:
         for place in range(0, 60, 7):
             data = FrameEncoder(1, 1).encode(COPTER) * 3
             connection.bytes_received(data[place : place + 7], "bridge")
         assert link.kept == ["bridge"]
-        assert (1, 1) in connection.heard
+        assert (1, 1) in connection.heartbeats
 
 
-async def test_heartbeats_of_everybody_fill_no_table(link: KeptPeers) -> None:
+async def test_heartbeats_of_many_senders_fill_no_table(link: KeptPeers) -> None:
     """65,000 senders behind one peer: the vehicle that is flown keeps its place, its counters and its route."""
     async with flown(link) as (vehicle, copter):
         connection, encoder = vehicle.connection, FrameEncoder(1, 1)
@@ -199,35 +199,33 @@ async def test_heartbeats_of_everybody_fill_no_table(link: KeptPeers) -> None:
             for component_id in range(0, 256, 5):
                 encoder.system_id, encoder.component_id = system_id, component_id
                 connection.bytes_received(encoder.encode(COPTER), f"{component_id}@stranger")
-        assert len(connection.heard) <= MOST_ROUTES
-        assert len(connection._routes._routes) <= MOST_ROUTES
-        assert sum(len(each.sources) for each in connection.statistics()) <= MOST_SENDERS
+        assert len(connection.heartbeats) <= MAX_ROUTES
+        assert len(connection._routes._routes) <= MAX_ROUTES
+        assert sum(len(each.sources) for each in connection.statistics()) <= MAX_SENDERS
         await copter.live("14550@copter", 2)
         assert connection.counts(1)[1] == 0
         assert peer_of(vehicle, link) == "14550@copter"
         await anyio.sleep(40)
         link.hear("new@comer", (2, 3), COPTER)
         link.hear("new@comer", (2, 3), COPTER)
-        assert (2, 3) in connection.heard
-        assert len(connection.heard) < 50
+        assert (2, 3) in connection.heartbeats
+        assert len(connection.heartbeats) < 50
 
 
 async def test_claims_are_bounded(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, _):
-        for port in range(MOST_CLAIMS + 100):
+        for port in range(MAX_CLAIMS + 100):
             for component_id in (1, 2, 3):
                 link.hear(f"{port % 200}@stranger", (1, component_id), COPTER)
         routes = vehicle.connection._routes
         assert isinstance(routes, Routes)
-        assert len(routes._claims) <= MOST_CLAIMS
+        assert len(routes._claims) <= MAX_CLAIMS
 
 
 # ------------------------------------------------------------------------- taking a place
 
 
-async def test_a_stranger_takes_no_place_after_a_silence(
-    link: KeptPeers, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_foreign_host_cannot_take_route_after_silence(link: KeptPeers, caplog: pytest.LogCaptureFixture) -> None:
     async with flown(link) as (vehicle, copter):
         heard = told(vehicle.connection)
         await anyio.sleep(20)
@@ -237,15 +235,15 @@ async def test_a_stranger_takes_no_place_after_a_silence(
         assert is_armed(vehicle)
         assert vehicle.is_silent
         kinds = [type(each) for each in heard]
-        assert kinds == [events.HeardTwice, events.MoveRefused]
-        assert heard[1] == events.MoveRefused(heard[1].at, 1, 1, "666@stranger")
-        assert "666@stranger speaks in its name" in caplog.text
+        assert kinds == [events.DuplicateSender, events.RouteChangeRefused]
+        assert heard[1] == events.RouteChangeRefused(heard[1].at, 1, 1, "666@stranger")
+        assert "frames from 666@stranger under the same ids are refused" in caplog.text
         copter.say("14550@copter", ARMED)
         await copter.live("14550@copter", 1)
         assert not vehicle.is_silent
 
 
-async def test_a_stranger_cannot_try_all_numbers(link: KeptPeers) -> None:
+async def test_foreign_host_cannot_try_sequence_numbers(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, _):
         await anyio.sleep(5)
         for first in range(256):
@@ -255,7 +253,7 @@ async def test_a_stranger_cannot_try_all_numbers(link: KeptPeers) -> None:
         assert is_armed(vehicle)
 
 
-async def test_may_move_lets_anybody_take_it_after_a_silence_but_not_before(link: KeptPeers) -> None:
+async def test_may_move_accepts_any_host_after_silence_only(link: KeptPeers) -> None:
     async with flown(link, may_move=True) as (vehicle, _):
         heard = told(vehicle.connection)
         other = Copter(link, 5, booted_at=3)
@@ -264,20 +262,20 @@ async def test_may_move_lets_anybody_take_it_after_a_silence_but_not_before(link
         await anyio.sleep(5)
         other.say("666@stranger", DISARMED)
         assert not is_armed(vehicle)
-        assert events.VehicleMoved(vehicle.connection.now(), 1, 1, "14550@copter", "666@stranger") in heard
+        assert events.RouteChanged(vehicle.connection.now(), 1, 1, "14550@copter", "666@stranger") in heard
 
 
-async def test_after_a_silence_it_may_come_from_another_host_if_it_goes_on(link: KeptPeers) -> None:
+async def test_other_host_that_continues_stream_takes_route_after_silence(link: KeptPeers) -> None:
     """From the wireless network to the mobile one: the same counter, the same clock."""
     async with flown(link) as (vehicle, copter):
         heard = told(vehicle.connection)
         await copter.live("14550@mobile", 8)
         assert peer_of(vehicle, link) == "14550@mobile"
         assert not vehicle.is_silent
-        assert [type(each) for each in heard] == [events.HeardTwice, events.VehicleMoved]
+        assert [type(each) for each in heard] == [events.DuplicateSender, events.RouteChanged]
 
 
-async def test_the_clock_must_go_on_where_there_is_one(link: KeptPeers) -> None:
+async def test_known_clock_must_continue(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         impostor = Copter(link, copter.encoder.sequence, booted_at=-90)
         await anyio.sleep(4)
@@ -285,7 +283,7 @@ async def test_the_clock_must_go_on_where_there_is_one(link: KeptPeers) -> None:
         assert is_armed(vehicle)
 
 
-async def test_the_numbers_must_go_on_where_they_are_known(link: KeptPeers) -> None:
+async def test_known_sequence_numbers_must_continue(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         impostor = Copter(link, copter.encoder.sequence + 100 & 0xFF)
         await anyio.sleep(4)
@@ -293,16 +291,16 @@ async def test_the_numbers_must_go_on_where_they_are_known(link: KeptPeers) -> N
         assert is_armed(vehicle)
 
 
-async def test_another_port_of_the_same_host_is_taken_at_once_if_it_goes_on(link: KeptPeers) -> None:
+async def test_other_port_that_continues_stream_takes_route_at_once(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         heard, begun = told(vehicle.connection), vehicle.connection.now()
         await copter.live("14999@copter", 1)
         assert peer_of(vehicle, link) == "14999@copter"
-        assert [type(each) for each in heard] == [events.VehicleMoved]
+        assert [type(each) for each in heard] == [events.RouteChanged]
         assert heard[0].at - begun < 1
 
 
-async def test_two_programs_on_one_host_do_not_take_turns(link: KeptPeers) -> None:
+async def test_two_programs_on_one_host_do_not_alternate(link: KeptPeers) -> None:
     """The numbers of the second may fit by chance; the first one is heard all the same."""
     async with flown(link) as (vehicle, copter):
         heard = told(vehicle.connection)
@@ -312,10 +310,10 @@ async def test_two_programs_on_one_host_do_not_take_turns(link: KeptPeers) -> No
             second.say("14999@copter", DISARMED)
             await anyio.sleep(0.25)
         assert is_armed(vehicle)
-        assert [type(each) for each in heard] == [events.HeardTwice]
+        assert [type(each) for each in heard] == [events.DuplicateSender]
 
 
-async def test_a_reboot_on_the_same_host_takes_its_place_after_a_silence(link: KeptPeers) -> None:
+async def test_reboot_on_same_host_takes_route_after_silence(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, _):
         await anyio.sleep(1)
         rebooted = Copter(link, 0, booted_at=vehicle.connection.now())
@@ -324,14 +322,14 @@ async def test_a_reboot_on_the_same_host_takes_its_place_after_a_silence(link: K
         assert not is_armed(vehicle)
 
 
-async def test_a_reboot_on_the_same_port_is_heard_at_once(link: KeptPeers) -> None:
+async def test_reboot_on_same_port_is_accepted_at_once(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, _):
         rebooted = Copter(link, 0, booted_at=vehicle.connection.now())
         await rebooted.live("14550@copter", 1.5, DISARMED)
         assert not is_armed(vehicle)
 
 
-async def test_a_signature_is_proof_enough_after_a_silence(link: KeptPeers) -> None:
+async def test_signature_is_sufficient_after_silence(link: KeptPeers) -> None:
     key = SigningKey.from_passphrase("ours")
     async with open_connection(link, signing=Signing(key)) as connection:
         unix_time = connection.unix_time
@@ -349,7 +347,7 @@ async def test_a_signature_is_proof_enough_after_a_silence(link: KeptPeers) -> N
 # -------------------------------------------------------------------- one peer, and disorder
 
 
-async def test_a_heartbeat_that_was_overtaken_is_not_believed(link: KeptPeers) -> None:
+async def test_overtaken_heartbeat_is_dropped(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         late = [copter.encoder.encode(message) for message in (ARMED, ATTITUDE)]
         copter.say("14550@copter", ATTITUDE, DISARMED)
@@ -359,7 +357,7 @@ async def test_a_heartbeat_that_was_overtaken_is_not_believed(link: KeptPeers) -
         assert not is_armed(vehicle)
 
 
-async def test_a_heartbeat_overtaken_by_other_messages_only_is_believed(link: KeptPeers) -> None:
+async def test_heartbeat_overtaken_by_other_messages_is_accepted(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         late = copter.encoder.encode(DISARMED)
         copter.say("14550@copter", ATTITUDE, ATTITUDE)
@@ -377,14 +375,14 @@ async def test_two_vehicles_behind_one_peer_do_not_flap(link: KeptPeers) -> None
         async with anyio.create_task_group() as group:
             group.start_soon(copter.live, "14550@copter", 20, ARMED)
             group.start_soon(other.live, "14550@copter", 20, DISARMED)
-        assert events.HeardTwice in [type(each) for each in heard]
-        assert len([each for each in heard if isinstance(each, events.HeardTwice)]) == 1
+        assert events.DuplicateSender in [type(each) for each in heard]
+        assert len([each for each in heard if isinstance(each, events.DuplicateSender)]) == 1
         assert max(changes) <= 3
         assert len(changes) <= 3
         assert is_armed(vehicle)
 
 
-async def test_what_the_second_behind_one_peer_says_is_not_listened_to(link: KeptPeers) -> None:
+async def test_second_vehicle_behind_one_peer_is_dropped(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, copter):
         other = Copter(link, copter.encoder.sequence + 100, booted_at=-900)
         times: list[SystemTime] = []
@@ -398,7 +396,7 @@ async def test_what_the_second_behind_one_peer_says_is_not_listened_to(link: Kep
         assert len(times) == 1
 
 
-async def test_one_forged_frame_does_not_turn_our_signing_off(link: KeptPeers) -> None:
+async def test_one_forged_frame_does_not_disable_signing(link: KeptPeers) -> None:
     key = SigningKey.from_passphrase("ours")
     signing = Signing(key)
     async with open_connection(link, signing=signing) as connection:
@@ -426,7 +424,7 @@ async def test_one_forged_frame_does_not_turn_our_signing_off(link: KeptPeers) -
             assert connection.signing is signing
 
 
-async def test_frames_of_elsewhere_never_turn_our_signing_off(link: KeptPeers) -> None:
+async def test_frames_of_other_peers_never_disable_signing(link: KeptPeers) -> None:
     key = SigningKey.from_passphrase("ours")
     signing = Signing(key)
     async with open_connection(link, signing=signing) as connection:
@@ -448,7 +446,7 @@ async def test_frames_of_elsewhere_never_turn_our_signing_off(link: KeptPeers) -
             assert connection.signing is signing
 
 
-async def test_who_speaks_seldom_does_not_lose_its_place_to_another_program_of_its_host(
+async def test_slow_sender_keeps_route_from_program_on_host(
     link: KeptPeers,
 ) -> None:
     """Heartbeats only, and no clock: the numbers of another one that speaks more often fit now and then."""
@@ -465,14 +463,14 @@ async def test_who_speaks_seldom_does_not_lose_its_place_to_another_program_of_i
             assert is_armed(vehicle)
 
 
-async def test_a_link_that_is_opened_again_is_told_who_its_peers_are(link: KeptPeers) -> None:
+async def test_reopened_link_gets_its_peers(link: KeptPeers) -> None:
     async with flown(link) as (vehicle, _):
         link.kept.clear()
         vehicle.connection.link_restored(1.0)
         assert link.kept == ["14550@copter"]
 
 
-async def test_what_is_for_all_components_goes_to_no_other_vehicle_of_the_same_system_id(
+async def test_system_broadcast_skips_duplicate_vehicle(
     link: KeptPeers,
 ) -> None:
     """Its autopilot is not listened to, its camera has ids that nobody else has; both would obey what is for all."""

@@ -22,7 +22,7 @@ from aerokit.events import HeartbeatPaused, HeartbeatResumed
 from aerokit.mavlink.enums import MavType
 from aerokit.sim import SimulatedCopter
 
-BLOCKING_FED_WITHIN_S = 60.0
+BLOCKING_MAX_IDLE_S = 60.0
 
 
 @pytest.mark.anyio
@@ -35,7 +35,7 @@ async def test_heartbeat_in_asyncio_needs_no_feeding(limit_s: float | None) -> N
 
 
 @pytest.mark.anyio
-async def test_heartbeat_not_fed_pauses_and_is_resumed(caplog: pytest.LogCaptureFixture) -> None:
+async def test_unfed_heartbeat_pauses_and_resumes(caplog: pytest.LogCaptureFixture) -> None:
     async with open_flight(heartbeat=OwnHeartbeat(fed_within_s=5.0)) as flight:
         connection = flight.vehicle.connection
         with connection.subscribe(HeartbeatPaused, HeartbeatResumed, capacity=5) as told:
@@ -58,30 +58,28 @@ async def test_heartbeat_not_fed_pauses_and_is_resumed(caplog: pytest.LogCapture
 
 
 @pytest.mark.anyio
-async def test_heartbeat_has_the_type_that_is_asked_for() -> None:
+async def test_heartbeat_has_the_configured_type() -> None:
     async with open_flight(heartbeat=OwnHeartbeat(type=MavType.ONBOARD_CONTROLLER)) as flight:
         await anyio.sleep(2.0)
         assert {each.type for each in flight.wire.all(m.Heartbeat)} == {MavType.ONBOARD_CONTROLLER}
 
 
 @pytest.mark.anyio
-async def test_no_heartbeat_is_sent_if_none_is_wanted() -> None:
+async def test_no_heartbeat_is_sent_if_disabled() -> None:
     async with open_flight(heartbeat=None) as flight:
         await flight.vehicle.wait_ready()
         flight.vehicle.connection.feed()
         assert flight.wire.all(m.Heartbeat) == []
 
 
-@pytest.mark.parametrize(
-    "values", [{"type": 256}, {"type": "GCS"}, {"fed_within_s": 0.5}, {"fed_within_s": "5"}]
-)
-def test_heartbeat_of_nonsense_is_refused(values: dict[str, Any]) -> None:
+@pytest.mark.parametrize("values", [{"type": 256}, {"type": "GCS"}, {"fed_within_s": 0.5}, {"fed_within_s": "5"}])
+def test_invalid_heartbeat_settings_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InvalidArgument, match=f"{next(iter(values))} = "):
         OwnHeartbeat(**values)
 
 
 @pytest.mark.anyio
-async def test_heartbeat_of_an_open_connection_is_not_changed_by_connect() -> None:
+async def test_connect_does_not_change_heartbeat_of_open_connection() -> None:
     async with open_flight() as flight:
         with pytest.raises(InvalidArgument, match="heartbeat = … is not allowed here"):
             async with aerokit.connect(flight.vehicle.connection, heartbeat=None):
@@ -99,61 +97,61 @@ class Hang:
         self._switch = connection._heartbeat
 
     def __call__(self, seconds: float) -> bool:
-        """Whether our heartbeat is still sent after so many seconds without a call."""
-        self._switch.proof._fed_at -= seconds
-        return self._switch.is_on()
+        """True if our heartbeat is still sent after this many seconds without a call."""
+        self._switch.activity._fed_at -= seconds
+        return self._switch.should_send()
 
 
-def test_heartbeat_of_a_blocking_program_pauses_until_it_calls_again() -> None:
+def test_heartbeat_of_blocking_program_pauses_until_next_call() -> None:
     with served_copter() as address, aerokit.sync.connect(address) as vehicle:
         hang = Hang(vehicle.aio.connection)
-        assert hang(BLOCKING_FED_WITHIN_S - 5.0)
+        assert hang(BLOCKING_MAX_IDLE_S - 5.0)
         assert not hang(10.0)
         _ = vehicle.position.latest  # a reading is a sign of life
         assert hang(0.0)
-        assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+        assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
         vehicle.wait_ready()
         assert hang(0.0)
         position = vehicle.position
-        assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+        assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
         _ = position.age  # and so is one of a cell that the program has kept
         assert hang(0.0)
 
 
-def test_heartbeat_goes_on_while_a_blocking_call_waits() -> None:
+def test_heartbeat_continues_during_a_blocking_call() -> None:
     with served_copter() as address, aerokit.sync.connect(address) as vehicle:
         hang = Hang(vehicle.aio.connection)
         seen: list[bool] = []
 
         def look(_: object) -> bool:
-            seen.append(hang(BLOCKING_FED_WITHIN_S + 10.0))
+            seen.append(hang(BLOCKING_MAX_IDLE_S + 10.0))
             return True
 
         vehicle.armed.wait_until(look)
         assert seen == [True]
 
 
-def test_heartbeat_of_a_blocking_fleet_and_connection_is_fed_by_calls() -> None:
+def test_calls_feed_heartbeat_of_blocking_fleet_and_connection() -> None:
     with served_copter() as address, aerokit.sync.open_connection(address) as connection:
         hang = Hang(connection.aio)
-        assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+        assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
         with aerokit.sync.fleet(connection, count=1) as fleet:
             assert hang(0.0)
-            assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+            assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
             assert len(fleet) == 1
             assert hang(0.0)
 
 
-def test_heartbeat_of_a_classic_program_is_fed_by_reading_attributes() -> None:
+def test_attribute_reads_feed_heartbeat_of_classic_program() -> None:
     with served_copter() as address:
         vehicle = dronekit.connect(address)
         try:
             hang = Hang(vehicle.aio.connection)
             for name in ("mode", "armed", "location", "battery", "parameters", "is_armable", "channels"):
-                assert not hang(BLOCKING_FED_WITHIN_S + 1.0)
+                assert not hang(BLOCKING_MAX_IDLE_S + 1.0)
                 getattr(vehicle, name)
                 assert hang(0.0), name
-            assert hang(BLOCKING_FED_WITHIN_S - 5.0)
+            assert hang(BLOCKING_MAX_IDLE_S - 5.0)
         finally:
             vehicle.close()
 
@@ -167,13 +165,11 @@ with aerokit.sync.connect(sys.argv[1], heartbeat=aerokit.OwnHeartbeat(fed_within
 """
 
 
-def test_heartbeat_of_a_program_in_an_endless_loop_stops() -> None:
+def test_heartbeat_of_program_in_endless_loop_stops() -> None:
     """With real sockets: the vehicle hears no ground station any more."""
     copter = SimulatedCopter(boot_time_s=0.0)
     heard: list[float] = []
-    copter.on(
-        m.Heartbeat, lambda beat, _: heard.append(time.monotonic()) if beat.type == MavType.GCS else None
-    )
+    copter.on(m.Heartbeat, lambda beat, _: heard.append(time.monotonic()) if beat.type == MavType.GCS else None)
     with (
         served([copter]) as address,
         subprocess.Popen([sys.executable, "-c", HANGING, address], stdout=subprocess.PIPE) as program,

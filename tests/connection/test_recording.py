@@ -41,7 +41,7 @@ def senders(path: Path) -> Counter[int]:
     return Counter(frame.system_id for _, raw in read_tlog(path) for frame in framer.receive(raw))
 
 
-async def test_both_directions_are_recorded_and_pymavlink_reads_every_frame(tmp_path: Path) -> None:
+async def test_pymavlink_reads_every_frame_of_both_directions(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     await fly(path)
     ours = senders(path)
@@ -58,7 +58,7 @@ async def test_both_directions_are_recorded_and_pymavlink_reads_every_frame(tmp_
     assert ours[1] - theirs[1] < 60  # AVAILABLE_MODES and CURRENT_MODE are unknown to its dialect
 
 
-async def test_a_recording_that_begins_later_has_frames_that_nobody_wants(tmp_path: Path) -> None:
+async def test_late_recording_has_frames_without_subscribers(tmp_path: Path) -> None:
     near, _ = memory_link_pair()
     async with open_connection(near) as connection:
         encoder = FrameEncoder(1, 1)
@@ -68,7 +68,7 @@ async def test_a_recording_that_begins_later_has_frames_that_nobody_wants(tmp_pa
     assert senders(tmp_path / "late.tlog")[1] == 1
 
 
-async def test_a_recording_on_which_nobody_is_heard_leaves_the_older_one(tmp_path: Path) -> None:
+async def test_recording_without_reception_keeps_the_older_file(tmp_path: Path) -> None:
     path = tmp_path / "last.tlog"
     await fly(path)
     before = path.read_bytes()
@@ -83,7 +83,7 @@ async def test_a_recording_on_which_nobody_is_heard_leaves_the_older_one(tmp_pat
     assert path.read_bytes() == before
 
 
-async def test_a_recording_replaces_the_older_one_with_what_was_sent_before_anybody_was_heard(
+async def test_recording_replaces_older_file_with_earlier_sent_frames(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "last.tlog"
@@ -95,7 +95,7 @@ async def test_a_recording_replaces_the_older_one_with_what_was_sent_before_anyb
     assert senders(path) == {255: 3, 7: 1}
 
 
-async def test_frames_nobody_wants_are_recorded_too(tmp_path: Path) -> None:
+async def test_frames_without_subscribers_are_recorded(tmp_path: Path) -> None:
     path = tmp_path / "all.tlog"
     async with (
         simulated_link(SimulatedCopter(boot_time_s=0)) as link,
@@ -107,7 +107,7 @@ async def test_frames_nobody_wants_are_recorded_too(tmp_path: Path) -> None:
     assert received > 50
 
 
-async def test_an_existing_file_is_replaced(tmp_path: Path) -> None:
+async def test_existing_file_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "twice.tlog"
     path.write_bytes(b"from another day")
     await fly(path)
@@ -115,7 +115,7 @@ async def test_an_existing_file_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("speed", ["1", "10", "inf"])
-async def test_the_same_program_runs_on_a_recorded_flight(tmp_path: Path, speed: str) -> None:
+async def test_program_runs_on_a_recorded_flight(tmp_path: Path, speed: str) -> None:
     path = tmp_path / "flight.tlog"
     await fly(path)
     highest, modes, armed = 0.0, list[str](), list[bool]()
@@ -142,7 +142,7 @@ async def test_the_same_program_runs_on_a_recorded_flight(tmp_path: Path, speed:
     assert seconds == pytest.approx((recorded[-1] - recorded[0]) / float(speed), abs=0.01)
 
 
-async def test_what_no_dialect_knows_is_recorded_too(tmp_path: Path) -> None:
+async def test_unknown_messages_are_recorded(tmp_path: Path) -> None:
     """In the order in which it came, and byte for byte."""
     path = tmp_path / "private.tlog"
     known, private = FrameEncoder(9, 1), Private(9, 7)
@@ -164,7 +164,7 @@ async def test_what_no_dialect_knows_is_recorded_too(tmp_path: Path) -> None:
     assert [raw for _, raw in read_tlog(path) if raw[5] == 9] == frames
 
 
-async def test_a_recording_begins_when_it_is_asked_for(tmp_path: Path) -> None:
+async def test_recording_starts_on_request(tmp_path: Path) -> None:
     path = tmp_path / "later.tlog"
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
         await anyio.sleep(2)
@@ -178,14 +178,14 @@ async def test_a_recording_begins_when_it_is_asked_for(tmp_path: Path) -> None:
     assert not (tmp_path / "second.tlog").exists()
 
 
-async def test_a_crash_loses_a_second_at_most(tmp_path: Path) -> None:
+async def test_crash_loses_at_most_a_second(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link, record=path):
         await anyio.sleep(5.5)
         assert senders(path)[1] > 50  # it is in the file before anything is closed
 
 
-async def test_a_file_that_cannot_be_written_is_told_before_anything_is_opened(tmp_path: Path) -> None:
+async def test_unwritable_file_is_refused_before_opening(tmp_path: Path) -> None:
     near, far = memory_link_pair()
     with pytest.raises(LinkOpenError, match=r"cannot record to .*No such file or directory"):
         async with connect(near, record=tmp_path / "no such folder" / "flight.tlog"):
@@ -197,16 +197,14 @@ async def test_a_file_that_cannot_be_written_is_told_before_anything_is_opened(t
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-async def test_a_full_disk_ends_the_recording_and_not_the_flight(caplog: pytest.LogCaptureFixture) -> None:
+async def test_full_disk_ends_recording_but_not_flight(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.CRITICAL, "aerokit"):
         await fly(Path("/dev/full"))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("end", ["flush", "close", "write"])
-def test_a_full_disk_is_told_of_once_wherever_it_is_noticed(
-    caplog: pytest.LogCaptureFixture, end: str
-) -> None:
+def test_full_disk_is_reported_once(caplog: pytest.LogCaptureFixture, end: str) -> None:
     recording, frame = Recording("/dev/full", 0.0), FrameEncoder(1, 1).encode(HEARTBEAT)
     for _ in range(100_000 if end == "write" else 1):
         recording.write(frame, 1.0)
@@ -216,10 +214,11 @@ def test_a_full_disk_is_told_of_once_wherever_it_is_noticed(
     recording.write(frame, 2.0)
     recording.flush()
     recording.close()
-    assert caplog.messages == ["recording to /dev/full has ended: No space left on device"]
+    errors = [each.getMessage() for each in caplog.records if each.levelno == logging.ERROR]
+    assert errors == ["recording to /dev/full has ended: No space left on device"]
 
 
-async def test_a_connection_that_is_open_has_its_own_recording(tmp_path: Path) -> None:
+async def test_open_connection_has_its_own_recording(tmp_path: Path) -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, open_connection(link) as connection:
         with pytest.raises(InvalidArgument, match="record"):
             async with connect(connection, record=tmp_path / "flight.tlog"):
@@ -227,7 +226,7 @@ async def test_a_connection_that_is_open_has_its_own_recording(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("speed", ["1", "7", "inf"])
-async def test_a_replay_ends_in_the_state_in_which_the_flight_ended(tmp_path: Path, speed: str) -> None:
+async def test_replay_ends_in_final_state_of_flight(tmp_path: Path, speed: str) -> None:
     path = tmp_path / "flight.tlog"
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link, record=path) as vehicle:
         await vehicle.wait_ready()

@@ -1,4 +1,4 @@
-"""Several peers on one link: who gets what, who is heard, and how much of it was lost."""
+"""Several peers on one link: destinations of messages, accepted senders, and loss."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.transport import MemoryLink, Peer
 
-MOST_PEERS = 256
+MAX_PEERS = 256
 
 pytestmark = pytest.mark.anyio
 
@@ -70,7 +70,7 @@ class PeersLink(MemoryLink):
             self.connection.bytes_received(self.frame(peer, source, message), peer)
 
     def peers_of(self, message_type: type[Message]) -> list[Peer]:
-        """Who was sent such a message, since this was asked last."""
+        """Peers that were sent such a message since the last call."""
         found = [peer for peer, message_id in self.sent if message_id == message_type.ID]
         self.sent.clear()
         return found
@@ -91,7 +91,7 @@ def command(system_id: int, component_id: int) -> CommandLong:
     return CommandLong(system_id, component_id, 400, 0, *(0.0,) * 7)
 
 
-async def test_a_command_goes_where_its_component_is(link: PeersLink, connection: Connection) -> None:
+async def test_command_goes_to_the_peer_of_its_component(link: PeersLink, connection: Connection) -> None:
     """An autopilot on one port, its companion on another, a second vehicle on a third."""
     link.hear("autopilot", (1, 1), COPTER)
     link.hear("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
@@ -106,24 +106,20 @@ async def test_a_command_goes_where_its_component_is(link: PeersLink, connection
         link.hear("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
 
 
-async def test_what_is_for_a_whole_system_goes_to_all_its_peers_and_no_other(
-    link: PeersLink, connection: Connection
-) -> None:
+async def test_system_broadcast_goes_to_all_peers_of_system(link: PeersLink, connection: Connection) -> None:
     link.hear("autopilot", (1, 1), COPTER)
     link.hear("companion", (1, 191), Heartbeat(18, 8, 0, 0, 4))
     link.hear("companion", (1, 192), Heartbeat(18, 8, 0, 0, 4))
     link.hear("other", (2, 1), COPTER)
     connection.send(ParamRequestList(1, 0))
     assert sorted(map(str, link.peers_of(ParamRequestList))) == ["autopilot", "companion"]
-    connection.send(command(1, 154))  # a component that was never heard
+    connection.send(command(1, 154))  # an unknown component
     assert sorted(map(str, link.peers_of(CommandLong))) == ["autopilot", "companion"]
     connection.send(Timesync(0, 1), to=2)
     assert link.peers_of(Timesync) == ["other"]
 
 
-async def test_what_is_for_all_and_for_the_unknown_goes_to_everyone(
-    link: PeersLink, connection: Connection
-) -> None:
+async def test_broadcast_and_unknown_targets_go_to_all_peers(link: PeersLink, connection: Connection) -> None:
     link.hear("one", (1, 1), COPTER)
     connection.send(RequestDataStream(9, 1, 0, 4, 1))
     assert link.peers_of(RequestDataStream) == [None]
@@ -139,26 +135,24 @@ async def test_only_heartbeats_make_routes(link: PeersLink, connection: Connecti
     assert link.peers_of(CommandLong) == [None]
 
 
-async def test_a_vehicle_that_comes_back_from_another_port(link: PeersLink, connection: Connection) -> None:
+async def test_vehicle_returns_from_another_port(link: PeersLink, connection: Connection) -> None:
     link.hear("old@host", (1, 1), COPTER)
     async with connect(connection, rates={}) as vehicle:
-        with vehicle.subscribe(events.VehicleSilent, events.VehicleBack, capacity=9) as heard:
+        with vehicle.subscribe(events.VehicleSilent, events.VehicleRecovered, capacity=9) as heard:
             await anyio.sleep(5)
             link.sent.clear()
             link.hear("new@host", (1, 1), COPTER)
             connection.send(command(1, 1))
             assert link.peers_of(CommandLong) == ["new@host"]
             assert type(await heard.get(1)) is events.VehicleSilent
-            assert type(await heard.get(1)) is events.VehicleBack
+            assert type(await heard.get(1)) is events.VehicleRecovered
         assert vehicle.heartbeat_age < 1
 
 
-async def test_a_client_that_comes_back_is_not_taken_for_a_second_vehicle(
-    link: PeersLink, connection: Connection
-) -> None:
+async def test_returning_client_is_not_a_second_vehicle(link: PeersLink, connection: Connection) -> None:
     """A TCP client's new connection is a new peer; the old one is known to have gone."""
-    doubles: list[events.HeardTwice] = []
-    connection.bus.attach_event(events.HeardTwice, doubles.append)
+    doubles: list[events.DuplicateSender] = []
+    connection.bus.attach_event(events.DuplicateSender, doubles.append)
     attitudes: list[Message] = []
     connection.bus.attach(Attitude, attitudes.append)
     link.hear("old", (1, 1), COPTER)
@@ -168,21 +162,19 @@ async def test_a_client_that_comes_back_is_not_taken_for_a_second_vehicle(
     assert (link.peers_of(CommandLong), len(attitudes), doubles) == (["new"], 1, [])
 
 
-async def test_many_peers_do_not_push_the_vehicle_out(link: PeersLink, connection: Connection) -> None:
+async def test_many_peers_do_not_evict_the_vehicle(link: PeersLink, connection: Connection) -> None:
     """A scanner, or a program that takes a new port for each datagram."""
     link.hear("vehicle", (1, 1), *[COPTER] * 5)
-    for port in range(2 * MOST_PEERS):
+    for port in range(2 * MAX_PEERS):
         link.hear(port, (250, 1), ATTITUDE)
-    assert len(list(connection.statistics())) == MOST_PEERS
+    assert len(list(connection.statistics())) == MAX_PEERS
     assert connection.counts(1) == (5, 0)
 
 
 # ---------------------------------------------------------------------------- loss
 
 
-async def test_loss_is_counted_for_each_component_of_a_system_and_not_for_others(
-    link: PeersLink, connection: Connection
-) -> None:
+async def test_loss_is_counted_per_component(link: PeersLink, connection: Connection) -> None:
     link.hear("one", (1, 1), *[ATTITUDE] * 10)
     link.hear("one", (1, 154), GIMBAL)  # its own sequence: no gap in that of the autopilot
     link.hear("one", (1, 1), *[ATTITUDE] * 10, lost=5)
@@ -194,9 +186,7 @@ async def test_loss_is_counted_for_each_component_of_a_system_and_not_for_others
     assert connection.counts(3) == (0, 0)
 
 
-async def test_two_peers_that_bring_the_same_vehicle_are_counted_apart(
-    link: PeersLink, connection: Connection
-) -> None:
+async def test_loss_is_counted_per_peer_of_one_vehicle(link: PeersLink, connection: Connection) -> None:
     """Each has a sequence of its own; what comes twice is delivered once."""
     attitudes: list[Message] = []
     connection.bus.attach(Attitude, attitudes.append)
@@ -209,7 +199,7 @@ async def test_two_peers_that_bring_the_same_vehicle_are_counted_apart(
     assert connection.counts(1) == (22, 10)
 
 
-async def test_the_loss_of_each_second_is_reported(link: PeersLink, connection: Connection) -> None:
+async def test_loss_is_reported_every_second(link: PeersLink, connection: Connection) -> None:
     link.hear("one", (1, 1), COPTER)
     async with connect(connection, rates={}) as vehicle:
         reports: list[events.LinkReport] = []
@@ -224,11 +214,11 @@ async def test_the_loss_of_each_second_is_reported(link: PeersLink, connection: 
         assert vehicle.link_quality.value.frames_per_s == 0
 
 
-async def test_system_0_is_never_taken_for_a_vehicle(link: PeersLink, connection: Connection) -> None:
+async def test_system_0_is_never_a_vehicle(link: PeersLink, connection: Connection) -> None:
     nobody = from_system_0(FrameEncoder(1, 1).encode(COPTER))
     assert Framer().receive(nobody)[0].system_id == 0
     connection.bytes_received(nobody, "zero")
-    assert connection.heard == {}
+    assert connection.heartbeats == {}
     with pytest.raises(ConnectFailed, match="system id 0"):
         async with connect(connection, timeout=2):
             pytest.fail("nobody is nobody's vehicle")

@@ -1,4 +1,4 @@
-"""Several links to one vehicle, and what may be wrong: nothing comes twice or late, nothing goes to somebody else."""
+"""Several links to one vehicle under faults: nothing is delivered twice or late, or to another vehicle."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from functools import partial
 
 import anyio
 import pytest
-from several_harness import GOOD, News, Radios, Told, over
+from several_harness import GOOD, EventLog, Radios, ReceivedMessages, over
 
 import aerokit
 from aerokit import events
 from aerokit import messages as m
 from aerokit.connection.connection import Connection
-from aerokit.connection.multilink.link_choice import PATIENCE_S, LinkChoice
-from aerokit.connection.multilink.link_questions import UNWANTED_HZ
+from aerokit.connection.multilink.link_choice import MAX_SWITCH_DELAY_S, LinkChoice
+from aerokit.connection.multilink.link_probes import UNATTACHED_RATE_HZ
 from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, LinkLost, LinkOpenError
 from aerokit.events import LinkState
@@ -25,7 +25,7 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND, FaultModel
-from aerokit.transport import Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
+from aerokit.transport import Link, MemoryLink, MultiLink, Peer, memory_link_pair
 
 STEADY_S = 3.0
 
@@ -57,7 +57,7 @@ def of_system_0(message: m.Heartbeat) -> bytes:
     return b"\xfd" + body + x25(body + STANDARD.extras[frame.message_id]).to_bytes(2, "little")
 
 
-def orders(told: Told) -> list[int]:
+def orders(told: ReceivedMessages) -> list[int]:
     """The radio that each order went over."""
     return [index for index, _ in told.of(m.CommandLong)]
 
@@ -71,9 +71,9 @@ async def opened(radios: Radios) -> None:
         await far.open(Deaf())
 
 
-async def test_system_0_is_nobody_whom_orders_for_all_would_be_sent_to() -> None:
+async def test_broadcast_commands_ignore_system_0() -> None:
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         radios.far[0].write(FrameEncoder(1, 1).encode(AUTOPILOT))
@@ -83,10 +83,10 @@ async def test_system_0_is_nobody_whom_orders_for_all_would_be_sent_to() -> None
         assert sorted(orders(told)) == [0, 1]
 
 
-async def test_an_order_for_all_reaches_nobody_twice_where_one_link_reaches_everybody() -> None:
-    """A ground station was heard over the other radio first, and over the vehicle's as well."""
+async def test_broadcast_command_reaches_each_system_once() -> None:
+    """A ground station was received over the other radio first, and then over the vehicle's as well."""
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         radios.far[1].write(FrameEncoder(250, 190).encode(STATION))
@@ -99,36 +99,36 @@ async def test_an_order_for_all_reaches_nobody_twice_where_one_link_reaches_ever
         assert len(orders(told)) == 1
 
 
-def test_another_vehicle_is_not_believed_because_ours_was_silent_for_long() -> None:
+def test_other_vehicle_is_refused_after_long_silence_of_ours() -> None:
     """Two that were switched on ten seconds apart; ours is switched off."""
     choice, now = LinkChoice(needs_proof=True), 0.0
     while now < 30.0:
         for link in (0, 1):
-            choice.heard(link, now, is_costly=False)
+            choice.record_heartbeat(link, now, is_costly=False)
         choice.choose(now)
-        choice.note_answer(0, now, 100.0 + now, 0.02, now)
-        choice.note_answer(1, now, 90.0 + now, 0.02, now)
+        choice.record_answer(0, now, 100.0 + now, 0.02, now)
+        choice.record_answer(1, now, 90.0 + now, 0.02, now)
         now += 0.5
     assert choice.candidates[1].is_doubted
     while now < 3000.0:
-        choice.heard(1, now, is_costly=False)
-        choice.note_answer(1, now, 90.0 + now, 0.02, now)
+        choice.record_heartbeat(1, now, is_costly=False)
+        choice.record_answer(1, now, 90.0 + now, 0.02, now)
         choice.choose(now)
         assert choice.used is choice.candidates[0]
         now += 0.5
 
 
-def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> None:
+def test_late_link_is_proven_by_its_clock() -> None:
     choice, now = LinkChoice(needs_proof=True), 0.0
     while now < 30.0:
-        choice.heard(0, now, is_costly=False)
+        choice.record_heartbeat(0, now, is_costly=False)
         choice.choose(now)
-        choice.note_answer(0, now, 100.0 + now, 0.02, now)
+        choice.record_answer(0, now, 100.0 + now, 0.02, now)
         now += 0.5
     now = 600.0
     for _ in range(4):
-        choice.heard(1, now, is_costly=False)
-        choice.note_answer(1, now - 0.1, 100.03 + now - 0.1, 0.2, now)
+        choice.record_heartbeat(1, now, is_costly=False)
+        choice.record_answer(1, now - 0.1, 100.03 + now - 0.1, 0.2, now)
         now += 0.5
     choice.choose(now)
     assert choice.used is choice.candidates[1]
@@ -136,7 +136,7 @@ def test_a_link_that_comes_after_a_long_silence_is_believed_by_its_clock() -> No
 
 @pytest.mark.parametrize("late_s", [2.0, 4.0, 6.0])
 @pytest.mark.parametrize("dies", [False, True])
-async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s: float, dies: bool) -> None:
+async def test_late_copies_from_a_slow_link_are_dropped(late_s: float, dies: bool) -> None:
     """Both radios carry 100 frames a second; one of them begins to be late, and the other dies perhaps."""
     radios = Radios(2)
     await opened(radios)
@@ -163,13 +163,13 @@ async def test_what_came_long_ago_over_the_other_link_does_not_come_again(late_s
         assert sorted(states, reverse=True) == states, "armed was not told after disarmed"
 
 
-async def test_signed_copies_are_taken_whichever_comes_first() -> None:
+async def test_signed_copies_are_accepted_in_any_order() -> None:
     """The quicker radio is not in use yet; nothing but heartbeats comes, which prove nothing."""
     radios = Radios(2, models=[FaultModel(delay_s=0.05), GOOD])
     await opened(radios)
     key = SigningKey(bytes(range(32)))
     async with open_connection(radios.together(), signing=Signing(key)) as connection:
-        refused = News(connection, events.FrameRefused)
+        refused = EventLog(connection, events.FrameRefused)
         states: list[int] = []
         connection.bus.attach(m.Heartbeat, lambda message: states.append(message.custom_mode))
         vehicle = FrameEncoder(1, 1)
@@ -183,7 +183,7 @@ async def test_signed_copies_are_taken_whichever_comes_first() -> None:
         assert refused.all == []
 
 
-async def test_a_link_that_is_in_use_elsewhere_stays_as_it_is() -> None:
+async def test_link_in_use_elsewhere_is_left_unchanged() -> None:
     near, far = memory_link_pair()
     other, _ = memory_link_pair()
     await far.open(Deaf())
@@ -193,7 +193,7 @@ async def test_a_link_that_is_in_use_elsewhere_stays_as_it_is() -> None:
                 pass
         far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
         await anyio.sleep(0.1)
-        assert (1, 1) in connection.heard
+        assert (1, 1) in connection.heartbeats
 
 
 class SlowLink(MemoryLink):
@@ -204,7 +204,7 @@ class SlowLink(MemoryLink):
         await super()._connect()
 
 
-async def test_a_link_that_goes_while_another_is_still_being_opened_does_not_end_the_connection() -> None:
+async def test_link_lost_while_another_opens_does_not_end_connection() -> None:
     near, far = memory_link_pair()
     await far.open(Deaf())
     async with anyio.create_task_group() as tasks:
@@ -221,7 +221,7 @@ async def test_a_link_that_goes_while_another_is_still_being_opened_does_not_end
             assert [each.state for each in connection.links.value] == [LinkState.LOST, LinkState.CONNECTED]
 
 
-async def test_links_that_all_go_while_they_are_opened_are_an_error() -> None:
+async def test_links_all_lost_while_opening_raise() -> None:
     near, far = memory_link_pair()
     await far.open(Deaf())
 
@@ -242,7 +242,7 @@ async def test_links_that_all_go_while_they_are_opened_are_an_error() -> None:
                 connection.raise_if_ended()
 
 
-async def test_a_link_that_is_opened_late_ends_the_interruption() -> None:
+async def test_link_opened_late_ends_the_interruption() -> None:
     near, far = memory_link_pair()
     await far.open(Deaf())
     tries = 0
@@ -259,9 +259,9 @@ async def test_a_link_that_is_opened_late_ends_the_interruption() -> None:
 
     late = Third("memory:late")
     both: list[Link] = [near, late]
-    together = SeveralLinks([partial(both.__getitem__, index) for index in range(2)], stays=True)
+    together = MultiLink([partial(both.__getitem__, index) for index in range(2)], survives_loss=True)
     async with open_connection(together) as connection:
-        news = News(connection, events.LinkInterrupted, events.LinkRestored)
+        news = EventLog(connection, events.LinkInterrupted, events.LinkRestored)
         far.close()
         await anyio.sleep(0.1)
         assert [type(each) for each in news.all] == [events.LinkInterrupted]
@@ -271,7 +271,7 @@ async def test_a_link_that_is_opened_late_ends_the_interruption() -> None:
         assert not connection.is_open
 
 
-async def test_a_camera_that_is_heard_first_over_another_link_does_not_hide_the_vehicle() -> None:
+async def test_camera_received_first_does_not_hide_the_vehicle() -> None:
     radios = Radios(2)
     camera = FrameEncoder(1, 100)
     copter = SimulatedCopter(boot_time_s=5.0)
@@ -286,7 +286,7 @@ async def test_a_camera_that_is_heard_first_over_another_link_does_not_hide_the_
             assert told.value[0].used_for == (1,)
 
 
-async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_taken() -> None:
+async def test_switch_to_better_link_delays_no_command() -> None:
     """Over the radio in use an order takes a second and a half; a better one is taken while it is under way."""
     copter = SimulatedCopter(boot_time_s=0.0)
     radios = Radios(2, models=[FaultModel(delay_s=1.5), GOOD])
@@ -294,10 +294,10 @@ async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_take
     async with over(radios, copter) as connection, aerokit.connect(connection) as vehicle:
         await vehicle.wait_ready()
         await anyio.sleep(20)
-        news = News(connection)
+        news = EventLog(connection)
         radios.mend(1)
-        assert connection._several is not None
-        choice = connection._several._choices[1]
+        assert connection._multilink is not None
+        choice = connection._multilink._choices[1]
         with anyio.fail_after(60):
             while choice._better is None or connection.now() - choice._better_since < 2.0:  # noqa: ASYNC110
                 await anyio.sleep(0.05)
@@ -310,19 +310,19 @@ async def test_no_order_arrives_after_a_newer_one_because_a_better_link_was_take
         assert news.chosen == [(radios.links[1].address, "better")]
 
 
-def test_orders_without_end_put_a_better_link_off_for_a_while_only() -> None:
+def test_continuous_commands_delay_switch_for_limited_time() -> None:
     choice, now, changed_at = LinkChoice(needs_proof=False), 0.0, None
-    choice.heard(0, now, is_costly=False)
+    choice.record_heartbeat(0, now, is_costly=False)
     choice.choose(now)
     while now < 40.0 and changed_at is None:
         for link, round_trip_s in ((0, 1.0), (1, 0.02)):
-            choice.heard(link, now, is_costly=False).note_round_trip(round_trip_s, now)
-        choice.ordered(now)
+            choice.record_heartbeat(link, now, is_costly=False).record_round_trip(round_trip_s, now)
+        choice.record_command(now)
         if choice.choose(now) == "better":
             changed_at = now
         now += 0.05
     assert changed_at is not None
-    assert STEADY_S + PATIENCE_S <= changed_at <= STEADY_S + PATIENCE_S + 0.2
+    assert STEADY_S + MAX_SWITCH_DELAY_S <= changed_at <= STEADY_S + MAX_SWITCH_DELAY_S + 0.2
 
 
 class Ports:
@@ -344,18 +344,18 @@ async def changed_for_the_better(connection: Connection, ports: Ports, radios: R
         if step % 10 == 0:
             ports.say(m.Heartbeat(2, 12, 81, 0, 4), *both)
         await anyio.sleep(0.1)
-        assert connection._several is not None
-        choice = connection._several._choices.get(1)
+        assert connection._multilink is not None
+        choice = connection._multilink._choices.get(1)
         if choice is not None and 1 in choice.candidates:
             choice.candidates[1].is_proven = True
-            choice.candidates[0].note_round_trip(1.0, connection.now())
-            choice.candidates[1].note_round_trip(0.01, connection.now())
+            choice.candidates[0].record_round_trip(1.0, connection.now())
+            choice.candidates[1].record_round_trip(0.01, connection.now())
         if choice is not None and choice.used is choice.candidates.get(1):
             return choice
     raise AssertionError("it was not taken")
 
 
-async def test_the_answer_to_what_was_ordered_before_a_change_is_taken_over_the_former_link_once() -> None:
+async def test_answer_over_former_link_is_accepted_once() -> None:
     """ArduPilot answers over the port that was asked, PX4 over all ports where it has seen us."""
     radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
     await opened(radios)
@@ -373,7 +373,7 @@ async def test_the_answer_to_what_was_ordered_before_a_change_is_taken_over_the_
         assert answers == [(400, 0), (400, 4), (400, 0), (176, 0)]
 
 
-async def test_the_former_link_is_known_to_lead_to_the_vehicle() -> None:
+async def test_former_link_stays_proven() -> None:
     radios = Radios(2, models=[FaultModel(delay_s=0.5), GOOD])
     await opened(radios)
     async with open_connection(radios.together()) as connection:
@@ -383,13 +383,13 @@ async def test_the_former_link_is_known_to_lead_to_the_vehicle() -> None:
         assert choice.used is choice.candidates[0]
 
 
-async def test_a_peer_of_one_of_several_links_is_named_as_it_is_by_its_link() -> None:
+async def test_peer_is_named_as_by_its_member_link() -> None:
     """A program on board is started again, and has another port."""
     here: socket.socket
     async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]) as connection:
-        news = News(connection, events.VehicleMoved)
+        news = EventLog(connection, events.RouteChanged)
         link = connection.link
-        assert isinstance(link, SeveralLinks)
+        assert isinstance(link, MultiLink)
         said: list[str] = []
         for round_ in range(2):
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here:
@@ -397,18 +397,18 @@ async def test_a_peer_of_one_of_several_links_is_named_as_it_is_by_its_link() ->
                 said.append(f"127.0.0.1:{here.getsockname()[1]}")
                 encoder = FrameEncoder(1, 1)
                 for _ in range(4):
-                    link._heard(1, encoder.encode(AUTOPILOT), here.getsockname())
+                    link._on_bytes(1, encoder.encode(AUTOPILOT), here.getsockname())
                     await anyio.sleep(0.1)
             if round_ == 0:
                 await anyio.sleep(4)
         moved = news.all[0]
-        assert isinstance(moved, events.VehicleMoved)
+        assert isinstance(moved, events.RouteChanged)
         assert [moved.before, moved.after] == said
 
 
-async def test_ids_that_somebody_makes_up_cost_little_and_not_for_long() -> None:
+async def test_forged_ids_cost_few_probes() -> None:
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     await opened(radios)
     async with open_connection(radios.together()) as connection:
         for begin in (1, 101, 1, 101):
@@ -417,13 +417,13 @@ async def test_ids_that_somebody_makes_up_cost_little_and_not_for_long() -> None
                     radios.far[0].write(FrameEncoder(system, component).encode(AUTOPILOT))
             await anyio.sleep(5)
         asked = len(told.of(m.Timesync))
-        assert 200 < asked <= 25 * UNWANTED_HZ
+        assert 200 < asked <= 25 * UNATTACHED_RATE_HZ
         await anyio.sleep(40)
         told.messages.clear()
         await anyio.sleep(10)
         assert told.of(m.Timesync) == []
-        assert connection._several is not None
-        assert not any(connection._several._counters.values())
+        assert connection._multilink is not None
+        assert not any(connection._multilink._counters.values())
         radios.far[0].write(FrameEncoder(7, 1).encode(AUTOPILOT))
         await anyio.sleep(5)
         assert len(told.of(m.Timesync)) >= 9

@@ -7,13 +7,13 @@ from contextlib import AbstractAsyncContextManager
 
 import anyio
 import pytest
-from several_harness import News, Radios, Told, over
+from several_harness import EventLog, Radios, ReceivedMessages, over
 
 import aerokit
 from aerokit import events
 from aerokit import messages as m
-from aerokit.connection.components import HardwareId
-from aerokit.connection.multilink.link_choice import PROOFS, UNNAMED_AFTER, LinkChoice
+from aerokit.connection.multilink.link_choice import MAX_TIMES_WITHOUT_HARDWARE, MIN_CLOCK_MATCHES, LinkChoice
+from aerokit.connection.multilink.vehicle_clock import HardwareId
 from aerokit.errors import AerokitError
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND
@@ -41,7 +41,7 @@ class Twins:
     def __init__(self, ours: bytes, theirs: bytes) -> None:
         self.ours, self.theirs = copter(ours), copter(theirs)
         self.radios = Radios(2)
-        self.told = Told(self.radios)
+        self.told = ReceivedMessages(self.radios)
 
     def connected(self) -> AbstractAsyncContextManager[aerokit.Connection]:
         vehicles = [self.ours, self.theirs]
@@ -49,21 +49,21 @@ class Twins:
 
 
 def choice_of(connection: aerokit.Connection) -> LinkChoice:
-    assert connection._several is not None
-    return connection._several._choices[1]
+    assert connection._multilink is not None
+    return connection._multilink._choices[1]
 
 
-async def test_another_vehicle_that_was_switched_on_at_the_same_instant_is_told_and_left_alone(
+async def test_vehicle_with_other_hardware_id_is_reported_and_refused(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     twins = Twins(b"A" * 18, b"B" * 18)
     with caplog.at_level(logging.WARNING, "aerokit"):
         async with twins.connected() as connection:
-            doubts = News(connection, events.HeardTwice)
+            doubts = EventLog(connection, events.DuplicateSender)
             async with aerokit.connect(connection) as flying:
                 await flying.wait_ready()
                 await anyio.sleep(10)
-                assert [(each.system_id, type(each)) for each in doubts.all] == [(1, events.HeardTwice)]
+                assert [(each.system_id, type(each)) for each in doubts.all] == [(1, events.DuplicateSender)]
                 twins.told.messages.clear()
                 twins.radios.cut(0)
                 await anyio.sleep(8)
@@ -74,16 +74,16 @@ async def test_another_vehicle_that_was_switched_on_at_the_same_instant_is_told_
                 assert choice_of(connection).candidates[1].is_doubted
     warnings = [each.getMessage() for each in caplog.records if "hardware id" in each.getMessage()]
     assert len(warnings) == 1
-    assert "another vehicle speaks as system 1 over" in warnings[0]
+    assert "another vehicle with system id 1 was received over" in warnings[0]
 
 
 @pytest.mark.parametrize(
     ("ours", "theirs"), [(NOBODY, NOBODY), (b"A" * 18, NOBODY), (NOBODY, b"B" * 18), (b"A" * 18, b"A" * 18)]
 )
-async def test_without_two_ids_to_compare_the_clock_decides(ours: bytes, theirs: bytes) -> None:
+async def test_clock_decides_without_two_hardware_ids(ours: bytes, theirs: bytes) -> None:
     twins = Twins(ours, theirs)
     async with twins.connected() as connection:
-        doubts = News(connection, events.HeardTwice)
+        doubts = EventLog(connection, events.DuplicateSender)
         async with aerokit.connect(connection) as flying:
             await flying.wait_ready()
             await anyio.sleep(4)
@@ -91,7 +91,7 @@ async def test_without_two_ids_to_compare_the_clock_decides(ours: bytes, theirs:
             assert doubts.all == []
 
 
-async def test_without_a_vehicle_object_both_are_asked() -> None:
+async def test_both_links_are_probed_without_vehicle_object() -> None:
     twins = Twins(b"A" * 18, b"B" * 18)
     async with twins.connected() as connection:
         await anyio.sleep(5)
@@ -100,9 +100,9 @@ async def test_without_a_vehicle_object_both_are_asked() -> None:
         assert choice_of(connection).candidates[1].is_doubted
 
 
-async def test_one_vehicle_with_two_radios_is_asked_once_over_the_second() -> None:
+async def test_second_radio_is_asked_once_for_hardware() -> None:
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     async with over(radios, copter(b"A" * 18)) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await anyio.sleep(5)
@@ -111,7 +111,7 @@ async def test_one_vehicle_with_two_radios_is_asked_once_over_the_second() -> No
         assert choice_of(connection).candidates[1].is_proven
 
 
-async def test_a_question_that_is_lost_is_asked_again() -> None:
+async def test_lost_hardware_request_is_repeated() -> None:
     twins = Twins(b"A" * 18, b"B" * 18)
     write, lost = twins.radios.links[1].link.write, [0]
 
@@ -134,7 +134,7 @@ async def test_a_question_that_is_lost_is_asked_again() -> None:
         assert choice_of(connection).candidates[1].is_doubted
 
 
-async def test_nothing_is_sent_to_nor_taken_of_who_was_used_by_mistake() -> None:
+async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
     """Theirs tells its hardware id only after ours has gone."""
     twins = Twins(b"A" * 18, NOBODY)
     async with twins.connected() as connection, aerokit.connect(connection) as flying:
@@ -160,12 +160,12 @@ async def test_nothing_is_sent_to_nor_taken_of_who_was_used_by_mistake() -> None
 
 
 class Answers:
-    """Two links to who tells the same time."""
+    """Two links on which the same time is received."""
 
     def __init__(self) -> None:
         self.choice, self.now = LinkChoice(needs_proof=True), 0.0
         for link in (0, 1):
-            self.choice.heard(link, 0.0, is_costly=False)
+            self.choice.record_heartbeat(link, 0.0, is_costly=False)
         self.choice.choose(0.0)
         self.second = self.choice.candidates[1]
 
@@ -174,68 +174,68 @@ class Answers:
         for _ in range(times):
             self.now += 0.5
             for link in links or (0, 1):
-                self.choice.heard(link, self.now, is_costly=False)
-                self.choice.asks_hardware(self.choice.candidates[link], is_wanted=True)
-                self.choice.note_answer(link, self.now, self.now + ahead_s, 0.01, self.now)
+                self.choice.record_heartbeat(link, self.now, is_costly=False)
+                self.choice.should_request_hardware(self.choice.candidates[link], is_attached=True)
+                self.choice.record_answer(link, self.now, self.now + ahead_s, 0.01, self.now)
             self.choice.choose(self.now)
 
 
-def test_who_does_not_tell_its_hardware_is_believed_by_its_clock_soon() -> None:
+def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
     answers = Answers()
-    answers.choice.note_hardware(0, OURS)
+    answers.choice.record_hardware(0, OURS)
     steps = 0
     while not answers.second.is_proven:
         answers.come(1)
         steps += 1
-    assert PROOFS < steps <= 1 + PROOFS + UNNAMED_AFTER
+    assert MIN_CLOCK_MATCHES < steps <= 1 + MIN_CLOCK_MATCHES + MAX_TIMES_WITHOUT_HARDWARE
 
 
-def test_who_tells_another_hardware_late_is_not_used_any_more() -> None:
+def test_late_other_hardware_id_disables_the_link() -> None:
     answers = Answers()
-    answers.choice.note_hardware(0, OURS)
+    answers.choice.record_hardware(0, OURS)
     answers.come(10)
     assert answers.choice.may_be_used(answers.second)
-    answers.choice.note_hardware(1, THEIRS)
+    answers.choice.record_hardware(1, THEIRS)
     for _ in range(5):
-        answers.second.note_copy(answers.now)
+        answers.second.record_copy(answers.now)
     answers.come(10)
     assert not answers.choice.may_be_used(answers.second)
     assert answers.second.is_doubted
     assert not answers.second.is_proven
 
 
-def test_a_vehicle_that_is_found_to_be_another_one_while_it_is_used_gets_nothing() -> None:
-    """Ours has gone; who answers over the second link tells only then who it is."""
+def test_used_link_with_other_hardware_gets_nothing() -> None:
+    """Our vehicle has gone; the one behind the second link sends its hardware id only then."""
     answers = Answers()
-    answers.choice.note_hardware(0, OURS)
+    answers.choice.record_hardware(0, OURS)
     answers.come(10)
     answers.come(10, 1)
     assert answers.choice.used is answers.second
-    answers.choice.note_hardware(1, THEIRS)
+    answers.choice.record_hardware(1, THEIRS)
     answers.come(2, 1)
     assert not answers.choice.may_be_used(answers.second)
-    answers.choice.heard(0, answers.now, is_costly=False)
+    answers.choice.record_heartbeat(0, answers.now, is_costly=False)
     assert answers.choice.choose(answers.now) == "another vehicle"
     assert answers.choice.used is answers.choice.candidates[0]
     assert not answers.second.is_proven
 
 
-def test_after_a_reboot_the_hardware_may_be_another_one() -> None:
+def test_hardware_may_change_after_reboot() -> None:
     answers = Answers()
     for link in (0, 1):
-        answers.choice.note_hardware(link, OURS)
+        answers.choice.record_hardware(link, OURS)
     answers.come(10)
     answers.come(1, ahead_s=0.0)
     for link in (0, 1):
-        answers.choice.note_hardware(link, THEIRS)
+        answers.choice.record_hardware(link, THEIRS)
     answers.come(10, ahead_s=0.0)
     assert answers.choice.may_be_used(answers.second)
     assert not answers.second.is_doubted
 
 
-def test_ids_are_compared_by_the_field_that_both_tell() -> None:
+def test_hardware_ids_are_compared_by_common_field() -> None:
     def of(uid2: bytes, uid: int) -> HardwareId:
-        return HardwareId.of(m.AutopilotVersion(0, 0, 0, 0, 0, b"", b"", b"", 0, 0, uid, uid2))
+        return HardwareId.from_message(m.AutopilotVersion(0, 0, 0, 0, 0, b"", b"", b"", 0, 0, uid, uid2))
 
     one, two = b"\1".ljust(18, b"\0"), b"\2".ljust(18, b"\0")
     assert of(one, 7).contradicts(of(two, 7))
@@ -248,4 +248,4 @@ def test_ids_are_compared_by_the_field_that_both_tell() -> None:
     assert of(b"", 7).confirms(of(two, 7))
     assert not of(one, 7).confirms(of(two, 7))
     assert not of(b"", 0).confirms(of(b"", 0)), "nothing told is no evidence"
-    assert [of(b"", 0).is_told, of(one, 0).is_told, of(b"", 1).is_told] == [False, True, True]
+    assert [of(b"", 0).has_value, of(one, 0).has_value, of(b"", 1).has_value] == [False, True, True]

@@ -7,7 +7,7 @@ from itertools import pairwise
 import anyio
 import pytest
 from exhaustive import sampled
-from several_harness import DEAD, GOOD, News, Radios, Told, over
+from several_harness import DEAD, GOOD, EventLog, Radios, ReceivedMessages, over
 
 import aerokit
 from aerokit import events
@@ -49,11 +49,11 @@ async def proven(connection: aerokit.Connection, link: int) -> None:
             await anyio.sleep(0.1)
 
 
-async def test_a_flight_goes_on_when_the_link_in_use_dies(vehicle: SimulatedVehicle) -> None:
+async def test_flight_continues_when_the_used_link_fails(vehicle: SimulatedVehicle) -> None:
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     async with over(radios, vehicle) as connection, aerokit.connect(connection) as flying:
-        news = News(connection, events.LinkChosen, events.VehicleSilent, events.LinkStateChanged)
+        news = EventLog(connection, events.LinkSelected, events.VehicleSilent, events.LinkStateChanged)
         await flying.wait_ready()
         await flying.arm()
         await flying.take_off(10)
@@ -71,15 +71,15 @@ async def test_a_flight_goes_on_when_the_link_in_use_dies(vehicle: SimulatedVehi
         assert connection.now() - cut_at > 3, "it was cut on the way"
         await flying.land()
         assert flying.heartbeat_age < 2
-    assert [each for each in news.all if not isinstance(each, events.LinkChosen)] == []
+    assert [each for each in news.all if not isinstance(each, events.LinkSelected)] == []
     orders = told.of(m.CommandLong, m.CommandInt, m.SetMode, m.SetPositionTargetGlobalInt)
     assert orders[0][0] == 0
     assert orders[-1][0] == 1
 
 
-async def test_what_is_ordered_goes_out_once_over_one_link() -> None:
+async def test_command_is_sent_once_over_one_link() -> None:
     radios = Radios(3)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
         await proven(connection, 1)
@@ -94,7 +94,7 @@ async def test_what_is_ordered_goes_out_once_over_one_link() -> None:
         assert {index for index, _ in heartbeats} == {0, 1, 2}, "every side hears that we are there"
 
 
-async def test_without_an_own_stream_for_each_link_every_frame_is_taken_once() -> None:
+async def test_shared_stream_is_delivered_once() -> None:
     """A router on board copies one stream: half of it is lost on each radio, and nearly all of it arrives."""
     lossy = FaultModel(loss=0.5)
     radios = Radios(2, models=[lossy, lossy], seed=3)
@@ -111,12 +111,12 @@ async def test_without_an_own_stream_for_each_link_every_frame_is_taken_once() -
         assert 0.65 < len(times) / 400 < 0.85, "three of four arrive by one of the two"
 
 
-async def test_copies_leave_no_gap_when_one_radio_dies() -> None:
+async def test_copies_leave_no_gap_when_one_radio_fails() -> None:
     radios = Radios(2)
     async with over(radios, a_copter(), copied=True) as connection:
         came: list[m.Attitude] = []
         connection.bus.attach(m.Attitude, came.append)
-        news = News(connection)
+        news = EventLog(connection)
         async with aerokit.connect(connection, rates={m.Attitude: 20}):
             await anyio.sleep(5)
             used = connection.links.value[0].used_for == (1,) if connection.links is not None else True
@@ -129,7 +129,7 @@ async def test_copies_leave_no_gap_when_one_radio_dies() -> None:
         assert [reason for _, reason in news.chosen] == ["silent"]
 
 
-async def test_the_other_stream_of_the_vehicle_is_not_mixed_in() -> None:
+async def test_second_stream_of_the_vehicle_is_not_mixed_in() -> None:
     """It may be older: the second radio needs a second."""
     radios = Radios(2, models=[GOOD, FaultModel(delay_s=1.0)])
     async with over(radios, a_copter()) as connection:
@@ -144,15 +144,15 @@ async def test_the_other_stream_of_the_vehicle_is_not_mixed_in() -> None:
         assert len(times) - len(set(times)) <= 1, "the vehicle begins its stream anew on the other link"
 
 
-async def test_a_costly_link_is_used_when_the_other_fails_and_no_longer() -> None:
+async def test_costly_link_is_used_only_while_other_fails() -> None:
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     async with over(radios, a_copter(), links={"costly": [0]}) as connection:
-        news = News(connection)
+        news = EventLog(connection)
         async with aerokit.connect(connection):
             await anyio.sleep(10)
             cheap, costly = radios.links[1].address, radios.links[0].address
-            used = [each.link for each in news.all if isinstance(each, events.LinkChosen)][-1]
+            used = [each.link for each in news.all if isinstance(each, events.LinkSelected)][-1]
             assert used == cheap
             radios.cut(1)
             await anyio.sleep(3)
@@ -166,10 +166,10 @@ async def test_a_costly_link_is_used_when_the_other_fails_and_no_longer() -> Non
             assert asked[0] < asked[1] / 5, "it is asked seldom"
 
 
-async def test_a_better_link_is_preferred() -> None:
+async def test_better_link_is_preferred() -> None:
     radios = Radios(2, models=[FaultModel(delay_s=0.6, loss=0.2), GOOD])
     async with over(radios, a_copter()) as connection:
-        news = News(connection)
+        news = EventLog(connection)
         async with aerokit.connect(connection):
             await anyio.sleep(20)
             status = connection.links
@@ -183,15 +183,15 @@ async def test_a_better_link_is_preferred() -> None:
             assert len(news.chosen) <= 1, "it is not changed again and again"
 
 
-async def test_another_vehicle_with_the_same_id_is_never_believed() -> None:
+async def test_other_vehicle_with_same_id_is_never_accepted() -> None:
     """Its link is there, and ours dies: nothing is ordered of it."""
     ours, another = SimulatedCopter(boot_time_s=0.0), SimulatedCopter(boot_time_s=0.0)
     radios = Radios(2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     server = {"vehicles_on": [[ours], [another]]}
     async with over(radios, [ours, another], server=server) as connection:
         another.booted_at = -500.0
-        doubts = News(connection, events.HeardTwice)
+        doubts = EventLog(connection, events.DuplicateSender)
         async with aerokit.connect(connection) as flying:
             await flying.wait_ready()
             await anyio.sleep(5)
@@ -207,10 +207,10 @@ async def test_another_vehicle_with_the_same_id_is_never_believed() -> None:
             assert to_it == []
 
 
-async def test_a_component_behind_the_other_link_is_heard_and_reached_there() -> None:
+async def test_component_behind_other_link_is_reached_there() -> None:
     """A camera on the second radio; the vehicle is spoken to over the first one."""
     radios = Radios(2)
-    told, camera = Told(radios), FrameEncoder(1, 100)
+    told, camera = ReceivedMessages(radios), FrameEncoder(1, 100)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
         heard: list[m.Heartbeat] = []
         connection.bus.attach(m.Heartbeat, heard.append)
@@ -225,7 +225,7 @@ async def test_a_component_behind_the_other_link_is_heard_and_reached_there() ->
         assert [index for index, _ in told.of(m.CommandLong)] == [1, 0]
 
 
-async def test_our_own_frames_that_are_passed_on_from_one_port_to_the_other_are_nobodys() -> None:
+async def test_own_frames_forwarded_by_vehicle_are_ignored() -> None:
     """As PX4 does with heartbeats of ground stations."""
     radios = Radios(2)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
@@ -235,10 +235,10 @@ async def test_our_own_frames_that_are_passed_on_from_one_port_to_the_other_are_
             await anyio.sleep(1)
         assert connection.links is not None
         assert all(each.systems == (1,) for each in connection.links.value)
-        assert (connection.source_system, connection.source_component) not in connection.heard
+        assert (connection.source_system, connection.source_component) not in connection.heartbeats
 
 
-async def test_transfers_go_on_over_the_next_link(vehicle: SimulatedVehicle) -> None:
+async def test_transfers_continue_over_the_next_link(vehicle: SimulatedVehicle) -> None:
     slow = FaultModel(delay_s=0.1, bandwidth=30_000)
     radios = Radios(2, models=[slow, slow])
     items = [waypoint(-35.36 + index * 1e-4, 149.16, altitude_relative_m=20.0) for index in range(150)]
@@ -266,11 +266,11 @@ async def test_transfers_go_on_over_the_next_link(vehicle: SimulatedVehicle) -> 
         assert len(back[0].items) == 150
 
 
-async def test_what_waits_in_a_stalled_link_is_taken_back() -> None:
+async def test_unsent_data_of_a_stalled_link_is_discarded() -> None:
     radios = Radios(2)
     copter = a_copter()
     async with over(radios, copter) as connection, aerokit.connect(connection) as flying:
-        news = News(connection)
+        news = EventLog(connection)
         await flying.wait_ready()
         await proven(connection, 1)
         used = 0 if connection.links.value[0].used_for else 1  # type: ignore[union-attr]
@@ -283,32 +283,32 @@ async def test_what_waits_in_a_stalled_link_is_taken_back() -> None:
         assert not copter.is_armed, "the order was taken back, and did not arrive late"
 
 
-async def test_a_link_that_is_closed_is_left_at_once_and_all_of_them_end_the_connection() -> None:
+async def test_closed_link_is_left_and_all_closed_end_connection() -> None:
     radios = Radios(2)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):
-        news = News(connection, events.LinkChosen, events.OneLinkChanged, events.LinkClosed)
+        news = EventLog(connection, events.LinkSelected, events.MemberLinkStateChanged, events.LinkClosed)
         await proven(connection, 1)
         used = 0 if connection.links.value[0].used_for else 1  # type: ignore[union-attr]
         radios.far[used].close()
         await anyio.sleep(0.2)
         assert [reason for _, reason in news.chosen] == ["lost"]
-        changed = [each for each in news.all if isinstance(each, events.OneLinkChanged)]
+        changed = [each for each in news.all if isinstance(each, events.MemberLinkStateChanged)]
         assert (changed[0].link, changed[0].after) == (radios.links[used].address, LinkState.LOST)
         radios.far[1 - used].close()
         await anyio.sleep(0.2)
         assert not connection.is_open
-        with pytest.raises(LinkLost, match="all links are away"):
+        with pytest.raises(LinkLost, match="all links are lost"):
             connection.raise_if_ended()
 
 
 async def test_links_that_cannot_be_opened() -> None:
-    with pytest.raises(LinkOpenError, match=r"none of the links.*tcp:127.0.0.1:1.*tcp:127.0.0.1:2"):
+    with pytest.raises(LinkOpenError, match=r"no link can be opened.*tcp:127.0.0.1:1.*tcp:127.0.0.1:2"):
         async with open_connection(["tcp:127.0.0.1:1", "tcp:127.0.0.1:2"]):
             pass
     with pytest.raises(InvalidArgument, match=r"\[\] is not allowed"):
         async with open_connection([]):
             pass
-    with pytest.raises(InvalidArgument, match="a recording is no link"):
+    with pytest.raises(InvalidArgument, match="a recording cannot replace a link"):
         async with open_connection(["udpin:127.0.0.1:0", "flight.tlog"]):
             pass
     with pytest.raises(InvalidArgument, match="not a link address"):
@@ -324,11 +324,11 @@ async def test_one_address_in_a_list_is_one_link() -> None:
             assert vehicle.system_id == 1
 
 
-async def test_a_link_that_was_not_there_is_used_when_it_comes() -> None:
+async def test_link_that_opens_late_is_used() -> None:
     radios = Radios(2)
     radios.links[1].incoming.model = radios.links[1].outgoing.model = DEAD
     async with over(radios, a_copter()) as connection, aerokit.connect(connection) as vehicle:
-        news = News(connection)
+        news = EventLog(connection)
         await vehicle.wait_ready()
         radios.mend(1)
         await proven(connection, 1)
@@ -338,10 +338,10 @@ async def test_a_link_that_was_not_there_is_used_when_it_comes() -> None:
         await vehicle.arm()
 
 
-async def test_a_ground_station_shares_all_of_the_links() -> None:
+async def test_ground_station_shares_all_links() -> None:
     """Its transfer goes on, too, when one of them dies; each order of its own arrives once."""
     radios = Radios(2, models=[FaultModel(delay_s=0.02)] * 2)
-    told = Told(radios)
+    told = ReceivedMessages(radios)
     ours, theirs = memory_link_pair(latency_s=0.005)
     async with (
         over(radios, a_copter()) as connection,
@@ -372,13 +372,11 @@ async def test_a_ground_station_shares_all_of_the_links() -> None:
 
 @pytest.mark.parametrize("seconds", sampled([0.0, 0.3, 0.6, 0.8, 1.0, 1.5], 3))
 @pytest.mark.parametrize("is_silent", [False, True])
-async def test_link_that_dies_soon_after_the_vehicle_stood_still_is_left(
-    seconds: float, is_silent: bool
-) -> None:
+async def test_link_that_fails_after_clock_pause_is_left(seconds: float, is_silent: bool) -> None:
     """The vehicle's clock stands still for 1.5 s, as a simulation's does; then the link in use dies."""
     radios, copter = Radios(2), SimulatedCopter()
     async with over(radios, copter) as connection, aerokit.connect(connection) as flying:
-        news = News(connection)
+        news = EventLog(connection)
         await anyio.sleep(6)
         await stand_still(copter, radios, is_silent=is_silent)
         await anyio.sleep(seconds)
@@ -390,11 +388,11 @@ async def test_link_that_dies_soon_after_the_vehicle_stood_still_is_left(
 
 @pytest.mark.parametrize("seconds", sampled([0.1, 0.6, 0.8, 1.0, 1.5, 3.0], 3))
 @pytest.mark.parametrize("hiccups", [0, 1, 2])
-async def test_link_that_dies_soon_after_a_reboot_is_left(seconds: float, hiccups: int) -> None:
+async def test_link_that_fails_after_reboot_is_left(seconds: float, hiccups: int) -> None:
     radios, copter = Radios(2), SimulatedCopter(boot_time_s=0.0)
     copter.uid = b"A" * 18
     async with over(radios, copter) as connection, aerokit.connect(connection):
-        news = News(connection)
+        news = EventLog(connection)
         await anyio.sleep(6)
         copter.booted_at = copter.now
         await anyio.sleep(seconds)

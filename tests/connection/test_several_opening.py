@@ -1,4 +1,4 @@
-"""Several links, and how they are opened: none twice, and one that is not there is told."""
+"""Opening several links: duplicates are refused, and a failed link is reported."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from functools import partial
 
 import anyio
 import pytest
-from several_harness import News
+from several_harness import EventLog
 
 from aerokit import events
 from aerokit.connection.opening import open_connection
 from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.events import LinkState
 from aerokit.testing import VIRTUAL_BACKEND
-from aerokit.transport import Link, MemoryLink, SeveralLinks, memory_link_pair
+from aerokit.transport import Link, MemoryLink, MultiLink, memory_link_pair
 
 pytestmark = pytest.mark.anyio
 
@@ -35,11 +35,9 @@ def anyio_backend() -> tuple[str, dict[str, object]]:
         ("zenoh://north/alpha", "zenoh://north/alpha"),
     ],
 )
-async def test_an_address_that_is_named_twice_is_refused_before_anything_is_opened(
-    one: str, again: str
-) -> None:
+async def test_duplicate_address_is_refused_before_opening(one: str, again: str) -> None:
     near, far = memory_link_pair()
-    with pytest.raises(InvalidArgument, match=r"address = .* is not allowed: .* is named twice") as caught:
+    with pytest.raises(InvalidArgument, match=r"address = .* is not allowed: .* is listed twice") as caught:
         async with open_connection([near, one, again]):
             pass
     assert repr(again) in str(caught.value)
@@ -47,19 +45,19 @@ async def test_an_address_that_is_named_twice_is_refused_before_anything_is_open
         far.close()
 
 
-async def test_a_link_that_is_named_twice_is_refused() -> None:
+async def test_duplicate_link_object_is_refused() -> None:
     near, far = memory_link_pair()
-    with pytest.raises(InvalidArgument, match="is named twice"):
+    with pytest.raises(InvalidArgument, match="is listed twice"):
         async with open_connection([near, near]):
             pass
     async with open_connection(near):
         far.close()
 
 
-async def test_what_is_another_one_each_time_may_be_named_twice() -> None:
+async def test_addresses_that_open_something_new_may_repeat() -> None:
     async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0", "tcpin:127.0.0.1:0"]) as connection:
-        assert isinstance(connection.link, SeveralLinks)
-        assert [connection.link.is_there(link) for link in range(3)] == [True, True, True]
+        assert isinstance(connection.link, MultiLink)
+        assert [connection.link.is_available(link) for link in range(3)] == [True, True, True]
 
 
 class NotYet(MemoryLink):
@@ -77,21 +75,19 @@ class NotYet(MemoryLink):
 
 
 @pytest.mark.parametrize("failures", [1, 4])
-async def test_a_link_that_cannot_be_opened_at_first_is_told_once(
-    failures: int, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_failed_member_link_is_reported_once(failures: int, caplog: pytest.LogCaptureFixture) -> None:
     near, _far = memory_link_pair()
     both: list[Link] = [near, NotYet(failures)]
-    together = SeveralLinks([partial(both.__getitem__, index) for index in range(2)])
+    together = MultiLink([partial(both.__getitem__, index) for index in range(2)])
     with caplog.at_level(logging.WARNING, "aerokit"):
         async with open_connection(together) as connection:
-            news = News(connection, events.OneLinkNotOpened, events.OneLinkChanged)
+            news = EventLog(connection, events.MemberLinkOpenFailed, events.MemberLinkStateChanged)
             await anyio.sleep(30)
-            told = [each for each in news.all if isinstance(each, events.OneLinkNotOpened)]
+            told = [each for each in news.all if isinstance(each, events.MemberLinkOpenFailed)]
             assert [each.link for each in told] == ["memory:away"] * (failures > 1)
             assert all(isinstance(each.error, LinkOpenError) for each in told)
             last = news.all[-1]
-            assert isinstance(last, events.OneLinkChanged)
+            assert isinstance(last, events.MemberLinkStateChanged)
             assert (last.link, last.after) == ("memory:away", LinkState.CONNECTED)
     warnings = [each.getMessage() for each in caplog.records if "memory:away" in each.getMessage()]
     assert len(warnings) == 1

@@ -58,7 +58,7 @@ def lenient(key: SigningKey) -> Signing:
 
 
 @pytest.mark.parametrize("make", [radio_copter, SimulatedPx4])
-async def test_a_key_is_set_up_used_and_taken_away(make: Any) -> None:
+async def test_key_is_set_up_used_and_removed(make: Any) -> None:
     simulated = make()
     async with connected(simulated) as vehicle:
         await vehicle.wait_ready()
@@ -77,7 +77,7 @@ async def test_a_key_is_set_up_used_and_taken_away(make: Any) -> None:
         assert signing.frames_refused == 0
 
 
-async def test_a_whole_flight_signed() -> None:
+async def test_whole_flight_signed() -> None:
     signing = Signing(KEY)
     copter = radio_copter(signing_key=KEY, parameter_count=200)
     async with connected(copter, signing=signing) as vehicle:
@@ -90,7 +90,7 @@ async def test_a_whole_flight_signed() -> None:
     assert signing.refused[Refusal.UNSIGNED] == signing.refused[Refusal.WRONG_SIGNATURE] == 0
 
 
-async def test_a_vehicle_with_a_key_does_not_hear_who_has_none() -> None:
+async def test_vehicle_with_key_ignores_unsigned_program() -> None:
     async with connected(radio_copter(signing_key=KEY)) as vehicle:
         with pytest.raises(CommandTimeout, match="its frames are signed and no key was given"):
             await vehicle.command(512, 148)
@@ -102,18 +102,18 @@ async def test_a_vehicle_with_a_key_does_not_hear_who_has_none() -> None:
 
 
 class Zeros(SigningKey):
-    """What PX4 signs with that has no key; SigningKey refuses it."""
+    """Key with which PX4 signs without a key; SigningKey refuses it."""
 
     def __init__(self) -> None:
         self._secret = bytes(32)
 
 
-async def test_signed_with_zeros_means_that_it_has_no_key() -> None:
+async def test_signing_with_zeros_means_no_key() -> None:
     px4 = SimulatedPx4()
     async with connected(px4) as vehicle:
         px4.channels[0].sign_with(lenient(Zeros()))
         await anyio.sleep(2)
-        heartbeat = vehicle.connection.heard[1, 1].received_frame
+        heartbeat = vehicle.connection.heartbeats[1, 1].received_frame
         assert heartbeat is not None
         assert lenient(Zeros()).has_signed(heartbeat)
         px4.faults.ignore(512)
@@ -122,7 +122,7 @@ async def test_signed_with_zeros_means_that_it_has_no_key() -> None:
         assert "signed" not in str(failure.value)
 
 
-async def test_a_key_is_taken_away_from_who_signs_with_zeros_then(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_key_is_removed_from_vehicle_signing_with_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
     px4 = SimulatedPx4(signing_key=KEY)
     start = px4.signing.start
 
@@ -138,7 +138,7 @@ async def test_a_key_is_taken_away_from_who_signs_with_zeros_then(monkeypatch: p
         assert [px4.signing.key, vehicle.connection.signing] == [None, None]
 
 
-async def test_px4_takes_keys_by_usb_only_and_the_error_says_so() -> None:
+async def test_px4_accepts_keys_by_usb_only() -> None:
     px4 = SimulatedPx4()
     px4.signing.may_change = lambda: False  # type: ignore[method-assign]
     async with connected(px4) as vehicle:
@@ -147,7 +147,7 @@ async def test_px4_takes_keys_by_usb_only_and_the_error_says_so() -> None:
 
 
 @pytest.mark.parametrize(("vehicle_key", "why"), [(None, "is not signed"), (WRONG, "another key")])
-async def test_a_vehicle_without_the_key_is_not_found(
+async def test_vehicle_without_the_key_is_not_found(
     vehicle_key: SigningKey | None, why: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     signing = Signing(KEY)
@@ -163,7 +163,7 @@ async def test_a_vehicle_without_the_key_is_not_found(
     assert KEY.fingerprint in record.getMessage()
 
 
-async def test_allow_unsigned_is_the_programs_choice() -> None:
+async def test_allow_unsigned_decides() -> None:
     signing = Signing(KEY, allow_unsigned=lambda frame: frame.message_id == Heartbeat.ID)
     async with connected(radio_copter(), signing=signing) as vehicle:
         await anyio.sleep(3)
@@ -172,7 +172,7 @@ async def test_allow_unsigned_is_the_programs_choice() -> None:
             await vehicle.command(512, 148)
 
 
-async def test_a_mistake_in_allow_unsigned_refuses_the_frame_and_nothing_else(
+async def test_allow_unsigned_exception_refuses_only_the_frame(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     def mistaken(frame: Frame) -> bool:
@@ -183,11 +183,11 @@ async def test_a_mistake_in_allow_unsigned_refuses_the_frame_and_nothing_else(
         connection.bytes_received(FrameEncoder(77, 1).encode(Heartbeat(2, 3, 0, 0, 3, 3)), None)
         await anyio.sleep(2)
         assert connection.is_open
-        assert (77, 1) not in connection.heard
+        assert (77, 1) not in connection.heartbeats
         assert "allow_unsigned" in caplog.text
 
 
-async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
+async def test_setup_is_refused_before_sending_and_by_vehicle() -> None:
     copter = radio_copter()
     async with connected(copter) as vehicle:
         await vehicle.wait_ready()
@@ -197,12 +197,12 @@ async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
         with pytest.raises(InvalidArgument, match="mavlink_version = 1"):
             vehicle.connection.signing = Signing(KEY)
         vehicle.connection.mavlink_version = 2
-        beat = vehicle.connection.heard[1, 1]
+        beat = vehicle.connection.heartbeats[1, 1]
         (frame,) = Framer().receive(FrameEncoder(1, 1, version=1).encode(beat))
-        vehicle.connection.heard[1, 1] = Heartbeat.decode(frame.payload, frame)
+        vehicle.connection.heartbeats[1, 1] = Heartbeat.decode(frame.payload, frame)
         with pytest.raises(NotSupported, match="the vehicle's frames are MAVLink 1"):
             await vehicle.setup_signing(Signing(KEY))
-        vehicle.connection.heard[1, 1] = beat
+        vehicle.connection.heartbeats[1, 1] = beat
         await vehicle.arm()
         with pytest.raises(OperationRejected, match="armed; nothing was sent"):
             await vehicle.setup_signing(Signing(KEY))
@@ -217,7 +217,7 @@ async def test_setup_is_refused_beforehand_and_by_the_vehicle() -> None:
         await vehicle.arm()
 
 
-async def test_one_key_at_a_time() -> None:
+async def test_one_key_handover_at_a_time() -> None:
     copter = radio_copter()
     async with connected(copter) as vehicle, anyio.create_task_group() as tasks:
         await vehicle.wait_ready()
@@ -239,7 +239,7 @@ async def test_setup_over_a_lossy_link() -> None:
         assert copter.signing.key == WRONG
 
 
-async def test_a_reboot_is_no_replay() -> None:
+async def test_reboot_is_no_replay() -> None:
     signing = Signing(KEY)
     copter = radio_copter(signing_key=KEY)
     async with connected(copter, signing=signing) as vehicle:
@@ -249,7 +249,7 @@ async def test_a_reboot_is_no_replay() -> None:
     assert signing.refused[Refusal.REPLAYED] == 0
 
 
-async def test_the_kept_time_stamp_is_what_the_next_run_begins_with() -> None:
+async def test_next_run_starts_with_stored_time_stamp() -> None:
     first = Signing(KEY, timestamp=1 << 47)
     async with connected(radio_copter(signing_key=KEY), signing=first) as vehicle:
         await vehicle.command(512, 148)
@@ -265,7 +265,7 @@ async def test_the_kept_time_stamp_is_what_the_next_run_begins_with() -> None:
 
 
 class Far:
-    """The other end of a link in memory: sends what it is told to, keeps what comes."""
+    """The far end of a memory link: sends on demand, and records received data."""
 
     def __init__(self) -> None:
         self.link, self._own = memory_link_pair()
@@ -306,7 +306,7 @@ HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
 ATTITUDE = Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-async def test_refused_frames_go_nowhere_and_are_told_once_for_each_reason(tmp_path: Path) -> None:
+async def test_refused_frames_are_reported_once_per_reason(tmp_path: Path) -> None:
     path = tmp_path / "log.tlog"
     signing, good = Signing(KEY), raw(HEARTBEAT, Signing(KEY))
     tapped: list[int] = []
@@ -315,7 +315,7 @@ async def test_refused_frames_go_nowhere_and_are_told_once_for_each_reason(tmp_p
             connection.subscribe(events.FrameRefused, capacity=9) as refused,
             connection.subscribe(Heartbeat, Attitude, capacity=9) as heard,
         ):
-            connection.tap(lambda frame, _: tapped.append(frame.system_id))
+            connection.observe_frames(lambda frame, _: tapped.append(frame.system_id))
             bad = raw(ATTITUDE, system_id=7), raw(ATTITUDE, Signing(WRONG), 8), good
             await far.say(good, *bad, *bad, raw(RadioStatus(0, 0, 0, 0, 0, 0, 0), system_id=51))
             told = [await refused.get() for _ in range(3)]
@@ -327,14 +327,14 @@ async def test_refused_frames_go_nowhere_and_are_told_once_for_each_reason(tmp_p
             (1, Refusal.REPLAYED.value),
         ]
         assert tapped == [1, 51]
-        assert list(connection.heard) == [(1, 1)]
+        assert list(connection.heartbeats) == [(1, 1)]
     assert signing.refused == {**dict.fromkeys(Refusal, 2), Refusal.TOO_OLD: 0}
     received = [each for _, each in read_tlog(path) if each[5] != 255]
     assert received[0] == good
     assert len(received) == 2
 
 
-async def test_what_is_forwarded_and_recorded_keeps_its_signature_but_no_key_is_recorded(
+async def test_forwarded_frames_keep_signature_and_keys_are_not_recorded(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "log.tlog"
@@ -352,18 +352,18 @@ async def test_what_is_forwarded_and_recorded_keeps_its_signature_but_no_key_is_
     assert all(Signing(KEY).has_signed(Frame.parse(each)) for each in recorded if each[5] == 255)
 
 
-async def test_an_unknown_message_is_checked_too() -> None:
+async def test_unknown_message_is_verified() -> None:
     signing, seen = Signing(KEY), []
     header = bytes((0xFD, 3, 1, 0, 0, 1, 1)) + (16_000_000).to_bytes(3, "little")
     frame = header + b"abc\x11\x22"
     async with with_far(signing=signing) as (connection, far):
-        connection.tap(lambda frame, _: seen.append(frame.message_id))
+        connection.observe_frames(lambda frame, _: seen.append(frame.message_id))
         await far.say(frame + Signing(KEY).sign(frame, 1.9e9), frame + Signing(WRONG).sign(frame, 2e9))
     assert seen == [16_000_000]
     assert signing.refused[Refusal.WRONG_SIGNATURE] == 1
 
 
-async def test_an_open_connection_has_its_signing() -> None:
+async def test_open_connection_has_its_signing() -> None:
     async with with_far() as (connection, _):
         with pytest.raises(InvalidArgument, match="signing"):
             async with connect_vehicle(connection, signing=Signing(KEY)):
@@ -373,7 +373,7 @@ async def test_an_open_connection_has_its_signing() -> None:
             pass
 
 
-async def test_time_stamps_go_on_with_the_clock_of_the_connection() -> None:
+async def test_time_stamps_follow_the_clock_of_the_connection() -> None:
     signing = Signing(KEY)
     async with with_far(signing=signing) as (_, far):
         await anyio.sleep(0.5)
@@ -384,7 +384,7 @@ async def test_time_stamps_go_on_with_the_clock_of_the_connection() -> None:
         assert stamps == sorted(set(stamps))
 
 
-async def test_a_time_stamp_that_is_not_kept_is_told_once_each_time(
+async def test_storage_error_of_time_stamp_is_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """From the first heartbeat on; we fly on all the same."""
@@ -397,11 +397,11 @@ async def test_a_time_stamp_that_is_not_kept_is_told_once_each_time(
         far = None
         for times in (1, 2):
             with monkeypatch.context() as broken:
-                broken.setattr(timestamp_file, "write_whole", full)
+                broken.setattr(timestamp_file, "write_atomically", full)
                 if far is None:
                     _, far = await stack.enter_async_context(with_far(signing=signing))
                 await anyio.sleep(100)
-                told = [text for text in caplog.messages if "is not kept: [Errno 28]" in text]
+                told = [text for text in caplog.messages if "cannot be stored: [Errno 28]" in text]
                 assert len(told) == times
             await anyio.sleep(100)
             assert signing.keep_error is None

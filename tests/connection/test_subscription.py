@@ -1,4 +1,4 @@
-"""Subscriptions: latest wins, what is missed is counted, ends are told."""
+"""Subscriptions: latest item wins, missed items are counted, and the end is raised."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Source:
         return Subscription(self.attach, capacity=capacity, overflow=overflow)
 
 
-async def test_a_slow_reader_gets_the_latest_and_sees_how_many_it_missed() -> None:
+async def test_slow_reader_gets_latest_item_and_missed_count() -> None:
     source = Source()
     with source.subscribe() as numbers:
         source.give(*range(100))
@@ -38,7 +38,7 @@ async def test_a_slow_reader_gets_the_latest_and_sees_how_many_it_missed() -> No
         assert numbers.missed == 99
 
 
-async def test_drop_newest_keeps_what_came_first() -> None:
+async def test_drop_newest_keeps_the_first_items() -> None:
     source = Source()
     with source.subscribe(3, "drop_newest") as numbers:
         source.give(*range(10))
@@ -46,7 +46,7 @@ async def test_drop_newest_keeps_what_came_first() -> None:
         assert numbers.missed == 7
 
 
-async def test_the_policy_error_ends_the_subscription_loudly() -> None:
+async def test_error_policy_ends_the_subscription() -> None:
     source = Source()
     with source.subscribe(2, "error") as numbers:
         source.give(1, 2, 3)
@@ -56,7 +56,7 @@ async def test_the_policy_error_ends_the_subscription_loudly() -> None:
             await numbers.get()
 
 
-async def test_it_is_registered_on_entry_and_gone_at_exit() -> None:
+async def test_subscription_is_active_inside_its_block() -> None:
     source = Source()
     numbers = source.subscribe()
     source.give(1)
@@ -68,7 +68,7 @@ async def test_it_is_registered_on_entry_and_gone_at_exit() -> None:
         await numbers.get()
 
 
-async def test_a_waiting_reader_is_woken() -> None:
+async def test_waiting_reader_is_woken() -> None:
     source, seen = Source(), list[int]()
     with source.subscribe(10) as numbers:
 
@@ -85,7 +85,7 @@ async def test_a_waiting_reader_is_woken() -> None:
     assert seen == [1, 2]
 
 
-async def test_get_times_out_and_leaves_the_subscription_usable() -> None:
+async def test_get_timeout_keeps_the_subscription_usable() -> None:
     source = Source()
     with source.subscribe() as numbers:
         with pytest.raises(OperationTimeout, match=r"within 0\.5 s"):
@@ -94,7 +94,7 @@ async def test_get_times_out_and_leaves_the_subscription_usable() -> None:
         assert await numbers.get(timeout=0.5) == 7
 
 
-async def test_cancelling_a_reader_loses_nothing() -> None:
+async def test_cancelled_reader_loses_nothing() -> None:
     source = Source()
     with source.subscribe() as numbers:
         with anyio.move_on_after(1):
@@ -103,7 +103,7 @@ async def test_cancelling_a_reader_loses_nothing() -> None:
         assert await numbers.get() == 1
 
 
-async def test_the_end_of_the_connection_is_raised_after_what_was_queued() -> None:
+async def test_end_of_connection_is_raised_after_queued_items() -> None:
     source = Source()
     with source.subscribe(5) as numbers:
         source.give(1)
@@ -114,7 +114,7 @@ async def test_the_end_of_the_connection_is_raised_after_what_was_queued() -> No
                 pass
 
 
-async def test_a_second_reader_is_refused() -> None:
+async def test_second_reader_is_refused() -> None:
     with Source().subscribe() as numbers:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(numbers.get)
@@ -125,6 +125,6 @@ async def test_a_second_reader_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("capacity", "overflow"), [(0, "drop_oldest"), (1, "block")])
-async def test_nonsense_is_refused(capacity: int, overflow: Overflow) -> None:
+async def test_invalid_arguments_are_refused(capacity: int, overflow: Overflow) -> None:
     with pytest.raises(InvalidArgument, match="is not allowed"):
         Source().subscribe(capacity, overflow)

@@ -61,12 +61,10 @@ async def connection(link: TwoPeers) -> AsyncIterator[Connection]:
 # ------------------------------------------------------------------------------------- taps
 
 
-async def test_a_tap_gets_everything_in_order_also_what_no_dialect_knows(
-    link: TwoPeers, connection: Connection
-) -> None:
+async def test_frame_observer_gets_all_frames_in_order(link: TwoPeers, connection: Connection) -> None:
     encoder, heard = FrameEncoder(1, 1), list[tuple[int, Peer]]()
     link.hear(encoder.encode(COPTER), "one")
-    detach = connection.tap(lambda frame, peer: heard.append((frame.message_id, peer)))
+    detach = connection.observe_frames(lambda frame, peer: heard.append((frame.message_id, peer)))
     link.hear(encoder.encode(ATTITUDE) + UNKNOWN + encoder.encode(COPTER), "one")
     link.hear(FrameEncoder(2, 1).encode(ATTITUDE), "another, new one")
     assert heard == [(30, "one"), (51234, "one"), (0, "one"), (30, "another, new one")]
@@ -74,34 +72,34 @@ async def test_a_tap_gets_everything_in_order_also_what_no_dialect_knows(
     detach()
     link.hear(encoder.encode(ATTITUDE), "one")
     assert len(heard) == 4
-    assert all(framer.wanted is connection.bus.wanted for framer in connection._intake.framers.values())
-    assert not any(framer.keep_unknown for framer in connection._intake.framers.values())
+    assert all(framer.wanted is connection.bus.wanted for framer in connection._receiver.framers.values())
+    assert not any(framer.keep_unknown for framer in connection._receiver.framers.values())
 
 
-async def test_those_who_subscribed_come_first(link: TwoPeers, connection: Connection) -> None:
+async def test_subscribers_are_called_before_observers(link: TwoPeers, connection: Connection) -> None:
     order: list[str] = []
-    connection.tap(lambda frame, peer: order.append(f"tap, {len(connection.heard)} known"))
+    connection.observe_frames(lambda frame, peer: order.append(f"tap, {len(connection.heartbeats)} known"))
     connection.attach([Heartbeat], lambda heartbeat: order.append("subscriber"))
     link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
     assert order == ["subscriber", "tap, 1 known"]
 
 
-async def test_a_tap_that_raises_is_logged_and_the_others_go_on(
+async def test_observer_exception_is_logged_and_others_continue(
     link: TwoPeers, connection: Connection, caplog: pytest.LogCaptureFixture
 ) -> None:
     heard: list[Frame] = []
-    connection.tap(lambda frame, peer: 1 / 0)
-    connection.tap(lambda frame, peer: heard.append(frame))
+    connection.observe_frames(lambda frame, peer: 1 / 0)
+    connection.observe_frames(lambda frame, peer: heard.append(frame))
     with caplog.at_level(logging.CRITICAL, "aerokit"):
         link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
     assert len(heard) == 1
     assert connection.is_open
 
 
-async def test_a_vehicle_that_is_heard_twice_is_tapped_once(link: TwoPeers, connection: Connection) -> None:
+async def test_duplicate_vehicle_is_observed_once(link: TwoPeers, connection: Connection) -> None:
     heard: list[Peer] = []
     link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
-    connection.tap(lambda frame, peer: heard.append(peer))
+    connection.observe_frames(lambda frame, peer: heard.append(peer))
     for peer in ("one", "two"):
         link.hear(FrameEncoder(1, 1).encode(ATTITUDE), peer)
     assert heard == ["one"]
@@ -110,7 +108,7 @@ async def test_a_vehicle_that_is_heard_twice_is_tapped_once(link: TwoPeers, conn
 # --------------------------------------------------------------------------------- raw frames
 
 
-async def test_a_raw_frame_goes_where_its_target_is_as_it_is(link: TwoPeers, connection: Connection) -> None:
+async def test_raw_frame_goes_unchanged_to_its_target(link: TwoPeers, connection: Connection) -> None:
     link.hear(FrameEncoder(1, 1).encode(COPTER), "one")
     link.hear(FrameEncoder(2, 1).encode(COPTER), "two")
     asked, told = (
@@ -134,28 +132,28 @@ async def test_a_raw_frame_goes_where_its_target_is_as_it_is(link: TwoPeers, con
     ],
     ids=["nothing", "text", "a part", "two", "unknown flags", "a part of version 1"],
 )
-async def test_what_is_no_frame_is_refused(link: TwoPeers, connection: Connection, data: bytes) -> None:
+async def test_invalid_raw_frame_is_refused(link: TwoPeers, connection: Connection, data: bytes) -> None:
     with pytest.raises(InvalidArgument, match=f"{len(data)} bytes"):
         connection.write_raw(data)
     assert link.sent == []
 
 
-async def test_a_closed_connection_writes_nothing(link: TwoPeers, connection: Connection) -> None:
+async def test_closed_connection_writes_nothing(link: TwoPeers, connection: Connection) -> None:
     connection.close()
     with pytest.raises(ConnectionClosed):
         connection.write_raw(UNKNOWN)
 
 
-async def test_a_ground_station_behind_a_forwarding_program() -> None:
-    """Taps and raw frames both ways: the ground station at the far end talks to the vehicle as if it were there."""
+async def test_ground_station_behind_a_forwarding_program() -> None:
+    """Frame observers and raw frames both ways: the far ground station talks to the vehicle as if it were near."""
     near, far = memory_link_pair(latency_s=0.01)
     async with (
         simulated_link(SimulatedCopter(boot_time_s=0)) as link,
         open_connection(link, source_system=254) as to_vehicle,
         open_connection(near, source_system=253) as to_station,
     ):
-        to_vehicle.tap(lambda frame, peer: to_station.write_raw(frame.raw))
-        to_station.tap(lambda frame, peer: to_vehicle.write_raw(frame.raw))
+        to_vehicle.observe_frames(lambda frame, peer: to_station.write_raw(frame.raw))
+        to_station.observe_frames(lambda frame, peer: to_vehicle.write_raw(frame.raw))
         async with connect(far, system_id=1) as vehicle:
             await vehicle.wait_ready()
             await vehicle.arm()
@@ -179,7 +177,7 @@ class Ear:
         """Nothing to do."""
 
 
-async def test_the_version_can_be_changed_while_it_is_open() -> None:
+async def test_version_can_be_changed_while_open() -> None:
     near, far = memory_link_pair()
     ear = Ear()
     await far.open(ear)
@@ -199,9 +197,7 @@ async def test_the_version_can_be_changed_while_it_is_open() -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
-async def test_component_0_is_answered(
-    make: type[SimulatedCopter] | type[SimulatedPx4], version: int
-) -> None:
+async def test_component_0_is_answered(make: type[SimulatedCopter] | type[SimulatedPx4], version: int) -> None:
     """Commands, parameters, missions and files of a program that calls itself (255, 0)."""
     async with (
         simulated_link(make()) as link,

@@ -10,4 +10,4 @@ from aerokit.dronekit import vehicle
 @pytest.fixture(autouse=True, scope="session")
 def no_first_values() -> None:
     """For the whole session: stages are shared by the tests of a module."""
-    pytest.MonkeyPatch().setattr(vehicle, "FIRST_VALUES_S", 0.0)
+    pytest.MonkeyPatch().setattr(vehicle, "FIRST_VALUES_TIMEOUT_S", 0.0)

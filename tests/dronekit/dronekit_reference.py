@@ -18,7 +18,7 @@ MODULE_NAMES = (
     *("connect", "copy", "default_still_waiting_callback", "logging", "math", "mavutil", "mavwp"),
     *("monotonic", "struct", "time", "util"),
 )
-"""What the module of DroneKit 2.9.2 has, by intention or not."""
+"""All names of the module of DroneKit 2.9.2, intended or not."""
 
 OTHER_NAMES = {
     "lib": MODULE_NAMES,
@@ -39,9 +39,7 @@ OBSERVERS: dict[str, dict[str, Any]] = {
     "on_attribute": {"name": ...},
     "notify_attribute_listeners": {"attr_name": ..., "value": ..., "cache": False},
 }
-COMMAND = (
-    "target_system target_component seq frame command current autocontinue param1 param2 param3 param4 x y z"
-)
+COMMAND = "target_system target_component seq frame command current autocontinue param1 param2 param3 param4 x y z"
 
 SIGNATURES: dict[str, dict[str, Any]] = {
     "APIException": {"message": ...},
@@ -330,4 +328,4 @@ EXAMPLES = {
         print("ready")
     """,
 }
-"""They run with what a program has imported, ``vehicle``, and functions that have the flight controller say things."""
+"""They run with a program's imports, ``vehicle``, and functions that make the flight controller send messages."""

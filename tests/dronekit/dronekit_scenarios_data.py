@@ -58,7 +58,7 @@ def row_33_setting(stage: Stage) -> Any:
 
 
 def all_read(stage: Stage) -> None:
-    """Nothing of the list is under way any more: a value from before a PARAM_SET would have it sent again, rightly."""
+    """Wait for the end of the download: an old value after PARAM_SET would cause a correct retry."""
     stage.vehicle.parameters.wait_ready()
     stage.reached()
 
@@ -120,25 +120,25 @@ def row_35_parameter_listeners(stage: Stage) -> Any:
     parameters.on_attribute("foo")(lambda _, name, value: decorated.append(name))
     for _ in range(2):
         stage.fc.parameters.values["FOO"] = 33.0
-        stage.fc.parameters.tell("FOO")
+        stage.fc.parameters.report("FOO")
     stage.settle()
     parameters.remove_attribute_listener("foo", listener)
     stage.fc.parameters.values["BAR"] = 4.0
-    stage.fc.parameters.tell("BAR")
+    stage.fc.parameters.report("BAR")
     stage.settle()
     return one, every, decorated
 
 
 @scenario([("MINE", 1.5), ("MINE", 1.5), ("MINE", 2.5)])
 def parameters_told_by_the_program(stage: Stage) -> Any:
-    told: list[tuple[str, float]] = []
+    notified: list[tuple[str, float]] = []
     parameters = stage.vehicle.parameters
-    parameters.on_attribute(attr_name="mine")(lambda _, name, value: told.append((name, value)))
+    parameters.on_attribute(attr_name="mine")(lambda _, name, value: notified.append((name, value)))
     for value in (1.5, 1.5):
         parameters.notify_attribute_listeners("mine", value)
     for value in (2.5, 2.5):
         parameters.notify_attribute_listeners("mine", value, cache=True)
-    return told
+    return notified
 
 
 @scenario((1, True), prepare=lambda fc: fc.parameters.lost_once.add("BAR"))
@@ -198,9 +198,7 @@ def row_36_download(stage: Stage) -> Any:
 
 
 def waypoint(stage: Stage, item: Item) -> Any:
-    return stage.dronekit.Command(
-        0, 0, 0, item.frame, item.command, 0, 0, *item.params, item.x, item.y, item.z
-    )
+    return stage.dronekit.Command(0, 0, 0, item.frame, item.command, 0, 0, *item.params, item.x, item.y, item.z)
 
 
 def kept(stage: Stage) -> list[tuple[int, float, float, float]]:
@@ -249,5 +247,5 @@ def changing_one_item(stage: Stage) -> Any:
 @scenario(([2], 3), prepare=keep_three)
 def row_38_next(stage: Stage) -> Any:
     sent = stage.sent_by(lambda: setattr(stage.vehicle.commands, "next", 2), "MISSION_SET_CURRENT")
-    stage.tell("MISSION_CURRENT", seq=3)
+    stage.report("MISSION_CURRENT", seq=3)
     return [frame.seq for frame in sent], stage.vehicle.commands.next

@@ -1,4 +1,4 @@
-"""Scenarios: who is told of what, in which order, and waiting for it."""
+"""Scenarios: notifications, their order, and waiting for them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def row_18_order_of_notifications(stage: Stage) -> Any:
         vehicle.add_attribute_listener(name, one)
     for name in ("global_frame", "global_relative_frame"):
         locations.add_attribute_listener(name, one)
-    stage.tell("GLOBAL_POSITION_INT", **POSITION)
+    stage.report("GLOBAL_POSITION_INT", **POSITION)
     return events
 
 
@@ -62,8 +62,8 @@ def row_19_states_once_sensors_each_time(stage: Stage) -> Any:
     stage.fc.base_mode, stage.fc.custom_mode, stage.fc.system_status = 129, 5, 4
     stage.fc.beat()
     stage.fc.beat()
-    stage.fc.tell("ATTITUDE", roll=0.25, pitch=0.5)
-    stage.tell("ATTITUDE", roll=0.25, pitch=0.5)
+    stage.fc.report("ATTITUDE", roll=0.25, pitch=0.5)
+    stage.report("ATTITUDE", roll=0.25, pitch=0.5)
     return [(name, value) for _, name, value in events]
 
 
@@ -83,8 +83,8 @@ def row_20_listener_that_raises(stage: Stage) -> Any:
     stage.vehicle.add_attribute_listener("heading", first)
     stage.vehicle.add_attribute_listener("heading", lambda _, name, value: calls.append(f"second {value}"))
     with stage.logged(having="heading") as lines:
-        stage.tell("VFR_HUD", heading=271)
-        stage.tell("VFR_HUD", heading=5)
+        stage.report("VFR_HUD", heading=271)
+        stage.report("VFR_HUD", heading=5)
     return calls, lines
 
 
@@ -100,9 +100,9 @@ def row_21_adding_and_removing(stage: Stage) -> Any:
     vehicle = stage.vehicle
     vehicle.add_attribute_listener("heading", listener)
     vehicle.add_attribute_listener("heading", listener)
-    stage.tell("VFR_HUD", heading=271)
+    stage.report("VFR_HUD", heading=271)
     vehicle.remove_attribute_listener("heading", listener)
-    stage.tell("VFR_HUD", heading=272)
+    stage.report("VFR_HUD", heading=272)
     again = caught(lambda: vehicle.remove_attribute_listener("heading", listener))
     unknown = caught(lambda: vehicle.remove_attribute_listener("no such name", listener))
     vehicle.add_attribute_listener("heading", other)
@@ -140,7 +140,7 @@ def message_listeners_after_attributes(stage: Stage) -> Any:
     stage.reached()
     stage.fc.custom_mode = 4
     stage.beat()
-    stage.tell("VFR_HUD", heading=271)
+    stage.report("VFR_HUD", heading=271)
     stage.vehicle.remove_message_listener("HEARTBEAT", one)
     stage.vehicle.remove_message_listener("HEARTBEAT", one)
     stage.vehicle.remove_message_listener("*", every)
@@ -160,7 +160,7 @@ def message_listener_that_raises(stage: Stage) -> Any:
     stage.vehicle.add_message_listener("VFR_HUD", lambda *_: calls.append("second"))
     stage.reached()
     with stage.logged(having="VFR_HUD") as lines:
-        stage.tell("VFR_HUD", heading=271)
+        stage.report("VFR_HUD", heading=271)
     return calls, lines
 
 
@@ -193,7 +193,7 @@ def listener_of_several_names(stage: Stage) -> Any:
     stage.vehicle.on_attribute(["mode", "attitude"])(listener)
     stage.fc.custom_mode = 5
     stage.beat()
-    stage.tell("ATTITUDE", yaw=0.5)
+    stage.report("ATTITUDE", yaw=0.5)
     return events
 
 
@@ -272,6 +272,6 @@ def wait_ready_names_of_true(stage: Stage) -> Any:
 def status_texts(stage: Stage) -> Any:
     with stage.logged("autopilot", having="text") as lines:
         for severity in range(8):
-            stage.fc.tell("STATUSTEXT", severity=severity, text=f" text {severity}  ".encode())
+            stage.fc.report("STATUSTEXT", severity=severity, text=f" text {severity}  ".encode())
         stage.settle()
     return lines

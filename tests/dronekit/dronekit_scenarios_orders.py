@@ -1,4 +1,4 @@
-"""Scenarios: what a program orders, and what goes out."""
+"""Scenarios: orders and the messages that they send."""
 
 from __future__ import annotations
 
@@ -46,9 +46,7 @@ def row_05_unknown_mode(stage: Stage) -> Any:
     return *texts, sent
 
 
-@scenario(
-    ("TimeoutError: failed to set flight mode", [(176, 1, 3, 0, 0, 0, 0, 0)], "None", "AUTO"), is_slow=True
-)
+@scenario(("TimeoutError: failed to set flight mode", [(176, 1, 3, 0, 0, 0, 0, 0)], "None", "AUTO"), is_slow=True)
 def row_09_wait_for_mode(stage: Stage) -> Any:
     stage.fc.results[176] = 4
     text = ""
@@ -128,7 +126,7 @@ def row_10_takeoff(stage: Stage) -> Any:
 
 
 def places(stage: Stage, location: Any, **speeds: float) -> list[tuple[Any, ...]]:
-    """What ``simple_goto`` sent: places as ``("goto", lat, lon, alt above home)``, commands as they are."""
+    """Return what ``simple_goto`` sent: positions as ``("goto", lat, lon, alt above home)``, commands unchanged."""
     seen: list[tuple[Any, ...]] = []
     names = (*GOTO, "COMMAND_LONG")
     for frame in stage.sent_by(lambda: stage.vehicle.simple_goto(location, **speeds), *names):
@@ -139,9 +137,7 @@ def places(stage: Stage, location: Any, **speeds: float) -> list[tuple[Any, ...]
             assert (frame.frame in (3, 6), frame.command) == (True, REPOSITION)
             seen.append(("goto", round(frame.x / 1e7, 4), round(frame.y / 1e7, 4), round(frame.z, 3)))
         elif frame.name == "SET_POSITION_TARGET_GLOBAL_INT":
-            seen.append(
-                ("goto", round(frame.lat_int / 1e7, 4), round(frame.lon_int / 1e7, 4), round(frame.alt, 3))
-            )
+            seen.append(("goto", round(frame.lat_int / 1e7, 4), round(frame.lon_int / 1e7, 4), round(frame.alt, 3)))
         elif frame.command == 178:
             seen.append((frame.command, *frame.params[:3]))
     return seen
@@ -171,7 +167,7 @@ def row_12_goto_above_the_sea(stage: Stage) -> Any:
 
 @scenario(([(178, 1, 7, -1)], [(178, 0, 8.5, -1)], 4.0, 3.0))
 def row_13_speeds(stage: Stage) -> Any:
-    stage.tell("VFR_HUD", airspeed=3, groundspeed=4)
+    stage.report("VFR_HUD", airspeed=3, groundspeed=4)
     ground = stage.commands_of(stage.assign("groundspeed", 7))
     air = stage.commands_of(stage.assign("airspeed", 8.5))
     vehicle = stage.vehicle
@@ -188,7 +184,7 @@ def row_13_speeds(stage: Stage) -> Any:
 )
 def row_14_setting_home(stage: Stage) -> Any:
     place = stage.dronekit.LocationGlobal(-35.1, 149.2, 600)
-    stage.tell("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
+    stage.report("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
     (sent,) = stage.sent_by(stage.assign("home_location", place))
     x, y, z = sent.params[4:]
     scale = 1e7 if sent.name == "COMMAND_INT" else 1
@@ -216,7 +212,7 @@ def waiting(stage: Stage) -> Any:
     vehicle = stage.vehicle
     late = caught(lambda: vehicle.wait_for(lambda: False, timeout=0.2, interval=0.05, errmsg="too late"))
     done = caught(lambda: vehicle.wait_for(lambda: True))
-    stage.tell("GLOBAL_POSITION_INT", lat=1, lon=1, alt=5000, relative_alt=3000)
+    stage.report("GLOBAL_POSITION_INT", lat=1, lon=1, alt=5000, relative_alt=3000)
     low = caught(lambda: vehicle.wait_for_alt(10, timeout=0.3))
     at_altitude = [
         caught(lambda: vehicle.wait_for_alt(3, timeout=50)),
@@ -229,8 +225,8 @@ def waiting(stage: Stage) -> Any:
 @scenario("TimeoutError", is_slow=True)
 def wait_for_armable(stage: Stage) -> Any:
     text = caught(lambda: stage.vehicle.wait_for_armable(timeout=0.3))
-    stage.fc.tell("GPS_RAW_INT", fix_type=3)
-    stage.tell("EKF_STATUS_REPORT", flags=831)
+    stage.fc.report("GPS_RAW_INT", fix_type=3)
+    stage.report("EKF_STATUS_REPORT", flags=831)
     stage.vehicle.wait_for_armable(timeout=50)
     return text.split(":")[0]
 
@@ -292,9 +288,7 @@ def send_mavlink(stage: Stage) -> Any:
 @scenario((1, 2))
 def messages_have_this_source(stage: Stage) -> Any:
     factory = stage.vehicle.message_factory
-    message = factory.set_position_target_local_ned_encode(
-        0, 0, 0, 1, 0b111111000111, 0, 0, 0, 1, 2, -3, 0, 0, 0, 0, 0
-    )
+    message = factory.set_position_target_local_ned_encode(0, 0, 0, 1, 0b111111000111, 0, 0, 0, 1, 2, -3, 0, 0, 0, 0, 0)
     (sent,) = stage.sent_by(lambda: stage.vehicle.send_mavlink(message), "SET_POSITION_TARGET_LOCAL_NED")
     return sent.target_system, sent.vy
 

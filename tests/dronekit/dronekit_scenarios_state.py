@@ -1,4 +1,4 @@
-"""Scenarios: what a vehicle tells and who is told of it."""
+"""Scenarios: attributes and their notifications."""
 
 from __future__ import annotations
 
@@ -102,13 +102,13 @@ def row_06_mode(stage: Stage) -> Any:
 
 @scenario("LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0")
 def row_15_home_position(stage: Stage) -> Any:
-    stage.tell("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
+    stage.report("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
     return str(stage.vehicle.home_location)
 
 
 @scenario((GLOBAL, RELATIVE, "[0.1, -0.2, 0.3]"))
 def row_16_position_and_velocity(stage: Stage) -> Any:
-    stage.tell("GLOBAL_POSITION_INT", **POSITION)
+    stage.report("GLOBAL_POSITION_INT", **POSITION)
     location = stage.vehicle.location
     return str(location.global_frame), str(location.global_relative_frame), str(stage.vehicle.velocity)
 
@@ -116,7 +116,7 @@ def row_16_position_and_velocity(stage: Stage) -> Any:
 @scenario((["location.global_relative_frame", "location", "velocity"], None))
 def row_17_position_before_its_altitude(stage: Stage) -> Any:
     events = stage.listen("*")
-    stage.tell("GLOBAL_POSITION_INT", **{**POSITION, "alt": 0})
+    stage.report("GLOBAL_POSITION_INT", **{**POSITION, "alt": 0})
     names = [name for _, name, _ in events if name.startswith(("loc", "vel"))]
     return names, stage.vehicle.location.global_frame.alt
 
@@ -130,15 +130,15 @@ def row_17_position_before_its_altitude(stage: Stage) -> Any:
 )
 def row_22_battery(stage: Stage) -> Any:
     before = stage.vehicle.battery
-    stage.tell("SYS_STATUS", voltage_battery=12587, current_battery=0, battery_remaining=100)
+    stage.report("SYS_STATUS", voltage_battery=12587, current_battery=0, battery_remaining=100)
     first = str(stage.vehicle.battery)
-    stage.tell("SYS_STATUS", voltage_battery=12587, current_battery=-1, battery_remaining=-1)
+    stage.report("SYS_STATUS", voltage_battery=12587, current_battery=-1, battery_remaining=-1)
     return before, first, str(stage.vehicle.battery)
 
 
 @scenario(("GPSInfo:fix=3,num_sat=10", 121, 65535, 3, 10))
 def row_23_gps(stage: Stage) -> Any:
-    stage.tell("GPS_RAW_INT", fix_type=3, satellites_visible=10, eph=121, epv=65535)
+    stage.report("GPS_RAW_INT", fix_type=3, satellites_visible=10, eph=121, epv=65535)
     gps = stage.vehicle.gps_0
     return str(gps), gps.eph, gps.epv, gps.fix_type, gps.satellites_visible
 
@@ -148,10 +148,10 @@ def row_23_gps(stage: Stage) -> Any:
 )
 def row_24_vfr_hud(stage: Stage) -> Any:
     events = stage.listen("airspeed", "groundspeed", "heading")
-    stage.tell("VFR_HUD", airspeed=3, groundspeed=4, heading=271)
+    stage.report("VFR_HUD", airspeed=3, groundspeed=4, heading=271)
     vehicle = stage.vehicle
-    told = [(name, value) for _, name, value in events]
-    return vehicle.airspeed, vehicle.groundspeed, vehicle.heading, type(vehicle.heading).__name__, told
+    notified = [(name, value) for _, name, value in events]
+    return vehicle.airspeed, vehicle.groundspeed, vehicle.heading, type(vehicle.heading).__name__, notified
 
 
 @scenario(
@@ -164,10 +164,10 @@ def row_24_vfr_hud(stage: Stage) -> Any:
 )
 def row_25_gimbal(stage: Stage) -> Any:
     events = stage.listen("mount", "gimbal", "mount_status")
-    stage.tell("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=9000)
+    stage.report("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=9000)
     gimbal = stage.vehicle.gimbal
-    told = [(name, value) for _, name, value in events]
-    return str(gimbal), stage.vehicle.mount_status, (gimbal.pitch, gimbal.roll, gimbal.yaw), told
+    notified = [(name, value) for _, name, value in events]
+    return str(gimbal), stage.vehicle.mount_status, (gimbal.pitch, gimbal.roll, gimbal.yaw), notified
 
 
 @scenario(
@@ -194,11 +194,11 @@ def row_26_version(stage: Stage) -> Any:
     stage.fc.tell_version(flight_sw_version=0x030300D7)
     stage.settle()
     version, can = vehicle.version, vehicle.capabilities
-    told = [(name, value) for _, name, value in events][-1:]
+    notified = [(name, value) for _, name, value in events][-1:]
     return (
         *(str(stable), stable.is_stable(), stable.release_version()),
         *(str(version), version.release_version(), version.release_type(), can.mission_int, can.ftp),
-        told,
+        notified,
     )
 
 
@@ -206,10 +206,10 @@ def row_26_version(stage: Stage) -> Any:
 def row_27_ekf(stage: Stage) -> Any:
     vehicle = stage.vehicle
     before = vehicle.is_armable, vehicle.ekf_ok
-    stage.tell("GPS_RAW_INT", fix_type=3)
+    stage.report("GPS_RAW_INT", fix_type=3)
     events = stage.listen("ekf_ok", "is_armable")
     for _ in range(3):
-        stage.tell("EKF_STATUS_REPORT", flags=831)
+        stage.report("EKF_STATUS_REPORT", flags=831)
     return *before, vehicle.is_armable, vehicle.ekf_ok, [(name, value) for _, name, value in events]
 
 
@@ -223,7 +223,7 @@ def row_27_ekf(stage: Stage) -> Any:
 )
 def row_27_ekf_while_armed(stage: Stage) -> Any:
     observed = {}
-    stage.tell("GPS_RAW_INT", fix_type=3)
+    stage.report("GPS_RAW_INT", fix_type=3)
     stage.fc.base_mode = 129
     stage.beat()
     for name, flags in (
@@ -232,7 +232,7 @@ def row_27_ekf_while_armed(stage: Stage) -> Any:
         ("armed, absolute, constant", 16 | 128 | 512),
         ("armed, predicted", 512),
     ):
-        stage.tell("EKF_STATUS_REPORT", flags=flags)
+        stage.report("EKF_STATUS_REPORT", flags=flags)
         observed[name] = stage.vehicle.ekf_ok, stage.vehicle.is_armable
     return observed
 
@@ -252,10 +252,10 @@ RAW = {f"chan{number}_raw": 1400 + 100 * number for number in range(1, 9)}
 def row_28_channels(stage: Stage) -> Any:
     channels, events = stage.vehicle.channels, stage.listen("channels")
     before = dict(channels)
-    stage.tell("RC_CHANNELS_RAW", port=0, **RAW)
+    stage.report("RC_CHANNELS_RAW", port=0, **RAW)
     eight = dict(channels)
     seen = len(channels), channels[1] == channels["1"], caught(lambda: channels["9"])
-    stage.tell("RC_CHANNELS_RAW", port=1, **RAW)
+    stage.report("RC_CHANNELS_RAW", port=1, **RAW)
     return before, eight, seen, (len(channels), channels[9], channels[9] == channels["9"], len(events))
 
 
@@ -269,7 +269,7 @@ def row_28_channels(stage: Stage) -> Any:
 def local_position(stage: Stage) -> Any:
     events = stage.listen("local_frame", to=stage.vehicle.location)
     stage.listen("location.local_frame", "location", into=events)
-    stage.tell("LOCAL_POSITION_NED", x=1, y=2, z=-3)
+    stage.report("LOCAL_POSITION_NED", x=1, y=2, z=-3)
     return events
 
 
@@ -281,8 +281,8 @@ def local_position(stage: Stage) -> Any:
 )
 def rangefinder(stage: Stage) -> Any:
     events = stage.listen("rangefinder")
-    stage.fc.tell("RANGEFINDER", distance=0.5, voltage=0.25)
-    stage.tell("RANGEFINDER", distance=0.5, voltage=0.25)
+    stage.fc.report("RANGEFINDER", distance=0.5, voltage=0.25)
+    stage.report("RANGEFINDER", distance=0.5, voltage=0.25)
     return str(stage.vehicle.rangefinder), [(name, value) for _, name, value in events]
 
 
@@ -290,15 +290,12 @@ def rangefinder(stage: Stage) -> Any:
 def home_is_told_each_time(stage: Stage) -> Any:
     events = stage.listen("home_location")
     for _ in range(2):
-        stage.tell("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
+        stage.report("HOME_POSITION", latitude=-353632610, longitude=1491652300, altitude=584000)
     return [name for _, name, _ in events]
 
 
 @scenario(
-    [
-        (status, f"SystemStatus:{status}")
-        for status in ("BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL")
-    ]
+    [(status, f"SystemStatus:{status}") for status in ("BOOT", "CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL")]
     + [("EMERGENCY", "SystemStatus:EMERGENCY"), ("POWEROFF", "SystemStatus:POWEROFF"), (None, None)]
 )
 def system_status(stage: Stage) -> Any:
@@ -313,9 +310,9 @@ def system_status(stage: Stage) -> Any:
 
 @scenario([("gimbal", "Gimbal: pitch=-45.0, roll=1.0, yaw=90.0")], controller={"version": 2}, is_kept=False)
 def mount_orientation(stage: Stage) -> Any:
-    """Of MAVLink 2 only, under which DroneKit is not played."""
+    """Only in MAVLink 2, which these scenarios do not use with DroneKit."""
     events = stage.listen("mount", "gimbal")
-    stage.tell("MOUNT_ORIENTATION", pitch=-45, roll=1, yaw=90, yaw_absolute=90)
+    stage.report("MOUNT_ORIENTATION", pitch=-45, roll=1, yaw=90, yaw_absolute=90)
     return [(name, value) for _, name, value in events]
 
 
@@ -323,11 +320,11 @@ def mount_orientation(stage: Stage) -> Any:
 def messages_that_tell_nothing(stage: Stage) -> Any:
     stage.settle()
     events = stage.listen("*")
-    stage.fc.tell("STATUSTEXT", severity=6, text=b"hello")
-    stage.fc.tell("COMMAND_ACK", command=31000, result=0)
-    stage.fc.tell("MISSION_ACK", type=0)
-    stage.fc.tell("MISSION_CURRENT", seq=3)
+    stage.fc.report("STATUSTEXT", severity=6, text=b"hello")
+    stage.fc.report("COMMAND_ACK", command=31000, result=0)
+    stage.fc.report("MISSION_ACK", type=0)
+    stage.fc.report("MISSION_CURRENT", seq=3)
     stage.fc.beat()
     stage.settle()
-    told_anyway = ("autopilot_version", "home_location", "parameters")  # asked for when the program connected
-    return [name for _, name, _ in events if name not in told_anyway]
+    always_notified = ("autopilot_version", "home_location", "parameters")  # requested on connecting
+    return [name for _, name, _ in events if name not in always_notified]

@@ -1,4 +1,4 @@
-"""A program of DroneKit and a flight controller, brought together; scenarios that give what was observed as plain data.
+"""A DroneKit program connected to a scripted flight controller; scenarios return their observations as plain data.
 
 Nothing here knows which implementation of DroneKit it is given.
 """
@@ -18,8 +18,8 @@ from typing import Any
 from flight_controller import FlightController, Received
 
 __all__ = [
-    "PATIENCE_S",
     "SCENARIOS",
+    "TEST_TIMEOUT_S",
     "Scenario",
     "Stage",
     "as_json",
@@ -31,11 +31,11 @@ __all__ = [
     "until",
 ]
 
-PATIENCE_S = 100.0
+TEST_TIMEOUT_S = 100.0
 ALWAYS = ("PING", "HEARTBEAT", "REQUEST_DATA_STREAM", "PARAM_REQUEST_READ")
 """Goes on by itself, whatever the program does."""
 QUIET = 3
-"""Round trips without anything new after which nothing more comes of what was done."""
+"""Round trips without new messages after which an action counts as finished."""
 
 
 class Stage:
@@ -49,17 +49,17 @@ class Stage:
         vehicle.add_message_listener("DEBUG", self._on_debug)
 
     def settle(self) -> None:
-        """Wait until everything that the flight controller has sent is taken in, and all listeners have heard of it."""
+        """Wait until all messages of the flight controller are processed and all listeners have run."""
         number = next(self._numbers)
         with self._saw:
-            for _ in range(int(PATIENCE_S / 0.1)):  # datagrams get lost
-                self.fc.tell("DEBUG", ind=7, time_boot_ms=number)
+            for _ in range(int(TEST_TIMEOUT_S / 0.1)):  # datagrams get lost
+                self.fc.report("DEBUG", ind=7, time_boot_ms=number)
                 if self._saw.wait_for(lambda: number in self._seen, 0.1):
                     return
         raise AssertionError("the vehicle's listeners heard nothing")
 
     def reached(self) -> None:
-        """Wait until everything that the program has sent has come to the flight controller, and what follows of it.
+        """Wait until the flight controller has received all messages of the program, and their effects.
 
         Answers to what has come may have more sent: of two equal commands the second may wait for the first's answer.
         """
@@ -75,9 +75,9 @@ class Stage:
         self.vehicle.send_mavlink(self.vehicle.message_factory.ping_encode(0, number, 0, 0))
         self.fc.wait_for("PING", lambda frame: frame.seq == number)
 
-    def tell(self, name: str, **fields: Any) -> None:
+    def report(self, name: str, **fields: Any) -> None:
         """Have the flight controller say it, and wait until it is taken in."""
-        self.fc.tell(name, **fields)
+        self.fc.report(name, **fields)
         self.settle()
 
     def beat(self, **fields: Any) -> None:
@@ -86,7 +86,7 @@ class Stage:
         self.settle()
 
     def sent_by(self, action: Callable[[], object], *names: str) -> list[Received]:
-        """What an action of the program had it send: these messages; without names, commands that change something."""
+        """Return the messages that an action sends: these types; without names, commands that change something."""
         since = self.fc.mark()
         action()
         self.reached()
@@ -116,7 +116,7 @@ class Stage:
 
     @contextlib.contextmanager
     def logged(self, name: str = "dronekit", *, having: str = "") -> Iterator[list[str]]:
-        """What is logged meanwhile, ``LEVEL text``, of what has this text: other vehicles use the same logger."""
+        """Collect log records as ``LEVEL text``; the filter excludes other vehicles, which share the logger."""
         lines: list[str] = []
         handler = logging.Handler()
 
@@ -159,7 +159,7 @@ SCENARIOS: list[Scenario] = []
 
 
 def scenario(expected: Any, **options: Any) -> Callable[[Callable[[Stage], Any]], Callable[[Stage], Any]]:
-    """Make a scenario of a function that is given a stage and gives what it observed.
+    """Decorator: make a scenario of a function that takes a stage and returns its observations.
 
     Args:
         expected: what it is to observe.
@@ -195,14 +195,14 @@ def on_stage(
 
 
 def play(dronekit: Any, each: Scenario, **controller: Any) -> Any:
-    """What a scenario observes with this implementation."""
+    """Return the observations of a scenario with this implementation."""
     options = {**each.controller, **controller}
     with on_stage(dronekit, options, each.connect, each.prepare) as stage:
         return each.play(stage)
 
 
 def caught(action: Callable[[], object]) -> str:
-    """Class and text of what an action raises; nothing raised: what it gives."""
+    """Return class and text of the exception of an action, or its result."""
     try:
         return plain(action())
     except Exception as error:
@@ -223,5 +223,5 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def as_json(value: Any) -> Any:
-    """The same for tuples and lists, for 1 and 1.0: what is compared."""
+    """Normalise for comparison: tuples equal lists, 1 equals 1.0."""
     return json.loads(json.dumps(value))

@@ -1,4 +1,4 @@
-"""A scripted flight controller on a real loopback socket: says what a test has it say, logs what it is told.
+"""A scripted flight controller on a real loopback socket: sends messages for a test, and records received ones.
 
 Built on pymavlink's encoder and parser, and knows nothing of the library under test: any program that speaks MAVLink
 can be its other side.
@@ -27,10 +27,10 @@ ACCEPTED, UNSUPPORTED = 0, 3
 DO_SET_MODE, ARM_DISARM, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME = 176, 400, 512, 520, 410
 SET_HOME = 179
 HOUSEKEEPING = (511, REQUEST_MESSAGE, REQUEST_VERSION, GET_HOME)
-"""Commands that ask for information and change nothing: no scenario is about them, unless it says so."""
-PATIENCE_S = 100.0
+"""Commands that only request information; scenarios ignore them by default."""
+TEST_TIMEOUT_S = 100.0
 UNHEARD_S = 0.005
-"""Seconds between heartbeats until somebody answers: tests do not wait for a connection."""
+"""Seconds between heartbeats until a client answers, so that tests connect quickly."""
 
 Message = Any
 Answer = Callable[[Message], object]
@@ -52,7 +52,7 @@ class Received:
 
     @property
     def target(self) -> tuple[int, int]:
-        """Whom it is for; -1 where the message has no such field."""
+        """Return the target system; -1 if the message has no such field."""
         return getattr(self.message, "target_system", -1), getattr(self.message, "target_component", -1)
 
     @property
@@ -130,11 +130,9 @@ class FlightController:
                 "system_status": self.system_status,
                 "mavlink_version": 3,
             }
-            self.tell("HEARTBEAT", **{**usual, **fields})
+            self.report("HEARTBEAT", **{**usual, **fields})
 
-    def tell(
-        self, name: str, *, source: tuple[int, int] | None = None, version: int = 0, **fields: Any
-    ) -> None:
+    def report(self, name: str, *, source: tuple[int, int] | None = None, version: int = 0, **fields: Any) -> None:
         """Send a message; fields that are not given are 0."""
         self.send(message_of(name, **fields), source=source, version=version)
 
@@ -155,7 +153,7 @@ class FlightController:
     # ----------------------------------------------------------------------------------- log
 
     def mark(self) -> int:
-        """How many frames have come: what comes from now on is ``since`` this."""
+        """Number of received frames; pass it as ``since`` to consider later ones only."""
         with self._came:
             return len(self._log)
 
@@ -168,7 +166,7 @@ class FlightController:
         self,
         name: str,
         predicate: Callable[[Received], object] = lambda _: True,
-        timeout: float = PATIENCE_S,
+        timeout: float = TEST_TIMEOUT_S,
         since: int = 0,
     ) -> Received:
         """The first such frame, once it has come.
@@ -187,7 +185,7 @@ class FlightController:
                 raise AssertionError(f"no such {name} in {timeout} s; came: {_brief(self._log[since:])}")
         return found[0]
 
-    def wait_until(self, condition: Callable[[], object], timeout: float = PATIENCE_S) -> None:
+    def wait_until(self, condition: Callable[[], object], timeout: float = TEST_TIMEOUT_S) -> None:
         """Wait until something holds that frames of the other side bring about."""
         with self._came:
             if not self._came.wait_for(condition, timeout):
@@ -197,9 +195,7 @@ class FlightController:
         """COMMAND_LONG and COMMAND_INT of these commands; without numbers those that ask for more than information."""
         every = self.received("COMMAND_LONG", "COMMAND_INT", since=since)
         return [
-            frame
-            for frame in every
-            if (frame.command in numbers if numbers else frame.command not in HOUSEKEEPING)
+            frame for frame in every if (frame.command in numbers if numbers else frame.command not in HOUSEKEEPING)
         ]
 
     def wait_for_command(self, number: int, since: int = 0) -> Received:
@@ -213,7 +209,7 @@ class FlightController:
         self._is_closed = True
         with contextlib.suppress(OSError):
             self._wake.send(b"!")
-        self._thread.join(PATIENCE_S)
+        self._thread.join(TEST_TIMEOUT_S)
         for each in (self._socket, self._peer, self._wake, self._woken):
             if each is not None:
                 each.close()
@@ -292,13 +288,13 @@ class FlightController:
             if answer is not None:
                 try:
                     answer(frame)
-                except Exception as error:  # of the script: close() tells of it
+                except Exception as error:  # of the script; close() raises it
                     self._faults.append(error)
             with self._came:
                 self._came.notify_all()
 
     def _write(self, frame: bytes) -> None:
-        with contextlib.suppress(OSError):  # nobody listens yet, or no longer
+        with contextlib.suppress(OSError):  # the client is not listening
             if not self._is_tcp:
                 self._socket.sendto(frame, self._remote)
             elif self._peer is not None:
@@ -309,12 +305,12 @@ class FlightController:
     def _on_command(self, frame: Received) -> None:
         result = self.results.get(frame.command, ACCEPTED)
         if frame.command in self.reasons:
-            self.tell("STATUSTEXT", severity=2, text=self.reasons[frame.command].encode())
+            self.report("STATUSTEXT", severity=2, text=self.reasons[frame.command].encode())
         if result == ACCEPTED:
             result = self._do(frame)
         if result is not None:
             me: dict[str, Any] = {"target_system": frame.system, "target_component": frame.component}
-            self.tell("COMMAND_ACK", command=frame.command, result=result, **me)
+            self.report("COMMAND_ACK", command=frame.command, result=result, **me)
 
     def _do(self, frame: Received) -> int:
         number = int(frame.param1)
@@ -341,7 +337,7 @@ class FlightController:
     def tell_version(self, **fields: Any) -> None:
         """Send AUTOPILOT_VERSION."""
         usual = {"capabilities": self.capabilities, "flight_sw_version": self.flight_sw_version}
-        self.tell("AUTOPILOT_VERSION", **{**usual, **fields})
+        self.report("AUTOPILOT_VERSION", **{**usual, **fields})
 
     def _set_home(self, frame: Received) -> None:
         scale = 1 if frame.name == "COMMAND_INT" else 1e7
@@ -353,7 +349,7 @@ class FlightController:
         if self.home is None:
             return 4
         latitude, longitude, altitude = self.home
-        self.tell("HOME_POSITION", latitude=latitude, longitude=longitude, altitude=altitude)
+        self.report("HOME_POSITION", latitude=latitude, longitude=longitude, altitude=altitude)
         return ACCEPTED
 
 

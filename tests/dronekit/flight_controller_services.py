@@ -44,14 +44,14 @@ class ParameterService:
 
     @property
     def answers(self) -> dict[str, Callable[[Any], object]]:
-        """Message name → what to do."""
+        """Handlers by message name."""
         return {
             "PARAM_REQUEST_LIST": self._on_list,
             "PARAM_REQUEST_READ": self._on_read,
             "PARAM_SET": self._on_set,
         }
 
-    def tell(self, name: str, source: tuple[int, int] | None = None, **fields: Any) -> None:
+    def report(self, name: str, source: tuple[int, int] | None = None, **fields: Any) -> None:
         """Send PARAM_VALUE; fields are those it differs in."""
         usual = {
             "param_id": name.encode(),
@@ -60,7 +60,7 @@ class ParameterService:
             "param_count": len(self.values),
             "param_index": list(self.values).index(name) if name in self.values else 65535,
         }
-        self.controller.tell("PARAM_VALUE", source=source, **{**usual, **fields})
+        self.controller.report("PARAM_VALUE", source=source, **{**usual, **fields})
 
     def _encoded(self, name: str) -> float:
         kind = self.types.get(name, REAL32)
@@ -80,16 +80,16 @@ class ParameterService:
         lost, self.lost_once = self.lost_once, set()
         for name in list(self.values):
             if name not in lost:
-                self.tell(name)
+                self.report(name)
 
     def _on_read(self, frame: Received) -> None:
         names = list(self.values)
         if self.is_silent:
             return
         if 0 <= frame.param_index < len(names):
-            self.tell(names[frame.param_index])
+            self.report(names[frame.param_index])
         elif frame.param_index == -1 and frame.param_id in self.values:
-            self.tell(frame.param_id)
+            self.report(frame.param_id)
 
     def _on_set(self, frame: Received) -> None:
         name = frame.param_id
@@ -97,13 +97,13 @@ class ParameterService:
         if self.is_silent or name not in self.values:
             return
         if self.is_bytewise and frame.param_type != kind:  # PX4 refuses it: it tells the old value
-            self.tell(name)
+            self.report(name)
             return
         self.values[name] = self.adjust(name, self._decoded(frame.param_value, kind))
         if self.lost_echoes:
             self.lost_echoes -= 1
         else:
-            self.tell(name)
+            self.report(name)
 
 
 class Item(NamedTuple):
@@ -142,7 +142,7 @@ class MissionService:
 
     @property
     def answers(self) -> dict[str, Callable[[Any], object]]:
-        """Message name → what to do."""
+        """Handlers by message name."""
         return {
             "MISSION_REQUEST_LIST": self._on_list,
             "MISSION_REQUEST": lambda frame: self._on_request(frame, is_int=False),
@@ -151,13 +151,13 @@ class MissionService:
             "MISSION_COUNT": self._on_count,
             "MISSION_ITEM": self._on_item,
             "MISSION_ITEM_INT": self._on_item,
-            "MISSION_SET_CURRENT": lambda frame: self.controller.tell("MISSION_CURRENT", seq=frame.seq),
+            "MISSION_SET_CURRENT": lambda frame: self.controller.report("MISSION_CURRENT", seq=frame.seq),
         }
 
     def _reply(self, frame: Received, name: str, /, **fields: Any) -> None:
         me: dict[str, Any] = {"target_system": frame.system, "target_component": frame.component}
         kind = getattr(frame.message, "mission_type", 0)
-        self.controller.tell(name, mission_type=kind, **me, **fields)
+        self.controller.report(name, mission_type=kind, **me, **fields)
 
     def _on_list(self, frame: Received) -> None:
         is_mission = getattr(frame.message, "mission_type", 0) == 0
@@ -209,7 +209,7 @@ class MissionService:
 
     def _on_item(self, frame: Received) -> None:
         if frame.current == 2:  # fly there; not of a mission
-            self.controller.tell("MISSION_ACK", type=0)
+            self.controller.report("MISSION_ACK", type=0)
             return
         if frame.seq != len(self._coming) or len(self._coming) >= self._count:
             return

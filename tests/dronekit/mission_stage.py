@@ -55,7 +55,7 @@ def connected(
 
 
 def kept(controller: FlightController) -> list[tuple[int, float, float]]:
-    """What it holds: command, latitude, altitude."""
+    """Return the stored mission: command, latitude, altitude."""
     return [(each.command, each.x, each.z) for each in controller.missions.items]
 
 

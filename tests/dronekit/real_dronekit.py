@@ -21,9 +21,7 @@ def main(names: list[str]) -> None:
     import dronekit  # type: ignore[import-not-found, unused-ignore]
 
     logging.getLogger().addHandler(logging.NullHandler())
-    kept = [
-        each for each in dronekit_scenarios.SCENARIOS if each.is_kept and (not names or each.name in names)
-    ]
+    kept = [each for each in dronekit_scenarios.SCENARIOS if each.is_kept and (not names or each.name in names)]
     print(json.dumps({each.name: _observed(dronekit, each) for each in kept}))  # noqa: T201
 
 

@@ -1,4 +1,4 @@
-"""What DroneKit 2.9.2 was observed to do, row by row; rows in which it is kept as it is are scenarios.
+"""Observed behaviour of DroneKit 2.9.2, row by row; unchanged rows are scenarios.
 
 With ``AEROKIT_DRONEKIT_PYTHON`` naming an interpreter that has DroneKit the scenarios are played with DroneKit itself,
 too, so that what is expected here is what it does.
@@ -38,7 +38,7 @@ def copter() -> Iterator[Stage]:
 
 @pytest.fixture(scope="module", autouse=True)
 def waiting(request: pytest.FixtureRequest) -> Iterator[dict[str, Future[Any]]]:
-    """What waits for timeouts does so while the other tests run; each may want to see what is logged."""
+    """Run slow scenarios in the background while other tests run; each collects its own log records."""
     slow: dict[str, Callable[[], Any]] = {
         f"test_slow_scenario[{each.name}]": partial(play, dronekit, each) for each in SLOW
     }
@@ -62,7 +62,7 @@ def test_scenario(each: Scenario, version: int) -> None:
 
 
 @pytest.mark.skipif(not DRONEKIT_PYTHON, reason="AEROKIT_DRONEKIT_PYTHON names no interpreter with DroneKit")
-def test_dronekit_itself_plays_them_so() -> None:
+def test_dronekit_itself_matches_reference() -> None:
     here = Path(__file__).parent
     program = [DRONEKIT_PYTHON, str(here / "real_dronekit.py")]
     output = subprocess.run(program, capture_output=True, text=True, timeout=300, check=True).stdout
@@ -75,8 +75,8 @@ def test_dronekit_itself_plays_them_so() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_row_03_everything_is_for_the_vehicle(version: int) -> None:
-    """And for no other one that hears the link: none of it is a broadcast."""
+def test_row_03_messages_target_the_vehicle(version: int) -> None:
+    """Messages are not broadcast to other vehicles on the link."""
     with on_stage(dronekit, {"version": version, "mode": 4}, prepare=_be_system_7) as stage:
         vehicle, factory = stage.vehicle, stage.vehicle.message_factory
         place = dronekit.LocationGlobalRelative(-35.1, 149.2, 20)
@@ -119,30 +119,28 @@ def test_row_05_unknown_mode_of_px4() -> None:
         assert stage.commands_of(lambda: caught(stage.assign("mode", "GUIDED_NOGPS"))) == []
 
 
-def test_row_08_refusal_comes_at_once_and_with_the_reason(copter: Stage) -> None:
+def test_row_08_rejected_arming_raises_at_once_with_reason(copter: Stage) -> None:
     copter.fc.results[400] = 4
     copter.fc.reasons[400] = "PreArm: Compass not healthy"
-    with pytest.raises(
-        dronekit.TimeoutError, match=r"(?s)failed to arm vehicle.*Compass not healthy"
-    ) as refusal:
+    with pytest.raises(dronekit.TimeoutError, match=r"(?s)failed to arm vehicle.*Compass not healthy") as refusal:
         copter.vehicle.arm(timeout=300)
     assert isinstance(refusal.value, TimeoutError)
     assert isinstance(refusal.value, dronekit.APIException)
 
 
-def test_row_09_refused_mode_comes_at_once(copter: Stage) -> None:
+def test_row_09_rejected_mode_raises_at_once(copter: Stage) -> None:
     copter.fc.results[176] = 4
     with pytest.raises(dronekit.TimeoutError, match="failed to set flight mode"):
         copter.vehicle.wait_for_mode("AUTO", timeout=300)
 
 
-def test_row_11_places_are_exact(copter: Stage) -> None:
+def test_row_11_goto_positions_are_exact(copter: Stage) -> None:
     place = dronekit.LocationGlobalRelative(-35.3632611, 149.1652301, 20)
     (goto,) = copter.sent_by(lambda: copter.vehicle.simple_goto(place), "COMMAND_INT")
     assert (goto.command, goto.x, goto.y, goto.z) == (192, -353632611, 1491652301, 20)
 
 
-def test_row_11_goto_of_firmware_that_knows_no_reposition(copter: Stage) -> None:
+def test_row_11_goto_without_reposition_support(copter: Stage) -> None:
     copter.fc.results[192] = 3
     place = dronekit.LocationGlobalRelative(-35.1, 149.2, 20)
     copter.vehicle.simple_goto(place)
@@ -151,12 +149,12 @@ def test_row_11_goto_of_firmware_that_knows_no_reposition(copter: Stage) -> None
     assert target.type_mask & 0b111111111000 == 0b110111111000  # place only
 
 
-def test_row_12_unknown_home_is_asked_for(copter: Stage) -> None:
+def test_row_12_unknown_home_is_requested(copter: Stage) -> None:
     assert places(copter, dronekit.LocationGlobal(-35.1, 149.2, 600)) == [("goto", -35.1, 149.2, 16.0)]
     assert str(copter.vehicle.home_location) == "LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0"
 
 
-def test_row_14_home_is_exact_and_wrong_ones_are_not_kept(copter: Stage) -> None:
+def test_row_14_home_is_exact_and_invalid_home_rejected(copter: Stage) -> None:
     place = dronekit.LocationGlobal(-35.3632611, 149.1652301, 600)
     (home,) = copter.sent_by(copter.assign("home_location", place), "COMMAND_INT")
     assert (home.command, home.param1, home.x, home.y, home.z) == (179, 0, -353632611, 1491652301, 600)
@@ -166,8 +164,8 @@ def test_row_14_home_is_exact_and_wrong_ones_are_not_kept(copter: Stage) -> None
     assert str(copter.vehicle.home_location) == before
 
 
-def test_row_17_no_place_without_a_fix(copter: Stage) -> None:
-    copter.tell("GLOBAL_POSITION_INT", lat=0, lon=0, alt=0, relative_alt=0)
+def test_row_17_location_without_fix_is_none(copter: Stage) -> None:
+    copter.report("GLOBAL_POSITION_INT", lat=0, lon=0, alt=0, relative_alt=0)
     frame = copter.vehicle.location.global_relative_frame
     assert (frame.lat, frame.lon) == (None, None)
 
@@ -175,28 +173,24 @@ def test_row_17_no_place_without_a_fix(copter: Stage) -> None:
 def test_row_28_channels_of_mavlink_2(copter: Stage) -> None:
     channels, events = copter.vehicle.channels, copter.listen("channels")
     pulses = {f"chan{number}_raw": 1000 + number for number in range(1, 19)}
-    copter.tell("RC_CHANNELS", chancount=16, **pulses)
+    copter.report("RC_CHANNELS", chancount=16, **pulses)
     assert dict(channels) == {str(number): 1000 + number for number in range(1, 9)}
     assert (len(channels), channels.count, channels[8]) == (8, 8, 1008)
     assert len(events) == 1
 
 
-def test_row_28_more_channels_when_asked_for(copter: Stage) -> None:
+def test_row_28_channel_count_can_be_increased(copter: Stage) -> None:
     channels = copter.vehicle.channels
     channels.count = 16
-    copter.tell(
-        "RC_CHANNELS", chancount=16, **{f"chan{number}_raw": 1000 + number for number in range(1, 19)}
-    )
+    copter.report("RC_CHANNELS", chancount=16, **{f"chan{number}_raw": 1000 + number for number in range(1, 19)})
     assert (len(channels), channels[9], channels["16"]) == (16, 1009, 1016)
 
 
-def test_row_30_a_wrong_key_stops_nothing(copter: Stage) -> None:
+def test_row_30_wrong_key_changes_nothing(copter: Stage) -> None:
     overrides = copter.vehicle.channels.overrides
     caught(lambda: overrides.__setitem__("9", 1))
     caught(lambda: setattr(copter.vehicle.channels, "overrides", {"9": 900}))
-    sent = copter.sent_by(
-        lambda: copter.vehicle.channels.overrides.__setitem__("1", 1234), "RC_CHANNELS_OVERRIDE"
-    )
+    sent = copter.sent_by(lambda: copter.vehicle.channels.overrides.__setitem__("1", 1234), "RC_CHANNELS_OVERRIDE")
     assert [(frame.chan1_raw, frame.chan2_raw) for frame in sent] == [(1234, 0)]
 
 
@@ -210,9 +204,7 @@ def test_row_33_parameters_have_their_own_type() -> None:
         parameters.wait_ready()
         assert parameters.set("FOO", 2.7)
         assert parameters.set("BAR", 2.75)
-        sent = {
-            (frame.param_id, frame.param_type, frame.param_value) for frame in stage.fc.received("PARAM_SET")
-        }
+        sent = {(frame.param_id, frame.param_type, frame.param_value) for frame in stage.fc.received("PARAM_SET")}
         assert sent == {("FOO", 6, 2.0), ("BAR", 9, 2.75)}
         assert (parameters["FOO"], parameters["BAR"]) == (2.0, 2.75)
 
@@ -231,11 +223,11 @@ def test_row_33_integers_of_px4() -> None:
         assert (parameters["SYS_AUTOSTART"], stage.fc.parameters.values["SYS_AUTOSTART"]) == (4010.0, 4010)
 
 
-# --------------------------------------------------------------------- what waited meanwhile
+# ------------------------------------------------------------------------- slow scenarios
 
 
 def silence() -> dict[str, Any]:
-    """Row 40: nothing is heard for five seconds and more, then again."""
+    """Row 40: no messages for more than five seconds, then again."""
     with (
         on_stage(dronekit, {"mode": 4}, {"heartbeat_timeout": 6}) as stage,
         stage.logged(having="ink") as lines,
@@ -258,12 +250,12 @@ def silence() -> dict[str, Any]:
         until(lambda: any("restored" in line for line in lines))
         stage.commands_of(stage.assign("mode", "LOITER"))
         stage.settle()
-        return {"told": lines, "raised": raised, "oldest": max(ages) > 5.5, "mode": vehicle.mode.name}
+        return {"notified": lines, "raised": raised, "oldest": max(ages) > 5.5, "mode": vehicle.mode.name}
 
 
 def test_row_40_silence(waiting: dict[str, Future[Any]]) -> None:
     assert waiting["test_row_40_silence"].result(timeout=60) == {
-        "told": ["WARNING Link timeout, no heartbeat in last 5 seconds", "INFO ...link restored."],
+        "notified": ["WARNING Link timeout, no heartbeat in last 5 seconds", "INFO ...link restored."],
         "raised": ["APIException"] * 6,
         "oldest": True,
         "mode": "LOITER",

@@ -23,7 +23,7 @@ SOURCES = Path(__file__).parent.parent.parent / "src"
 IGNORED, RELEASED = 0xFFFF, 0xFFFE
 VALUES = {f"chan{number}_raw": 1000 + number for number in range(1, 19)}
 FIRST_VALUES = {f"chan{number}_raw": 1000 + number for number in range(1, 9)}
-TOLD = {str(number): 1000 + number for number in range(1, 9)}
+REPORTED = {str(number): 1000 + number for number in range(1, 9)}
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def channels(stage: Stage) -> Channels:
 
 
 def sent(stage: Stage, action: Callable[[], object]) -> list[tuple[int, ...]]:
-    """Each RC_CHANNELS_OVERRIDE that comes of it, without the zeros at its end."""
+    """Return the RC_CHANNELS_OVERRIDE messages of an action, without trailing zeros."""
     messages = []
     for frame in stage.sent_by(action, "RC_CHANNELS_OVERRIDE"):
         assert frame.target == (1, 0)
@@ -53,42 +53,42 @@ def sent(stage: Stage, action: Callable[[], object]) -> list[tuple[int, ...]]:
 # ------------------------------------------------------------------------------------ channels
 
 
-def test_there_are_eight_before_the_first_message(channels: Channels) -> None:
+def test_channels_are_eight_before_first_message(channels: Channels) -> None:
     assert channels == {str(number): None for number in range(1, 9)}
     assert len(channels) == channels.count == 8
 
 
-def test_rc_channels_fills_them_and_tells(stage: Stage, channels: Channels) -> None:
+def test_rc_channels_updates_channels_and_notifies(stage: Stage, channels: Channels) -> None:
     events = stage.listen("channels")
-    stage.tell("RC_CHANNELS", chancount=16, **{**VALUES, "chan3_raw": 0, "chan8_raw": IGNORED})
-    assert channels == {**TOLD, "3": 0, "8": None}
+    stage.report("RC_CHANNELS", chancount=16, **{**VALUES, "chan3_raw": 0, "chan8_raw": IGNORED})
+    assert channels == {**REPORTED, "3": 0, "8": None}
     assert [name for _, name, _ in events] == ["channels"]
 
 
-def test_rc_channels_raw_of_another_port_makes_them_sixteen(stage: Stage, channels: Channels) -> None:
-    stage.tell("RC_CHANNELS_RAW", port=0, **FIRST_VALUES)
-    assert channels == TOLD
-    stage.tell("RC_CHANNELS_RAW", port=1, **{**FIRST_VALUES, "chan1_raw": 1900})
+def test_rc_channels_raw_port_1_gives_sixteen_channels(stage: Stage, channels: Channels) -> None:
+    stage.report("RC_CHANNELS_RAW", port=0, **FIRST_VALUES)
+    assert channels == REPORTED
+    stage.report("RC_CHANNELS_RAW", port=1, **{**FIRST_VALUES, "chan1_raw": 1900})
     assert len(channels) == 16
     assert channels[9] == channels["9"] == 1900
     assert channels["1"] == 1001
-    stage.tell("RC_CHANNELS_RAW", port=2, **FIRST_VALUES)
+    stage.report("RC_CHANNELS_RAW", port=2, **FIRST_VALUES)
     assert len(channels) == 16
 
 
-def test_more_channels_are_read_when_they_are_asked_for(stage: Stage, channels: Channels) -> None:
+def test_channels_count_increases_channels(stage: Stage, channels: Channels) -> None:
     channels.count = 18
     assert channels.get("18", 0) is None
-    stage.tell("RC_CHANNELS", chancount=18, **VALUES)
+    stage.report("RC_CHANNELS", chancount=18, **VALUES)
     assert channels["18"] == 1018
     channels.count = 8
-    assert channels == TOLD
+    assert channels == REPORTED
     for count in (7, 19):
         with pytest.raises(ValueError, match="8 to 18"):
             channels.count = count
 
 
-def test_numbers_are_texts_or_integers(channels: Channels) -> None:
+def test_channel_keys_are_strings_or_integers(channels: Channels) -> None:
     assert channels[1] is None
     assert 8 in channels
     assert "8" in channels
@@ -99,14 +99,14 @@ def test_numbers_are_texts_or_integers(channels: Channels) -> None:
         channels["9"]
 
 
-def test_they_have_the_methods_of_python_2(channels: Channels) -> None:
+def test_channels_have_python_2_methods(channels: Channels) -> None:
     assert list(channels.iterkeys()) == list(channels.viewkeys()) == list(channels)
     assert list(channels.itervalues()) == list(channels.viewvalues()) == [None] * 8
     assert dict(channels.iteritems()) == dict(channels.viewitems()) == channels.copy() == channels
     assert Channels.fromkeys("ab", 1) == {"a": 1, "b": 1}
 
 
-def test_they_are_the_vehicles_to_change(channels: Channels) -> None:
+def test_channels_are_read_only(channels: Channels) -> None:
     changes: tuple[Callable[[Any], object], ...] = (
         lambda each: each.__setitem__("1", 1),
         lambda each: each.__delitem__("1"),
@@ -123,7 +123,7 @@ def test_they_are_the_vehicles_to_change(channels: Channels) -> None:
     assert len(channels) == 8
 
 
-def test_readers_see_all_values_of_one_message(stage: Stage, channels: Channels) -> None:
+def test_channels_readers_see_values_of_one_message(stage: Stage, channels: Channels) -> None:
     torn, ended = [], threading.Event()
 
     def read() -> None:
@@ -145,7 +145,7 @@ def test_readers_see_all_values_of_one_message(stage: Stage, channels: Channels)
 # ----------------------------------------------------------------------------------- overrides
 
 
-def test_each_change_is_sent(stage: Stage, channels: Channels) -> None:
+def test_overrides_each_change_is_sent(stage: Stage, channels: Channels) -> None:
     overrides = channels.overrides
     assert sent(stage, lambda: overrides.__setitem__("2", 200)) == [(0, 200)]
     assert sent(stage, lambda: overrides.__setitem__(3, 1500)) == [(0, 200, 1500)]
@@ -159,7 +159,7 @@ def test_each_change_is_sent(stage: Stage, channels: Channels) -> None:
     assert overrides == {}
 
 
-def test_the_methods_of_a_dictionary_send(stage: Stage, channels: Channels) -> None:
+def test_overrides_dict_methods_send(stage: Stage, channels: Channels) -> None:
     overrides = channels.overrides
     assert sent(stage, lambda: overrides.update({"1": 1100}, **{"2": 1200})) == [(1100, 1200)]
     assert sent(stage, lambda: overrides.setdefault(3, 1300)) == [(1100, 1200, 1300)]
@@ -175,7 +175,7 @@ def test_the_methods_of_a_dictionary_send(stage: Stage, channels: Channels) -> N
         overrides.popitem()
 
 
-def test_overrides_count_what_is_overridden(channels: Channels) -> None:
+def test_overrides_len_counts_overridden_channels(channels: Channels) -> None:
     overrides = channels.overrides
     assert not overrides
     assert len(overrides) == 0
@@ -209,7 +209,7 @@ class Int64:
         return self.value >= other
 
 
-def test_what_controllers_and_numpy_work_out_is_rounded(stage: Stage, channels: Channels) -> None:
+def test_overrides_round_fractions_and_numpy_numbers(stage: Stage, channels: Channels) -> None:
     numbers: dict[str, Any] = {"1": 1523.7, "2": Int64(1400), "3": 1500.0}
 
     def override() -> None:
@@ -231,7 +231,7 @@ WRONG: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
 )
 
 
-def test_what_is_wrong_changes_nothing(stage: Stage, channels: Channels) -> None:
+def test_overrides_invalid_values_change_nothing(stage: Stage, channels: Channels) -> None:
     channels.overrides["1"] = 1100
     stage.reached()
 
@@ -246,7 +246,7 @@ def test_what_is_wrong_changes_nothing(stage: Stage, channels: Channels) -> None
     assert sent(stage, lambda: channels.overrides.__setitem__("2", 1200)) == [(1100, 1200)]
 
 
-def test_a_channel_that_is_not_overridden_cannot_be_deleted(stage: Stage, channels: Channels) -> None:
+def test_overrides_delete_missing_channel_raises(stage: Stage, channels: Channels) -> None:
     def order() -> None:
         with pytest.raises(KeyError, match="3"):
             del channels.overrides["3"]
@@ -254,20 +254,16 @@ def test_a_channel_that_is_not_overridden_cannot_be_deleted(stage: Stage, channe
     assert sent(stage, order) == []
 
 
-def test_channels_above_eight_are_left_alone_until_they_were_overridden(
-    stage: Stage, channels: Channels
-) -> None:
+def test_channels_above_eight_are_untouched_until_overridden(stage: Stage, channels: Channels) -> None:
     channels.count = 18
     overrides = channels.overrides
     assert sent(stage, lambda: overrides.__setitem__("10", 1900)) == [(*(0,) * 9, 1900)]
     assert sent(stage, lambda: overrides.__delitem__("10")) == [(*(0,) * 9, RELEASED)]
     assert sent(stage, lambda: overrides.__setitem__(1, 1100)) == [(1100, *(0,) * 8, RELEASED)]
-    assert sent(stage, lambda: overrides.__setitem__(18, 1200)) == [
-        (1100, *(0,) * 8, RELEASED, *(0,) * 7, 1200)
-    ]
+    assert sent(stage, lambda: overrides.__setitem__(18, 1200)) == [(1100, *(0,) * 8, RELEASED, *(0,) * 7, 1200)]
 
 
-def test_mavlink_1_has_eight_channels_to_override() -> None:
+def test_overrides_with_mavlink_1_allow_eight_channels() -> None:
     with on_stage(dronekit, {"version": 1}, {"rate": None}, _knows_only_mavlink_1) as stage:
         channels = stage.vehicle.channels
         assert sent(stage, lambda: channels.overrides.__setitem__("2", 200)) == [(0, 200)]
@@ -281,7 +277,7 @@ def _knows_only_mavlink_1(controller: Any) -> None:
     controller.capabilities &= ~8192
 
 
-def test_after_closing_nothing_can_be_overridden(stage: Stage, channels: Channels) -> None:
+def test_overrides_after_close_raise(stage: Stage, channels: Channels) -> None:
     stage.vehicle.close()
     with pytest.raises(dronekit.APIException):
         channels.overrides["1"] = 1500
@@ -306,7 +302,7 @@ def released(fc: FlightController, since: int) -> list[tuple[int, ...]]:
 GIVEN_BACK = (0, IGNORED, 0, *(IGNORED,) * 5, 0, RELEASED, *(0,) * 8)
 
 
-def test_overrides_end_with_the_connection(stage: Stage, channels: Channels) -> None:
+def test_overrides_are_released_on_close(stage: Stage, channels: Channels) -> None:
     channels.count = 18
     channels.overrides = OURS
     stage.reached()
@@ -315,7 +311,7 @@ def test_overrides_end_with_the_connection(stage: Stage, channels: Channels) -> 
     assert set(released(stage.fc, since)) == {GIVEN_BACK}
 
 
-def test_overrides_by_send_mavlink_end_with_the_connection(stage: Stage) -> None:
+def test_overrides_sent_by_send_mavlink_are_released_on_close(stage: Stage) -> None:
     values = [1500, IGNORED, 1900, *(IGNORED,) * 5, IGNORED, 1700]
     stage.vehicle.send_mavlink(stage.vehicle.message_factory.rc_channels_override_encode(0, 0, *values))
     stage.reached()
@@ -325,7 +321,7 @@ def test_overrides_by_send_mavlink_end_with_the_connection(stage: Stage) -> None
 
 
 @pytest.mark.parametrize("has_overridden", [False, True], ids=["never", "given back before"])
-def test_close_without_overrides_sends_no_release(
+def test_close_without_overrides_sends_no_release_message(
     stage: Stage, channels: Channels, has_overridden: bool
 ) -> None:
     if has_overridden:
@@ -338,7 +334,7 @@ def test_close_without_overrides_sends_no_release(
     assert stage.fc.received("RC_CHANNELS_OVERRIDE", since=since) == []
 
 
-def test_release_overrides_false_leaves_them_to_the_vehicle() -> None:
+def test_release_overrides_false_sends_no_release() -> None:
     with on_stage(dronekit, connect={"release_overrides": False}) as stage:
         stage.vehicle.channels.overrides = {"3": 1900}
         stage.reached()
@@ -361,7 +357,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("end", sampled(ENDS.values(), 3), ids=ENDS)
-def test_overrides_end_with_the_program(end: str) -> None:
+def test_overrides_are_released_at_program_exit(end: str) -> None:
     program = f"""
 import time
 from aerokit import dronekit

@@ -38,7 +38,7 @@ def empty() -> Iterator[Pair]:
 # -------------------------------------------------------------------------------------- Command
 
 
-def test_a_command_is_a_mission_item_of_pymavlink_with_the_text_of_mavlink_1() -> None:
+def test_command_is_pymavlink_mission_item_with_mavlink_1_text() -> None:
     cmd = Command(0, 0, 0, 3, 16, 0, 0, 0, 0, 0, 0, -34.3, 149.1, 30)
     assert isinstance(cmd, mavlink.MAVLink_mission_item_message)
     assert str(cmd) == (
@@ -54,7 +54,7 @@ def test_a_command_is_a_mission_item_of_pymavlink_with_the_text_of_mavlink_1() -
 # ------------------------------------------------------------------------------------- download
 
 
-def test_what_is_downloaded_are_commands_counted_without_home(
+def test_downloaded_commands_are_counted_without_home(
     three: Pair,
 ) -> None:
     _, cmds = three
@@ -67,7 +67,7 @@ def test_what_is_downloaded_are_commands_counted_without_home(
     assert str(vehicle.home_location) == "LocationGlobal:lat=-35.363261,lon=149.16523,alt=584.0"
 
 
-def test_it_is_a_list(three: Pair) -> None:
+def test_commands_work_like_a_list(three: Pair) -> None:
     _, cmds = three
     assert [each.seq for each in cmds[0:2]] == [1, 2]
     assert [each.seq for each in cmds[-2:]] == [2, 3]
@@ -81,7 +81,7 @@ def test_it_is_a_list(three: Pair) -> None:
         cmds["a"]  # type: ignore[call-overload]
 
 
-def test_nothing_is_there_before_a_download_and_nothing_is_waited_for(
+def test_commands_before_download_are_empty(
     empty: Pair,
 ) -> None:
     controller, cmds = empty
@@ -95,7 +95,7 @@ def test_nothing_is_there_before_a_download_and_nothing_is_waited_for(
     assert transfers(controller, before) == []  # programs call flush() after anything
 
 
-def test_lost_items_are_asked_for_again() -> None:
+def test_lost_mission_items_are_requested_again() -> None:
     with connected(HOME, FIRST, SECOND, THIRD) as (controller, vehicle):
         controller.missions.lost = {0: 1, 2: 1}
         vehicle.commands.download()
@@ -104,19 +104,17 @@ def test_lost_items_are_asked_for_again() -> None:
 
 
 @pytest.mark.parametrize(("autopilot", "items"), [(3, [HOME]), (3, []), (12, [])])
-def test_empty_missions_are_complete_at_once(autopilot: int, items: list[Item]) -> None:
+def test_empty_mission_download_completes(autopilot: int, items: list[Item]) -> None:
     with connected(*items, autopilot=autopilot) as (_, vehicle):
         vehicle.commands.download()
         assert vehicle.wait_ready("commands", timeout=LIMIT_S)
         assert len(vehicle.commands) == 0
 
 
-def test_a_download_that_fails_says_why_and_the_next_one_works(
-    empty: Pair, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_failed_download_raises_reason_and_can_be_repeated(empty: Pair, caplog: pytest.LogCaptureFixture) -> None:
     controller, cmds = empty
     answer = controller.missions.answers["MISSION_REQUEST_LIST"]
-    controller.answers["MISSION_REQUEST_LIST"] = lambda frame: controller.tell(
+    controller.answers["MISSION_REQUEST_LIST"] = lambda frame: controller.report(
         "MISSION_ACK", type=1, target_system=frame.system, target_component=frame.component
     )
     cmds.download()
@@ -135,7 +133,7 @@ def test_a_download_that_fails_says_why_and_the_next_one_works(
     assert [each.z for each in cmds] == [20.0]
 
 
-def test_what_is_changed_after_download_comes_after_it(
+def test_changes_after_download_wait_for_it(
     empty: Pair,
 ) -> None:
     _, cmds = empty
@@ -148,19 +146,19 @@ def test_what_is_changed_after_download_comes_after_it(
     assert len(cmds) == 0
 
 
-def test_a_download_under_way_is_begun_anew(empty: Pair) -> None:
+def test_running_download_is_restarted(empty: Pair) -> None:
     controller, cmds = empty
     controller.missions.lost = {1: 2}
-    told: list[int] = []
-    cmds._vehicle.add_attribute_listener("commands", lambda _, __, value: told.append(len(value)))
+    notified: list[int] = []
+    cmds._vehicle.add_attribute_listener("commands", lambda _, __, value: notified.append(len(value)))
     for _ in range(5):
         cmds.download()
     assert cmds.wait_ready(timeout=LIMIT_S)
     cmds._vehicle._handler.listener_thread.call(lambda: None)
-    assert (len(cmds), told) == (1, [1])
+    assert (len(cmds), notified) == (1, [1])
 
 
-def test_blocking_calls_work_in_a_listener(empty: Pair) -> None:
+def test_blocking_calls_work_in_listener(empty: Pair) -> None:
     controller, cmds = empty
     seen: list[Any] = []
     ended = threading.Event()
@@ -183,7 +181,7 @@ def test_blocking_calls_work_in_a_listener(empty: Pair) -> None:
 # --------------------------------------------------------------------------------------- upload
 
 
-def test_the_vehicle_gets_exactly_what_was_added_without_a_download_before(
+def test_upload_without_download_sends_added_commands(
     empty: Pair,
 ) -> None:
     controller, cmds = empty
@@ -193,12 +191,10 @@ def test_the_vehicle_gets_exactly_what_was_added_without_a_download_before(
     cmds.upload()
     assert kept(controller)[1:] == [(22, -35.5, 30.0), (16, -35.6, 30.0), (16, -35.7, 30.0)]
     assert [each.command for each in cmds] == [22, 16, 16]
-    assert {frame.name for frame in controller.received("MISSION_ITEM", "MISSION_ITEM_INT")} == {
-        "MISSION_ITEM_INT"
-    }
+    assert {frame.name for frame in controller.received("MISSION_ITEM", "MISSION_ITEM_INT")} == {"MISSION_ITEM_INT"}
 
 
-def test_add_copies_and_counts_and_writes_the_target_into_what_it_is_given(
+def test_add_copies_command_and_sets_target(
     three: Pair,
 ) -> None:
     _, cmds = three
@@ -210,7 +206,7 @@ def test_add_copies_and_counts_and_writes_the_target_into_what_it_is_given(
         cmds.add(None)
 
 
-def test_messages_of_pymavlink_can_be_added(empty: Pair) -> None:
+def test_add_accepts_pymavlink_messages(empty: Pair) -> None:
     _, cmds = empty
     content = (0, 0, 0, 3, 16, 0, 1, 0, 0, 0, 0)
     cmds.add(mavlink_1.MAVLink_mission_item_message(*content, -35.5, 149.25, 30))
@@ -218,7 +214,7 @@ def test_messages_of_pymavlink_can_be_added(empty: Pair) -> None:
     assert [(type(each), each.x, each.y) for each in cmds] == [(Command, -35.5, 149.25)] * 2
 
 
-def test_what_is_edited_in_place_or_assigned_is_uploaded(
+def test_edited_and_assigned_commands_are_uploaded(
     three: Pair,
 ) -> None:
     controller, cmds = three
@@ -239,7 +235,7 @@ def test_what_is_edited_in_place_or_assigned_is_uploaded(
         cmds[0] = 5
 
 
-def test_a_refusal_is_raised_with_its_reason_and_what_was_to_be_uploaded_is_kept(
+def test_rejected_upload_raises_reason_and_keeps_commands(
     three: Pair,
 ) -> None:
     controller, cmds = three
@@ -248,7 +244,7 @@ def test_a_refusal_is_raised_with_its_reason_and_what_was_to_be_uploaded_is_kept
     with pytest.raises(APIException, match="refused") as caught:
         cmds.upload()
     assert type(caught.value) is APIException
-    cmds[0].z = 20.0  # as before: the vehicle may hold a part of it nevertheless
+    cmds[0].z = 20.0  # as before; the vehicle may have stored a part of it
     before = controller.mark()
     controller.missions.result = 0
     cmds.upload()
@@ -256,7 +252,7 @@ def test_a_refusal_is_raised_with_its_reason_and_what_was_to_be_uploaded_is_kept
     assert len(cmds) == 3
 
 
-def test_a_vehicle_that_does_not_answer_is_a_timeout_and_the_next_upload_works(
+def test_unanswered_upload_raises_timeout_and_can_be_repeated(
     three: Pair,
 ) -> None:
     controller, cmds = three
@@ -270,7 +266,7 @@ def test_a_vehicle_that_does_not_answer_is_a_timeout_and_the_next_upload_works(
     assert kept(controller)[1:] == [(16, -35.5, 30.0)]
 
 
-def test_an_emptied_mission_is_emptied_on_the_vehicle(
+def test_cleared_mission_is_cleared_on_vehicle(
     three: Pair,
 ) -> None:
     controller, cmds = three
@@ -283,7 +279,7 @@ def test_an_emptied_mission_is_emptied_on_the_vehicle(
 # ------------------------------------------------------------------------------------ the rest
 
 
-def test_threads_that_add_at_once_lose_nothing(empty: Pair) -> None:
+def test_add_from_several_threads_keeps_all_commands(empty: Pair) -> None:
     _, cmds = empty
     cmds.clear()
 
@@ -299,7 +295,7 @@ def test_threads_that_add_at_once_lose_nothing(empty: Pair) -> None:
     assert [each.seq for each in cmds] == list(range(1, 201))
 
 
-def test_a_closed_vehicle_says_so() -> None:
+def test_commands_of_closed_vehicle_raise() -> None:
     with connected(HOME) as (_, vehicle):
         cmds = vehicle.commands
         cmds.add(waypoint())

@@ -1,4 +1,4 @@
-"""``connect``: what it imports, how its errors are caught, and how much of a traceback they show."""
+"""``connect``: imports, exception types and tracebacks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import aerokit.dronekit as dronekit
 from aerokit.dronekit import mavlink
 
 SOURCES = Path(__file__).parent.parent.parent / "src"
-MOST_LINES = 10
+MAX_LINES = 10
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def fc() -> Iterator[FlightController]:
         yield each
 
 
-def test_a_program_that_only_flies_imports_neither_pymavlink_nor_the_blocking_twin(
+def test_simple_program_imports_neither_pymavlink_nor_sync(
     fc: FlightController,
 ) -> None:
     program = f"""
@@ -51,7 +51,7 @@ print([each for each in ('pymavlink', 'aerokit.sync.twins', 'argparse') if each 
 
 
 @pytest.mark.parametrize("caught_as", [OSError, serial.SerialException, ValueError])
-def test_a_connection_string_that_is_none_is_caught_as_with_dronekit(caught_as: type[Exception]) -> None:
+def test_connect_invalid_string_raises_dronekit_exceptions(caught_as: type[Exception]) -> None:
     with pytest.raises(caught_as, match="'nonsense' is not a link address"):
         dronekit.connect("nonsense")
 
@@ -63,22 +63,22 @@ def refused() -> None:
     dronekit.connect(f"tcp:127.0.0.1:{port}")
 
 
-def nobody() -> None:
+def no_vehicle() -> None:
     dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=0.1)
 
 
-@pytest.mark.parametrize("failing", [refused, nobody])
-def test_a_failure_shows_few_lines(failing: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mavlink, "BETWEEN_ATTEMPTS_S", 0.0)
+@pytest.mark.parametrize("failing", [refused, no_vehicle])
+def test_connect_failure_has_short_traceback(failing: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mavlink, "RETRY_INTERVAL_S", 0.0)
     assert callable(failing)
     with pytest.raises((OSError, dronekit.APIException)) as caught:
         failing()
     assert caught.tb.tb_next is not None
     shown = "".join(traceback.format_exception(caught.type, caught.value, caught.tb.tb_next))
-    assert shown.count("\n") <= MOST_LINES, shown
+    assert shown.count("\n") <= MAX_LINES, shown
 
 
-def test_an_error_of_the_programs_own_class_is_shown_whole(fc: FlightController) -> None:
+def test_error_in_vehicle_class_has_full_traceback(fc: FlightController) -> None:
     def broken(handler: mavlink.MAVConnection) -> dronekit.Vehicle:
         raise ValueError("a mistake in here")
 
@@ -88,7 +88,7 @@ def test_an_error_of_the_programs_own_class_is_shown_whole(fc: FlightController)
 
 
 @pytest.mark.parametrize("wrong", ["guided", "Guided", "5", "alt_hold"])
-def test_modes_are_spelled_in_capitals(fc: FlightController, wrong: str) -> None:
+def test_mode_names_are_upper_case(fc: FlightController, wrong: str) -> None:
     with dronekit.connect(fc.address, rate=None) as vehicle:
         since = fc.mark()
         with pytest.raises(KeyError, match=wrong):
@@ -98,14 +98,14 @@ def test_modes_are_spelled_in_capitals(fc: FlightController, wrong: str) -> None
         assert {frame.param2 for frame in fc.commands(since=since)} == {4}
 
 
-def test_a_vehicle_of_an_unknown_autopilot_has_the_modes_of_ardupilot() -> None:
+def test_unknown_autopilot_has_ardupilot_modes() -> None:
     """iNav calls itself generic."""
     with FlightController(autopilot=0, mode=4) as fc, dronekit.connect(fc.address, rate=None) as vehicle:
         assert vehicle.mode.name == "GUIDED"
         vehicle.wait_for_mode("LOITER", timeout=100)
 
 
-def test_input_can_be_turned_off_and_on(fc: FlightController) -> None:
+def test_accept_input_discards_received_bytes(fc: FlightController) -> None:
     """Programs play a link that has gone by it."""
     with dronekit.connect(fc.address, rate=None) as vehicle:
         handler = vehicle._handler

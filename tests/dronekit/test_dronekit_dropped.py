@@ -25,7 +25,7 @@ from aerokit.transport import tcp
 
 LIMIT_S = 100.0
 SOURCES = Path(__file__).parent.parent.parent / "src"
-CLOSED = "the program has dropped it without close()"
+CLOSED = "the program dropped it without close()"
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def address() -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def nothing_else_is_open() -> Iterator[None]:
-    """What a test leaves open, above all when it fails, is closed here."""
-    with mavlink.connections_made() as connections:
+    """Close connections that a failed test left open."""
+    with mavlink.created_connections() as connections:
         yield
         for each in tuple(connections):
             each.close()
@@ -70,7 +70,7 @@ class Listening(dronekit.Vehicle):
     def on_attitude(self, _vehicle: object, _name: str, _message: object) -> None: ...
 
 
-def test_a_dropped_vehicle_leaves_its_place_to_the_next(
+def test_dropped_vehicle_is_closed_and_frees_its_link(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
@@ -85,10 +85,8 @@ def test_a_dropped_vehicle_leaves_its_place_to_the_next(
         dronekit.connect(address, wait_ready=["attitude"]) as vehicle,
     ):
         assert vehicle.attitude.pitch is not None
-    told = [
-        (each.name, each.levelname, each.getMessage()) for each in caplog.records if CLOSED in each.message
-    ]
-    assert told == [("dronekit", "WARNING", f"the vehicle at {address} is closed: {CLOSED}")]
+    notified = [(each.name, each.levelname, each.getMessage()) for each in caplog.records if CLOSED in each.message]
+    assert notified == [("dronekit", "WARNING", f"the connection to {address} was closed: {CLOSED}")]
 
 
 def _download(vehicle: dronekit.Vehicle) -> None:
@@ -112,9 +110,7 @@ USES: dict[str, Callable[[dronekit.Vehicle], object]] = {
 
 
 @pytest.mark.parametrize("use", USES.values(), ids=USES)
-def test_what_it_was_used_for_does_not_keep_it(
-    address: str, use: Callable[[dronekit.Vehicle], object]
-) -> None:
+def test_dropped_vehicle_is_not_kept_by_previous_use(address: str, use: Callable[[dronekit.Vehicle], object]) -> None:
     vehicle = dronekit.connect(address)
     dropped = weakref.ref(vehicle)
     use(vehicle)
@@ -123,7 +119,7 @@ def test_what_it_was_used_for_does_not_keep_it(
     eventually(lambda: not own_threads())
 
 
-def test_a_download_of_parameters_does_not_keep_it(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dropped_vehicle_is_not_kept_by_parameter_download(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parameter_transfers, "_method", lambda _: anyio.sleep_forever())
     vehicle = dronekit.connect(address)
     dropped = weakref.ref(vehicle)
@@ -139,13 +135,13 @@ OWNERS: dict[str, Callable[[dronekit.Vehicle], Any]] = {
 
 
 @pytest.mark.parametrize("owner", OWNERS.values(), ids=OWNERS)
-def test_an_attribute_listener_keeps_it_until_it_is_removed(
+def test_dropped_vehicle_is_kept_by_attribute_listener_until_removed(
     address: str, owner: Callable[[dronekit.Vehicle], Any]
 ) -> None:
-    told, is_to_go = threading.Event(), threading.Event()
+    notified, is_to_go = threading.Event(), threading.Event()
 
     def listener(self: Any, name: str, value: object) -> None:
-        told.set()
+        notified.set()
         if is_to_go.is_set():
             self.remove_attribute_listener("*", listener)
 
@@ -155,19 +151,19 @@ def test_an_attribute_listener_keeps_it_until_it_is_removed(
     del vehicle
     for _ in range(3):
         assert not is_gone(dropped)
-        told.clear()
-        assert told.wait(LIMIT_S)
+        notified.clear()
+        assert notified.wait(LIMIT_S)
     is_to_go.set()
     eventually(lambda: is_gone(dropped))
     eventually(lambda: not own_threads())
 
 
 @pytest.mark.parametrize("name", ["*", "ATTITUDE"])
-def test_a_message_listener_keeps_it_until_it_is_removed(address: str, name: str) -> None:
-    told, is_to_go = threading.Event(), threading.Event()
+def test_dropped_vehicle_is_kept_by_message_listener_until_removed(address: str, name: str) -> None:
+    notified, is_to_go = threading.Event(), threading.Event()
 
     def listener(self: dronekit.Vehicle, _: str, message: object) -> None:
-        told.set()
+        notified.set()
         if is_to_go.is_set():
             self.remove_message_listener(name, listener)
 
@@ -177,24 +173,24 @@ def test_a_message_listener_keeps_it_until_it_is_removed(address: str, name: str
     del vehicle
     for _ in range(3):
         assert not is_gone(dropped)
-        told.clear()
-        assert told.wait(LIMIT_S)
+        notified.clear()
+        assert notified.wait(LIMIT_S)
     is_to_go.set()
     eventually(lambda: is_gone(dropped))
     eventually(lambda: not own_threads())
 
 
 @pytest.mark.parametrize("left", ["attribute", "message"])
-def test_each_kind_of_listener_keeps_it_when_the_other_is_removed(address: str, left: str) -> None:
-    told = threading.Event()
+def test_dropped_vehicle_is_kept_by_remaining_listener(address: str, left: str) -> None:
+    notified = threading.Event()
 
     def to_attribute(_: object, name: str, value: object) -> None:
         if left == "attribute":
-            told.set()
+            notified.set()
 
     def to_message(_: object, name: str, message: object) -> None:
         if left == "message":
-            told.set()
+            notified.set()
 
     vehicle = dronekit.connect(address)
     vehicle.add_attribute_listener("attitude", to_attribute)
@@ -207,27 +203,27 @@ def test_each_kind_of_listener_keeps_it_when_the_other_is_removed(address: str, 
     del vehicle
     for _ in range(3):
         assert not is_gone(dropped)
-        told.clear()
-        assert told.wait(LIMIT_S)
+        notified.clear()
+        assert notified.wait(LIMIT_S)
 
 
 @pytest.mark.exhaustive
-def test_a_listener_to_a_parameter_keeps_it(address: str) -> None:
-    told = threading.Event()
+def test_dropped_vehicle_is_kept_by_parameter_listener(address: str) -> None:
+    notified = threading.Event()
     vehicle = dronekit.connect(address, wait_ready=["parameters"])
-    vehicle.parameters.add_attribute_listener("RTL_ALT", lambda *_: told.set())
+    vehicle.parameters.add_attribute_listener("RTL_ALT", lambda *_: notified.set())
     dropped = weakref.ref(vehicle)
     del vehicle
     assert not is_gone(dropped)
     with dronekit.connect(address) as other:
         other.parameters["RTL_ALT"] = 1234 if other.parameters["RTL_ALT"] != 1234 else 1235
-        assert told.wait(LIMIT_S)
+        assert notified.wait(LIMIT_S)
 
 
 @pytest.mark.parametrize(
     "options", [{"vehicle_class": Listening}, {"status_printer": lambda _: None}], ids=["subclass", "printer"]
 )
-def test_callbacks_given_when_connecting_keep_it(address: str, options: dict[str, Any]) -> None:
+def test_dropped_vehicle_is_kept_by_connect_callbacks(address: str, options: dict[str, Any]) -> None:
     dropped = weakref.ref(dronekit.connect(address, **options))
     assert not is_gone(dropped)
     vehicle = dropped()
@@ -237,13 +233,13 @@ def test_callbacks_given_when_connecting_keep_it(address: str, options: dict[str
     eventually(lambda: is_gone(dropped))
 
 
-def test_listeners_of_the_connection_keep_it(address: str) -> None:
-    told = threading.Event()
-    dronekit.connect(address)._handler.forward_message(lambda _, message: told.set())
+def test_dropped_vehicle_is_kept_by_connection_listeners(address: str) -> None:
+    notified = threading.Event()
+    dronekit.connect(address)._handler.forward_message(lambda _, message: notified.set())
     for _ in range(3):
         gc.collect()
-        told.clear()
-        assert told.wait(LIMIT_S)
+        notified.clear()
+        assert notified.wait(LIMIT_S)
 
 
 PARTS: dict[str, Callable[[dronekit.Vehicle], Any]] = {
@@ -260,7 +256,7 @@ PARTS: dict[str, Callable[[dronekit.Vehicle], Any]] = {
 
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
-def test_a_part_of_it_keeps_the_connection(address: str, part: Callable[[dronekit.Vehicle], Any]) -> None:
+def test_dropped_vehicle_part_keeps_connection(address: str, part: Callable[[dronekit.Vehicle], Any]) -> None:
     kept = part(dronekit.connect(address))
     gc.collect()
     assert own_threads() == ["aerokit loop"]
@@ -268,7 +264,7 @@ def test_a_part_of_it_keeps_the_connection(address: str, part: Callable[[droneki
     eventually(lambda: (gc.collect(), not own_threads())[1])
 
 
-def test_an_order_under_way_keeps_it_and_is_carried_out(address: str) -> None:
+def test_dropped_vehicle_is_kept_by_running_order(address: str) -> None:
     may_end, has_ended = threading.Event(), threading.Event()
 
     async def order() -> None:
@@ -288,7 +284,7 @@ def test_an_order_under_way_keeps_it_and_is_carried_out(address: str) -> None:
     assert has_ended.is_set()
 
 
-def test_a_call_that_waits_keeps_it(address: str) -> None:
+def test_dropped_vehicle_is_kept_by_waiting_call(address: str) -> None:
     may_end, ended = threading.Event(), list[str]()
 
     def wait(vehicle: dronekit.Vehicle) -> None:
@@ -308,8 +304,8 @@ def test_a_call_that_waits_keeps_it(address: str) -> None:
     eventually(lambda: not own_threads())
 
 
-def test_a_connection_that_is_dropped_while_connections_are_collected(address: str) -> None:
-    with mavlink.connections_made() as made:
+def test_dropped_connection_is_not_kept_by_created_connections(address: str) -> None:
+    with mavlink.created_connections() as made:
         connection = mavlink.MAVConnection(address)
         assert list(made) == [connection]
         del connection
@@ -317,14 +313,14 @@ def test_a_connection_that_is_dropped_while_connections_are_collected(address: s
         assert not made
 
 
-def test_what_is_called_when_it_is_closed_is_called_when_it_is_dropped(address: str) -> None:
+def test_dropped_vehicle_calls_on_close_functions(address: str) -> None:
     closed = list[str]()
     dronekit.connect(address)._handler.on_close(lambda: closed.append("well"))
     eventually(lambda: (gc.collect(), closed)[1])
     eventually(lambda: not own_threads())
 
 
-def test_closing_is_not_dropping(address: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_closed_vehicle_logs_no_dropped_warning(address: str, caplog: pytest.LogCaptureFixture) -> None:
     with dronekit.connect(address) as vehicle:
         dropped = weakref.ref(vehicle)
     del vehicle
@@ -333,7 +329,7 @@ def test_closing_is_not_dropping(address: str, caplog: pytest.LogCaptureFixture)
 
 
 @pytest.mark.parametrize("collects", ["", "gc.collect()"])
-def test_a_program_may_end_with_a_vehicle_that_it_has_dropped(collects: str) -> None:
+def test_program_exits_with_dropped_vehicle(collects: str) -> None:
     with served_copter() as address:
         program = f"""
 import gc
@@ -353,7 +349,7 @@ connect({address!r}, wait_ready=['attitude'])
     assert not [line for line in result.stderr.splitlines() if CLOSED not in line]
 
 
-def test_who_logs_slowly_does_not_hold_the_collector_up(address: str) -> None:
+def test_dropped_vehicle_slow_log_handler_does_not_block_collector(address: str) -> None:
     is_held, may_go_on = threading.Event(), threading.Event()
 
     class Slow(logging.Handler):

@@ -66,7 +66,7 @@ EXPECTED: dict[str, tuple[float, list[str], list[str]]] = {
     ),
     "flight_replay": (50, [str(RECORDING)], ["4 waypoints", "to waypoint ", "at the end of the track"]),
 }
-"""Example: times real time, its arguments beside the address, what it must print."""
+"""Example: speed-up, additional arguments, expected output."""
 
 PARAMETERS = {"gimbal": {"MNT1_TYPE": 1.0}}
 """Of the vehicle, where they are not the usual ones."""
@@ -78,12 +78,12 @@ def without_alias() -> Iterator[None]:
     uninstall()
 
 
-def test_every_example_is_run() -> None:
+def test_every_example_has_a_test() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(EXPECTED)
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_example_says_dronekit_only(name: str) -> None:
+def test_example_imports_dronekit_only(name: str) -> None:
     text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
     imported = [node.module for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)]
     assert "dronekit" in imported
@@ -96,13 +96,13 @@ def test_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     speedup, arguments, expected = EXPECTED[name]
     with served_copter(speedup=speedup, parameters=PARAMETERS.get(name)) as address:
         run_script(EXAMPLES / f"{name}.py", [*arguments, "--connect", address])
-    told = capsys.readouterr()
-    assert told.err == ""
+    notified = capsys.readouterr()
+    assert notified.err == ""
     for text in expected:
-        assert text in told.out
+        assert text in notified.out
 
 
-def test_example_as_a_program() -> None:
+def test_example_as_program() -> None:
     with served_copter() as address:
         done = subprocess.run(
             [
@@ -125,8 +125,8 @@ def test_example_as_a_program() -> None:
     assert "mode: STABILIZE" in done.stdout
 
 
-def test_blocks_of_the_page() -> None:
-    """What docs/from-dronekit.md says about moving over; the second block goes on where the first one ends."""
+def test_from_dronekit_page_blocks() -> None:
+    """The blocks of docs/from-dronekit.md; the second one continues the first."""
     names: dict[str, Any] = {}
     assert len(BLOCKS) == 2
     with served_copter(speedup=50) as address:

@@ -1,4 +1,4 @@
-"""``vehicle.gimbal``: where it points, and what orders it makes of which firmware."""
+"""``vehicle.gimbal``: attitude, and commands by firmware."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def tell_device(
     stage: Stage, pitch: float, roll: float, yaw: float, flags: int = IN_VEHICLE_FRAME, **fields: Any
 ) -> None:
     fields.setdefault("delta_yaw", NAN)
-    stage.tell("GIMBAL_DEVICE_ATTITUDE_STATUS", flags=flags, q=quaternion(pitch, roll, yaw), **fields)
+    stage.report("GIMBAL_DEVICE_ATTITUDE_STATUS", flags=flags, q=quaternion(pitch, roll, yaw), **fields)
 
 
 def params(frame: Received) -> tuple[int, tuple[float | None, ...]]:
@@ -71,39 +71,42 @@ def commands(stage: Stage, order: Any) -> list[tuple[int, tuple[float | None, ..
 # ----------------------------------------------------------------------------- where it points
 
 
-def test_nothing_is_known_without_a_gimbal(stage: Stage) -> None:
+def test_gimbal_angles_without_gimbal_are_none(stage: Stage) -> None:
     assert angles(stage) == (None, None, None)
     assert stage.vehicle.mount_status == [None, None, None]
     assert str(stage.vehicle.gimbal) == "Gimbal: pitch=None, roll=None, yaw=None"
 
 
-def test_mount_status_is_taken_as_it_is(stage: Stage) -> None:
+def test_mount_status_is_unchanged(stage: Stage) -> None:
     events = stage.listen("*")
-    stage.tell("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=-9000)
+    stage.report("MOUNT_STATUS", pointing_a=-4500, pointing_b=100, pointing_c=-9000)
     assert str(stage.vehicle.gimbal) == "Gimbal: pitch=-45.0, roll=1.0, yaw=-90.0"
     assert stage.vehicle.mount_status == [-45.0, -90.0, 1.0]
-    told = [(name, value) for _, name, value in events if name in ("mount", "gimbal")]
-    assert told == [("mount", "[-45.0, -90.0, 1.0]"), ("gimbal", "Gimbal: pitch=-45.0, roll=1.0, yaw=-90.0")]
+    notified = [(name, value) for _, name, value in events if name in ("mount", "gimbal")]
+    assert notified == [
+        ("mount", "[-45.0, -90.0, 1.0]"),
+        ("gimbal", "Gimbal: pitch=-45.0, roll=1.0, yaw=-90.0"),
+    ]
 
 
-def test_mount_orientation_has_the_yaw_from_north(stage: Stage) -> None:
+def test_mount_orientation_yaw_is_from_north(stage: Stage) -> None:
     events = stage.listen("mount", "gimbal")
-    stage.tell("MOUNT_ORIENTATION", pitch=-30, roll=2, yaw=-10, yaw_absolute=350)
+    stage.report("MOUNT_ORIENTATION", pitch=-30, roll=2, yaw=-10, yaw_absolute=350)
     assert angles(stage) == (-30, 2, 350)
     assert [name for _, name, _ in events] == ["gimbal"]
-    stage.tell("MOUNT_ORIENTATION", pitch=-30, roll=NAN, yaw=-10)
+    stage.report("MOUNT_ORIENTATION", pitch=-30, roll=NAN, yaw=-10)
     assert angles(stage) == (-30, None, -10)
-    stage.tell("ATTITUDE", yaw=math.radians(5))
-    stage.tell("MOUNT_ORIENTATION", pitch=-30, roll=0, yaw=-10)
+    stage.report("ATTITUDE", yaw=math.radians(5))
+    stage.report("MOUNT_ORIENTATION", pitch=-30, roll=0, yaw=-10)
     assert angles(stage) == (-30, 0, 355)
 
 
-def test_the_yaw_of_a_gimbal_device_is_from_north(stage: Stage) -> None:
+def test_gimbal_device_yaw_is_from_north(stage: Stage) -> None:
     events = stage.listen("mount", "gimbal")
     tell_device(stage, -45, 1, 10)
     assert angles(stage) == (-45, 1, 10)  # the vehicle's heading is not known yet
     assert [name for _, name, _ in events] == ["mount", "gimbal"]
-    stage.tell("ATTITUDE", yaw=math.radians(-90))
+    stage.report("ATTITUDE", yaw=math.radians(-90))
     tell_device(stage, -45, 1, 10)
     assert angles(stage) == (-45, 1, 280)
     tell_device(stage, -45, 1, 10, delta_yaw=math.radians(100))
@@ -119,26 +122,26 @@ def test_the_yaw_of_a_gimbal_device_is_from_north(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("yaw", [0, 30, -170])
-def test_straight_down_is_no_special_place(stage: Stage, yaw: float) -> None:
+def test_rotate_straight_down(stage: Stage, yaw: float) -> None:
     tell_device(stage, -90, 0, yaw, IN_EARTH_FRAME)
     assert angles(stage) == (-90, 0, yaw % 360)
     tell_device(stage, 90, 0, yaw, IN_EARTH_FRAME)
     assert angles(stage) == (90, 0, yaw % 360)
 
 
-def test_a_gimbal_that_does_not_know_is_none(stage: Stage) -> None:
-    stage.tell("GIMBAL_DEVICE_ATTITUDE_STATUS", flags=IN_EARTH_FRAME, q=[NAN] * 4)
+def test_gimbal_with_unknown_angles_is_none(stage: Stage) -> None:
+    stage.report("GIMBAL_DEVICE_ATTITUDE_STATUS", flags=IN_EARTH_FRAME, q=[NAN] * 4)
     assert angles(stage) == (None, None, None)
-    stage.tell("GIMBAL_DEVICE_ATTITUDE_STATUS", flags=IN_EARTH_FRAME, q=[0.0] * 4)
+    stage.report("GIMBAL_DEVICE_ATTITUDE_STATUS", flags=IN_EARTH_FRAME, q=[0.0] * 4)
     assert angles(stage) == (None, None, None)
 
 
-def test_of_several_gimbals_it_is_the_first(stage: Stage) -> None:
+def test_gimbal_is_the_first_of_several(stage: Stage) -> None:
     tell_device(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
     tell_device(stage, -10, 0, 0, IN_EARTH_FRAME, gimbal_device_id=1)
     tell_device(stage, -20, 0, 0, IN_EARTH_FRAME, gimbal_device_id=2)
     tell_device(stage, -30, 0, 0, IN_EARTH_FRAME, source=(1, 154))
-    stage.tell("MOUNT_ORIENTATION", pitch=-40, yaw_absolute=90)
+    stage.report("MOUNT_ORIENTATION", pitch=-40, yaw_absolute=90)
     tell_device(stage, -50, 0, 0, IN_EARTH_FRAME, source=(2, 1))
     assert angles(stage) == (-10, 0, 0)
 
@@ -146,13 +149,13 @@ def test_of_several_gimbals_it_is_the_first(stage: Stage) -> None:
 # --------------------------------------------------------------------------------------- rotate
 
 
-def test_rotate_is_a_command_of_the_gimbal_manager(stage: Stage) -> None:
+def test_rotate_uses_gimbal_manager_command(stage: Stage) -> None:
     assert commands(stage, lambda: stage.vehicle.gimbal.rotate(-90.5, 0, 200)) == [
         (PITCHYAW, (-90.5, 200, None, None, 28))
     ]
 
 
-def test_a_manager_that_wants_control_to_be_claimed_gets_it_claimed(stage: Stage) -> None:
+def test_gimbal_manager_denial_claims_control(stage: Stage) -> None:
     stage.fc.results[PITCHYAW] = DENIED
     with stage.logged() as lines:
         sent = commands(stage, lambda: stage.vehicle.gimbal.rotate(-45, 0, 0))
@@ -166,23 +169,23 @@ def test_a_manager_that_wants_control_to_be_claimed_gets_it_claimed(stage: Stage
     assert commands(stage, stage.vehicle.gimbal.release) == [(MOUNT_CONTROL, (0, 0, 0, 0, 0, 0, 3))]
 
 
-def test_roll_needs_the_mount_command_whose_yaw_is_the_vehicles(stage: Stage) -> None:
-    stage.tell("ATTITUDE", yaw=math.radians(100))
+def test_rotate_with_roll_uses_mount_command(stage: Stage) -> None:
+    stage.report("ATTITUDE", yaw=math.radians(100))
     assert commands(stage, lambda: stage.vehicle.gimbal.rotate(-45, 5, 90)) == [
         (MOUNT_CONTROL, (-45, 5, -10, 0, 0, 0, 2))
     ]
 
 
-def test_firmware_without_a_gimbal_manager_gets_the_mount_command(stage: Stage) -> None:
+def test_rotate_falls_back_to_mount_command(stage: Stage) -> None:
     stage.fc.results[PITCHYAW] = UNSUPPORTED
-    stage.tell("ATTITUDE", yaw=math.radians(-170))
+    stage.report("ATTITUDE", yaw=math.radians(-170))
     assert commands(stage, lambda: stage.vehicle.gimbal.rotate(-45, 0, 180)) == [
         (PITCHYAW, (-45, 180, None, None, 28)),
         (MOUNT_CONTROL, (-45, 0, -10, 0, 0, 0, 2)),
     ]
 
 
-def test_orders_in_quick_succession_learn_from_the_answers_to_those_they_replaced(stage: Stage) -> None:
+def test_gimbal_fast_orders_use_answers_to_replaced_ones(stage: Stage) -> None:
     gimbal = stage.vehicle.gimbal
     stage.fc.results[PITCHYAW] = DENIED
     gimbal.rotate(-45, 0, 0)
@@ -197,7 +200,7 @@ def test_orders_in_quick_succession_learn_from_the_answers_to_those_they_replace
     assert commands(stage, lambda: gimbal.rotate(-47, 0, 0)) == [(PITCHYAW, (-47, 0, None, None, 28))]
 
 
-def test_firmware_without_commands_gets_the_messages(stage: Stage) -> None:
+def test_rotate_falls_back_to_mount_messages(stage: Stage) -> None:
     stage.fc.results.update({PITCHYAW: UNSUPPORTED, MOUNT_CONTROL: UNSUPPORTED})
     since = stage.fc.mark()
     with stage.logged() as lines:
@@ -211,7 +214,7 @@ def test_firmware_without_commands_gets_the_messages(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("wrong", [NAN, math.inf, None, "down"])
-def test_angles_are_numbers(stage: Stage, wrong: Any) -> None:
+def test_gimbal_angles_must_be_numbers(stage: Stage, wrong: Any) -> None:
     gimbal = stage.vehicle.gimbal
     for each in ((wrong, 0, 0), (0, wrong, 0), (0, 0, wrong)):
         with pytest.raises(ValueError, match="a finite number of degrees"):
@@ -222,7 +225,7 @@ def test_angles_are_numbers(stage: Stage, wrong: Any) -> None:
 # -------------------------------------------------------------------------------------- places
 
 
-def test_a_place_above_home_or_above_the_sea(stage: Stage) -> None:
+def test_target_location_above_home_or_sea_level(stage: Stage) -> None:
     for kind, frame in ((LocationGlobalRelative, 6), (LocationGlobal, 5)):
         since = stage.fc.mark()
         commands(stage, lambda kind=kind: stage.vehicle.gimbal.target_location(kind(*PLACE)))
@@ -232,7 +235,7 @@ def test_a_place_above_home_or_above_the_sea(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("result", [UNSUPPORTED, LONG_ONLY])
-def test_firmware_that_does_not_know_it_gets_the_old_command(stage: Stage, result: int) -> None:
+def test_target_location_falls_back_to_old_command(stage: Stage, result: int) -> None:
     stage.fc.results[ROI_LOCATION] = result
     for kind, altitude in ((LocationGlobalRelative, 10), (LocationGlobal, 10 - 584)):
         since = stage.fc.mark()
@@ -241,7 +244,7 @@ def test_firmware_that_does_not_know_it_gets_the_old_command(stage: Stage, resul
         assert (sent.name, *params(sent)) == ("COMMAND_LONG", ROI, (0, 0, 0, 0, -35.1235, 149.7654, altitude))
 
 
-def test_px4_takes_every_altitude_for_one_above_the_sea() -> None:
+def test_target_location_px4_uses_amsl_altitude() -> None:
     with on_stage(dronekit, {"autopilot": 12}, {"rate": None}) as stage:
         since = stage.fc.mark()
         commands(stage, lambda: stage.vehicle.gimbal.target_location(LocationGlobalRelative(*PLACE)))
@@ -250,11 +253,9 @@ def test_px4_takes_every_altitude_for_one_above_the_sea() -> None:
         assert places == [(5, 594), (5, 10)]
 
 
-def test_zeros_end_it(stage: Stage) -> None:
+def test_target_location_zeros_end_it(stage: Stage) -> None:
     gimbal = stage.vehicle.gimbal
-    assert commands(stage, lambda: gimbal.target_location(LocationGlobalRelative(0, 0, 0))) == [
-        (ROI_NONE, ())
-    ]
+    assert commands(stage, lambda: gimbal.target_location(LocationGlobalRelative(0, 0, 0))) == [(ROI_NONE, ())]
     stage.fc.results[ROI_NONE] = UNSUPPORTED
     assert commands(stage, lambda: gimbal.target_location(LocationGlobal(0, 0, 0))) == [
         (ROI_NONE, ()),
@@ -262,7 +263,7 @@ def test_zeros_end_it(stage: Stage) -> None:
     ]
 
 
-def test_places_are_checked_before_anything_is_sent(stage: Stage) -> None:
+def test_target_location_invalid_location_sends_nothing(stage: Stage) -> None:
     gimbal = stage.vehicle.gimbal
     for wrong, text in (
         (None, "Expecting roi"),
@@ -276,14 +277,14 @@ def test_places_are_checked_before_anything_is_sent(stage: Stage) -> None:
     assert commands(stage, lambda: None) == []
 
 
-def test_a_refusal_is_a_warning(stage: Stage) -> None:
+def test_gimbal_rejection_is_a_warning(stage: Stage) -> None:
     stage.fc.results[PITCHYAW] = FAILED
     with stage.logged() as lines:
         assert len(commands(stage, lambda: stage.vehicle.gimbal.rotate(-45, 0, 0))) == 1
     assert [line for line in lines if "PITCHYAW was refused: FAILED" in line]
 
 
-def test_after_closing_orders_raise(stage: Stage) -> None:
+def test_gimbal_orders_after_close_raise(stage: Stage) -> None:
     stage.vehicle.close()
     gimbal = stage.vehicle.gimbal
     for order in (
@@ -295,7 +296,7 @@ def test_after_closing_orders_raise(stage: Stage) -> None:
             order()
 
 
-def test_angles_beyond_a_turn_are_the_same_direction(stage: Stage) -> None:
+def test_gimbal_angles_beyond_360_are_reduced(stage: Stage) -> None:
     """Programs add them up: a heading of 359 and 90 degrees to the right."""
     sent = commands(stage, lambda: stage.vehicle.gimbal.rotate(-10, 0, 449))
     assert sent == [(PITCHYAW, (-10, 89, None, None, 28))]

@@ -1,4 +1,4 @@
-"""The life of a classic vehicle: what it leaves behind, whoever closes it, and Ctrl-C."""
+"""Connecting and closing a classic vehicle, leaks, and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -40,9 +40,7 @@ def vehicle(address: str) -> Iterator[dronekit.Vehicle]:
 
 
 def own_threads() -> list[str]:
-    return sorted(
-        each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit"))
-    )
+    return sorted(each.name for each in threading.enumerate() if each.name.startswith(("aerokit", "dronekit")))
 
 
 def open_sockets() -> int:
@@ -62,7 +60,7 @@ def eventually(is_true: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
-def test_nothing_is_left_after_closing(address: str) -> None:
+def test_close_leaves_no_threads(address: str) -> None:
     threads, sockets = own_threads(), open_sockets()
     vehicle = dronekit.connect(address, wait_ready=["attitude"])
     vehicle.add_attribute_listener("attitude", lambda *_: None)
@@ -71,10 +69,10 @@ def test_nothing_is_left_after_closing(address: str) -> None:
     vehicle.close()
     vehicle.close()
     assert own_threads() == threads
-    eventually(lambda: open_sockets() <= sockets)  # the server's side of it closes, too
+    eventually(lambda: open_sockets() <= sockets)  # the server closes its side, too
 
 
-def test_attributes_stay_and_orders_raise_after_closing(vehicle: dronekit.Vehicle) -> None:
+def test_closed_vehicle_keeps_attributes_and_orders_raise(vehicle: dronekit.Vehicle) -> None:
     vehicle.close()
     assert vehicle.mode.name == "STABILIZE"
     for use in (
@@ -94,7 +92,7 @@ def test_attributes_stay_and_orders_raise_after_closing(vehicle: dronekit.Vehicl
 
 
 @pytest.mark.parametrize("kind", ["attribute", "message"])
-def test_a_callback_may_close_the_vehicle(address: str, kind: str) -> None:
+def test_callback_may_close_vehicle(address: str, kind: str) -> None:
     threads = own_threads()
     vehicle = dronekit.connect(address)
     closed = threading.Event()
@@ -112,7 +110,7 @@ def test_a_callback_may_close_the_vehicle(address: str, kind: str) -> None:
     eventually(lambda: own_threads() == threads)
 
 
-def test_closing_ends_what_waits_on_other_threads(vehicle: dronekit.Vehicle) -> None:
+def test_close_ends_waiting_calls_of_other_threads(vehicle: dronekit.Vehicle) -> None:
     errors: list[BaseException] = []
 
     def wait(call: Callable[[], object]) -> None:
@@ -135,7 +133,7 @@ def test_closing_ends_what_waits_on_other_threads(vehicle: dronekit.Vehicle) -> 
     assert len(errors) == len(calls)
 
 
-def test_a_callback_may_call_what_blocks_while_reception_goes_on(vehicle: dronekit.Vehicle) -> None:
+def test_callback_may_block_during_reception(vehicle: dronekit.Vehicle) -> None:
     seen: list[str] = []
     done = threading.Event()
 
@@ -152,7 +150,7 @@ def test_a_callback_may_call_what_blocks_while_reception_goes_on(vehicle: dronek
     assert seen == ["ALT_HOLD"]
 
 
-def test_reading_does_not_wait_for_the_loop(vehicle: dronekit.Vehicle) -> None:
+def test_attributes_are_read_without_loop(vehicle: dronekit.Vehicle) -> None:
     vehicle.wait_ready("attitude", "gps_0", "battery", "location", "heading", timeout=LIMIT_S)
     is_held, may_go_on = threading.Event(), threading.Event()
 
@@ -181,7 +179,7 @@ def test_reading_does_not_wait_for_the_loop(vehicle: dronekit.Vehicle) -> None:
         may_go_on.set()
 
 
-def test_the_numbers_of_a_location_belong_to_one_message(vehicle: dronekit.Vehicle) -> None:
+def test_location_numbers_are_of_one_message(vehicle: dronekit.Vehicle) -> None:
     ended, torn = threading.Event(), []
     location = vehicle.location
 
@@ -218,7 +216,7 @@ BLOCKING: dict[str, Callable[[dronekit.Vehicle], object]] = {
 
 
 @pytest.mark.parametrize("name", BLOCKING)
-def test_ctrl_c_ends_blocking_calls(vehicle: dronekit.Vehicle, name: str) -> None:
+def test_ctrl_c_ends_blocking_call(vehicle: dronekit.Vehicle, name: str) -> None:
     threads = own_threads()
     timer = threading.Timer(0.3, _thread.interrupt_main)
     timer.start()
@@ -235,7 +233,7 @@ def test_ctrl_c_ends_blocking_calls(vehicle: dronekit.Vehicle, name: str) -> Non
     ("ending", "last_mode"),
     [("", None), ("vehicle.mode = 'RTL'", "RTL"), ("vehicle.mode = 'LAND'; vehicle.close()", "LAND")],
 )
-def test_a_program_that_just_ends_delivers_its_last_order(ending: str, last_mode: str | None) -> None:
+def test_program_exit_delivers_last_order(ending: str, last_mode: str | None) -> None:
     with served_copter() as address:
         program = f"""
 import logging
@@ -261,7 +259,7 @@ vehicle.add_attribute_listener('attitude', lambda *_: None)
             vehicle.close()
 
 
-def test_a_link_that_cannot_be_opened_raises_what_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connect_failure_raises_operating_system_exception(monkeypatch: pytest.MonkeyPatch) -> None:
     threads, pauses = own_threads(), list[float]()
     monkeypatch.setattr(mavlink, "time", SimpleNamespace(sleep=pauses.append))
     with socket.socket() as listener:
@@ -277,11 +275,11 @@ def test_a_link_that_cannot_be_opened_raises_what_the_system_says(monkeypatch: p
     assert own_threads() == threads
 
 
-def test_without_a_vehicle_connect_has_a_deadline_and_leaves_nothing() -> None:
+def test_connect_without_vehicle_times_out_and_closes() -> None:
     threads, sockets = own_threads(), open_sockets()
     with pytest.raises(dronekit.APIException, match="Timeout in initializing connection") as caught:
         dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=0.2)
-    assert "not a single byte was heard" in str(caught.value)
+    assert "no bytes were received" in str(caught.value)
     with pytest.raises(builtin_timeout()), served_copter(boot_time_s=0.0) as address:
         dronekit.connect(address, wait_ready=["no such attribute"], timeout=0.2)
     assert own_threads() == threads
@@ -292,31 +290,31 @@ def builtin_timeout() -> type[Exception]:
     return TimeoutError
 
 
-def test_as_a_context_manager(address: str) -> None:
+def test_vehicle_is_context_manager(address: str) -> None:
     threads = own_threads()
     with dronekit.connect(address) as vehicle:
         assert vehicle.mode.name == "STABILIZE"
     assert own_threads() == threads
 
 
-def test_a_link_that_is_reset_comes_back(vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture) -> None:
+def test_reset_link_reopens(vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture) -> None:
     connection: Any = vehicle._handler.connection
     vehicle._handler.reset()
     eventually(lambda: "is back" in caplog.text or connection.counts(1)[0] == 0 or connection.link.is_away)
-    told: list[str] = []
+    notified: list[str] = []
     eventually(lambda: not connection.link.is_away)
-    vehicle.on_message("ATTITUDE")(lambda _, name, message: told.append(name))
-    eventually(lambda: told)
+    vehicle.on_message("ATTITUDE")(lambda _, name, message: notified.append(name))
+    eventually(lambda: notified)
     vehicle.wait_for_mode("ALT_HOLD", timeout=LIMIT_S)
     vehicle.wait_for_mode("STABILIZE", timeout=LIMIT_S)
 
 
-def test_which_modes_there_are(vehicle: dronekit.Vehicle) -> None:
+def test_is_mode_available(vehicle: dronekit.Vehicle) -> None:
     assert vehicle._is_mode_available(5)
     assert not vehicle._is_mode_available(222)
 
 
-def test_a_subclass_calls_its_own_things_what_it_likes(address: str) -> None:
+def test_subclass_attributes_do_not_collide(address: str) -> None:
     class Own(dronekit.Vehicle):
         def __init__(self, *args: Any) -> None:
             super().__init__(*args)
@@ -341,44 +339,40 @@ def test_a_subclass_calls_its_own_things_what_it_likes(address: str) -> None:
         assert vehicle.attitude.pitch is not None
 
 
-def test_connecting_waits_for_the_first_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", LIMIT_S)
-    monkeypatch.setattr(vehicle_module, "NO_MORE_S", LIMIT_S)
+def test_connect_waits_for_first_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", LIMIT_S)
+    monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", LIMIT_S)
     with dronekit.connect(address) as vehicle:
         assert vehicle.location.global_relative_frame.alt is not None
         assert vehicle.attitude.yaw is not None
         assert vehicle.battery.voltage is not None
 
 
-def test_connecting_does_not_wait_for_what_does_not_come(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_connect_does_not_wait_for_missing_values(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("attitude", "heading", "what it never tells"))
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", 1e6)
-    monkeypatch.setattr(vehicle_module, "NO_MORE_S", 0.05)
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", 1e6)
+    monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", 0.05)
     dronekit.connect(address).close()
 
 
-def test_what_came_before_connecting_waited_counts(
-    vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_connect_counts_earlier_values(vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vehicle_module, "FIRST_VALUES", ("mode", "what it never tells"))
-    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_S", 1e6)
-    monkeypatch.setattr(vehicle_module, "NO_MORE_S", 0.05)
+    monkeypatch.setattr(vehicle_module, "FIRST_VALUES_TIMEOUT_S", 1e6)
+    monkeypatch.setattr(vehicle_module, "NEXT_VALUE_TIMEOUT_S", 0.05)
     vehicle._dk_wait_for_first_values()
 
 
 @pytest.mark.parametrize("wrong", [None, 14550, b"udp:127.0.0.1:14550"])
-def test_what_is_no_connection_string(wrong: Any) -> None:
-    with pytest.raises(ValueError, match="is no connection string"):
+def test_connect_non_string_raises(wrong: Any) -> None:
+    with pytest.raises(ValueError, match="is not a connection string"):
         dronekit.connect(wrong)
 
 
-def test_errors_say_what_is_missing(vehicle: dronekit.Vehicle) -> None:
+def test_errors_name_missing_values(vehicle: dronekit.Vehicle) -> None:
     with pytest.raises(dronekit.TimeoutError) as waited:
         vehicle.wait_ready("mode", "batery", timeout=0.01)
     assert str(waited.value) == "wait_ready experienced a timeout after 0.01 seconds."
-    assert str(waited.value.__cause__) == "never told: batery"
+    assert str(waited.value.__cause__) == "not received: batery"
     with pytest.raises(KeyError) as wrong:
         vehicle.mode = dronekit.VehicleMode("GIUDED")
     assert wrong.value.args == ("GIUDED",)
@@ -387,9 +381,7 @@ def test_errors_say_what_is_missing(vehicle: dronekit.Vehicle) -> None:
         vehicle.wait_for(lambda: False, timeout=0.01)
 
 
-def test_refusals_say_in_which_state_the_vehicle_is(
-    vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_rejections_describe_vehicle_state(vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(dronekit.TimeoutError, match=r"failed to reach specified altitude: .*NAV_TAKEOFF"):
         vehicle.wait_simple_takeoff(10, timeout=LIMIT_S)
     assert "takeoff: " in caplog.text

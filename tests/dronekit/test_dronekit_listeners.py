@@ -1,4 +1,4 @@
-"""Listeners: their order, their thread, and what they may do."""
+"""Listeners: order, thread and allowed calls."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def emptied(thread: ListenerThread) -> None:
     assert done.wait(LIMIT_S)
 
 
-def told(observed: HasObservers, thread: ListenerThread, *values: Any, name: str = "x", **more: Any) -> None:
+def notified(observed: HasObservers, thread: ListenerThread, *values: Any, name: str = "x", **more: Any) -> None:
     for value in values:
-        observed._dk_listeners.tell(name, value, **more)
+        observed._dk_listeners.notify(name, value, **more)
     emptied(thread)
 
 
-def test_calls_come_in_order_and_the_thread_starts_with_the_first() -> None:
+def test_listener_thread_starts_with_first_call_and_keeps_order() -> None:
     thread = ListenerThread("late")
     assert all(each.name != "late" for each in threading.enumerate())
     seen: list[int] = []
@@ -54,9 +54,7 @@ def test_calls_come_in_order_and_the_thread_starts_with_the_first() -> None:
     assert -1 not in seen
 
 
-def test_a_raising_call_is_logged_and_the_next_one_runs(
-    thread: ListenerThread, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_listener_thread_logs_exception_and_continues(thread: ListenerThread, caplog: pytest.LogCaptureFixture) -> None:
     def fail() -> None:
         raise SystemExit(3)
 
@@ -65,7 +63,7 @@ def test_a_raising_call_is_logged_and_the_next_one_runs(
     assert "Exception in a callback" in caplog.text
 
 
-def test_stopping_from_a_call_does_not_wait_for_itself(thread: ListenerThread) -> None:
+def test_listener_thread_stop_in_call_does_not_deadlock(thread: ListenerThread) -> None:
     ended = threading.Event()
 
     def stop() -> None:
@@ -77,7 +75,7 @@ def test_stopping_from_a_call_does_not_wait_for_itself(thread: ListenerThread) -
     assert ended.wait(LIMIT_S)
 
 
-def test_call_waits_and_is_direct_on_the_thread_itself(thread: ListenerThread) -> None:
+def test_listener_thread_call_waits_or_is_direct(thread: ListenerThread) -> None:
     seen: list[object] = []
     thread.call(lambda: thread.call(lambda: seen.append(threading.current_thread().name)))
     assert seen == ["test listeners"]
@@ -86,10 +84,10 @@ def test_call_waits_and_is_direct_on_the_thread_itself(thread: ListenerThread) -
     assert seen[-1] == "after"
 
 
-def test_what_waits_behind_a_stuck_listener_is_bounded(
+def test_queue_behind_blocked_listener_is_bounded(
     thread: ListenerThread, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(listener_thread, "MOST_WAITING", 5)
+    monkeypatch.setattr(listener_thread, "MAX_QUEUED_CALLS", 5)
     may_go_on, seen = threading.Event(), list[object]()
     is_stuck = threading.Event()
 
@@ -108,10 +106,10 @@ def test_what_waits_behind_a_stuck_listener_is_bounded(
     assert seen[:-1] == list(range(len(seen) - 1))
     assert len(seen) == 6
     assert thread.dropped == 20 - (len(seen) - 1)
-    assert caplog.text.count("does not come back") == 1
+    assert caplog.text.count("blocks the callback thread") == 1
 
 
-def test_listeners_of_a_name_come_before_those_of_every_name(thread: ListenerThread) -> None:
+def test_listeners_of_name_run_before_wildcard(thread: ListenerThread) -> None:
     observed, seen = HasObservers(thread), list[Any]()
 
     def every(*call: Any) -> None:
@@ -127,8 +125,8 @@ def test_listeners_of_a_name_come_before_those_of_every_name(thread: ListenerThr
     observed.add_attribute_listener("x", first)
     observed.add_attribute_listener("x", second)
     observed.add_attribute_listener("x", first)
-    told(observed, thread, 7)
-    told(observed, thread, 8, name="y")
+    notified(observed, thread, 7)
+    notified(observed, thread, 8, name="y")
     assert seen == [
         ("first", observed, "x", 7),
         ("second", observed, "x", 7),
@@ -137,7 +135,7 @@ def test_listeners_of_a_name_come_before_those_of_every_name(thread: ListenerThr
     ]
 
 
-def test_a_listener_that_removes_itself_does_not_cost_the_next_one(thread: ListenerThread) -> None:
+def test_listener_that_removes_itself_does_not_affect_next(thread: ListenerThread) -> None:
     observed, seen = HasObservers(thread), list[Any]()
 
     def once(_: Any, name: str, value: Any) -> None:
@@ -146,12 +144,12 @@ def test_a_listener_that_removes_itself_does_not_cost_the_next_one(thread: Liste
 
     observed.add_attribute_listener("x", once)
     observed.add_attribute_listener("x", lambda _, name, value: seen.append(("always", value)))
-    told(observed, thread, 1, 2)
+    notified(observed, thread, 1, 2)
     assert seen == [("once", 1), ("always", 1), ("always", 2)]
 
 
 @pytest.mark.parametrize("error", [ValueError("no"), SystemExit(1), KeyboardInterrupt()])
-def test_a_raising_listener_is_logged_and_the_others_run(
+def test_raising_listener_is_logged_and_others_run(
     thread: ListenerThread, caplog: pytest.LogCaptureFixture, error: BaseException
 ) -> None:
     observed, seen = HasObservers(thread), list[Any]()
@@ -161,7 +159,7 @@ def test_a_raising_listener_is_logged_and_the_others_run(
 
     observed.add_attribute_listener("heading", fail)
     observed.add_attribute_listener("heading", lambda _, name, value: seen.append(value))
-    told(observed, thread, 1, 2, name="heading")
+    notified(observed, thread, 1, 2, name="heading")
     assert seen == [1, 2]
     records = [each for each in caplog.records if each.levelno == logging.ERROR]
     assert [(each.name, each.message) for each in records] == [
@@ -170,16 +168,16 @@ def test_a_raising_listener_is_logged_and_the_others_run(
     assert records[0].exc_info is not None
 
 
-def test_cached_attributes_are_told_when_they_change(thread: ListenerThread) -> None:
+def test_cached_attributes_notify_on_change(thread: ListenerThread) -> None:
     observed, seen = HasObservers(thread), list[Any]()
     observed.add_attribute_listener("x", lambda _, name, value: seen.append(value))
-    told(observed, thread, False, False, True, True, False, cache=True)
+    notified(observed, thread, False, False, True, True, False, cache=True)
     assert seen == [False, True, False]
-    told(observed, thread, False, False)
+    notified(observed, thread, False, False)
     assert seen == [False, True, False, False, False]
 
 
-def test_removing(thread: ListenerThread) -> None:
+def test_listeners_can_be_removed(thread: ListenerThread) -> None:
     observed = HasObservers(thread)
 
     def listener(*_: Any) -> None:
@@ -196,7 +194,7 @@ def test_removing(thread: ListenerThread) -> None:
     observed.remove_attribute_listener("x", listener)
 
 
-def test_decorators_take_a_name_or_a_list(thread: ListenerThread) -> None:
+def test_listener_decorators_accept_name_or_list(thread: ListenerThread) -> None:
     observed, seen = HasObservers(thread), list[Any]()
 
     @observed.on_attribute(["x", "y"])
@@ -204,12 +202,12 @@ def test_decorators_take_a_name_or_a_list(thread: ListenerThread) -> None:
         seen.append((name, value))
 
     assert callable(listener)
-    told(observed, thread, 1)
-    told(observed, thread, 2, name="y")
+    notified(observed, thread, 1)
+    notified(observed, thread, 2, name="y")
     assert seen == [("x", 1), ("y", 2)]
 
 
-def test_notifying_waits_for_the_listeners_and_works_inside_one(thread: ListenerThread) -> None:
+def test_notify_waits_for_listeners_and_works_inside_one(thread: ListenerThread) -> None:
     observed, seen = HasObservers(thread), list[Any]()
 
     def outer(_: Any, name: str, value: Any) -> None:
@@ -225,21 +223,21 @@ def test_notifying_waits_for_the_listeners_and_works_inside_one(thread: Listener
     assert seen[2:] == [("inner", 5)]
 
 
-def test_without_a_thread_listeners_run_where_they_are_told() -> None:
+def test_listeners_without_thread_run_on_notifying_thread() -> None:
     observed, seen = HasObservers(), list[Any]()
     observed.add_attribute_listener("x", lambda *_: seen.append(threading.current_thread()))
     observed.notify_attribute_listeners("x", 1)
-    observed._dk_listeners.tell("x", 1)
+    observed._dk_listeners.notify("x", 1)
     assert seen == [threading.current_thread()] * 2
 
 
-def test_telling_nobody_does_not_start_the_thread() -> None:
+def test_notify_without_listeners_starts_no_thread() -> None:
     thread = ListenerThread("unused")
-    HasObservers(thread)._dk_listeners.tell("x", 1)
+    HasObservers(thread)._dk_listeners.notify("x", 1)
     assert all(each.name != "unused" for each in threading.enumerate())
 
 
-def test_a_blocked_listener_keeps_nobody_from_telling(thread: ListenerThread) -> None:
+def test_blocked_listener_does_not_block_notify(thread: ListenerThread) -> None:
     observed, may_go_on, seen = HasObservers(thread), threading.Event(), list[Any]()
 
     def block(_: Any, name: str, value: Any) -> None:
@@ -248,14 +246,14 @@ def test_a_blocked_listener_keeps_nobody_from_telling(thread: ListenerThread) ->
 
     observed.add_attribute_listener("x", block)
     for number in range(10):
-        observed._dk_listeners.tell("x", number)
+        observed._dk_listeners.notify("x", number)
     assert not seen
     may_go_on.set()
     emptied(thread)
     assert seen == list(range(10))
 
 
-def test_telling_listeners_never_waits_for_what_waits_for_it() -> None:
+def test_notify_does_not_deadlock() -> None:
     threads, met = (ListenerThread("one"), ListenerThread("two")), threading.Barrier(2)
     ended: list[str] = []
 
@@ -265,8 +263,7 @@ def test_telling_listeners_never_waits_for_what_waits_for_it() -> None:
 
     one, two = threads
     callers = [
-        threading.Thread(target=each.call, args=(meet_and_call, other))
-        for each, other in ((one, two), (two, one))
+        threading.Thread(target=each.call, args=(meet_and_call, other)) for each, other in ((one, two), (two, one))
     ]
     for caller in callers:
         caller.start()
@@ -274,11 +271,11 @@ def test_telling_listeners_never_waits_for_what_waits_for_it() -> None:
         caller.join(LIMIT_S)
         assert not caller.is_alive()
 
-    async def tell() -> None:
+    async def notify() -> None:
         one.call(ended.append, "from a coroutine")
 
     one.post(time.sleep, 0.05)
-    asyncio.run(tell())
+    asyncio.run(notify())
     for each in threads:
         each.call(lambda: None)
         each.stop()
@@ -286,7 +283,7 @@ def test_telling_listeners_never_waits_for_what_waits_for_it() -> None:
     assert ended == ["called", "called", "from a coroutine"]
 
 
-def test_listeners_added_from_many_threads_are_all_there() -> None:
+def test_listeners_added_from_many_threads_are_all_kept() -> None:
     observed = HasObservers()
     start = threading.Barrier(4)
 

@@ -1,4 +1,4 @@
-"""Calibrations, tunes, reboots and the request of capabilities: what is sent, and what is told of a refusal."""
+"""Calibrations, tunes, reboots and capability requests: messages and rejections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def stage() -> Iterator[Stage]:
         yield each
 
 
-def test_each_calibration_is_a_command(stage: Stage) -> None:
+def test_calibrations_send_commands(stage: Stage) -> None:
     vehicle = stage.vehicle
     orders: tuple[tuple[Callable[[], object], tuple[int, ...]], ...] = (
         (vehicle.send_calibrate_gyro, (CALIBRATION, 1, 0, 0, 0, 0, 0, 0)),
@@ -36,13 +36,13 @@ def test_each_calibration_is_a_command(stage: Stage) -> None:
         assert stage.commands_of(order) == [expected]
 
 
-def test_px4_calibrates_its_compasses_by_another_command() -> None:
+def test_compass_calibration_px4_uses_other_command() -> None:
     with on_stage(dronekit, {"autopilot": 12}, {"rate": None}) as stage:
         sent = stage.commands_of(stage.vehicle.send_calibrate_magnetometer)
         assert sent == [(CALIBRATION, 0, 1, 0, 0, 0, 0, 0)]
 
 
-def test_a_refused_calibration_is_a_warning_with_the_reason(stage: Stage) -> None:
+def test_rejected_calibration_is_a_warning_with_reason(stage: Stage) -> None:
     stage.fc.results[CALIBRATION] = FAILED
     stage.fc.reasons[CALIBRATION] = "Disarm to allow calibration"
     with stage.logged() as lines:
@@ -51,14 +51,14 @@ def test_a_refused_calibration_is_a_warning_with_the_reason(stage: Stage) -> Non
     assert [line for line in lines if "FAILED" in line and "Disarm to allow calibration" in line]
 
 
-def test_a_long_calibration_is_sent_once(stage: Stage) -> None:
+def test_long_calibration_is_sent_once(stage: Stage) -> None:
     stage.fc.results[CALIBRATION] = IN_PROGRESS
     since = stage.fc.mark()
     with stage.logged() as lines:
         stage.vehicle.send_calibrate_gyro()
         stage.fc.wait_for_command(CALIBRATION, since=since)
         stage.settle()
-        stage.tell("COMMAND_ACK", command=CALIBRATION, result=0)
+        stage.report("COMMAND_ACK", command=CALIBRATION, result=0)
         stage.vehicle._handler.calls.wait(10.0)
     assert len(stage.fc.commands(CALIBRATION, since=since)) == 1
     assert not [line for line in lines if line.startswith("WARNING")]
@@ -68,13 +68,9 @@ ONCE = [name for name in vars(maintenance.Maintenance) if name.startswith("send_
 
 
 @pytest.mark.parametrize("name", ONCE)
-def test_calibration_or_reboot_with_a_lost_answer_is_sent_once(
-    stage: Stage, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for limit in ("CALIBRATION_S", "REBOOT_S"):
-        monkeypatch.setattr(
-            maintenance, limit, 0.4
-        )  # eight heartbeats, after each of which it could be sent again
+def test_maintenance_with_lost_answer_is_sent_once(stage: Stage, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for limit in ("CALIBRATION_TIMEOUT_S", "REBOOT_TIMEOUT_S"):
+        monkeypatch.setattr(maintenance, limit, 0.4)  # eight heartbeats, after each of which it could be sent again
     stage.fc.results.update(dict.fromkeys((CALIBRATION, MAG_CALIBRATION, REBOOT)))
     since = stage.fc.mark()
     with stage.logged() as lines:
@@ -85,11 +81,11 @@ def test_calibration_or_reboot_with_a_lost_answer_is_sent_once(
     assert [line for line in lines if line.startswith("WARNING") and "COMMAND_ACK" in line]
 
 
-def test_reboot(stage: Stage) -> None:
+def test_reboot_sends_command(stage: Stage) -> None:
     assert stage.commands_of(stage.vehicle.reboot) == [(REBOOT, 1, 0, 0, 0, 0, 0, 0)]
 
 
-def test_the_request_of_capabilities_has_the_arguments_of_a_message_listener(stage: Stage) -> None:
+def test_send_capabilities_request_has_listener_arguments(stage: Stage) -> None:
     vehicle = stage.vehicle
     stage.reached()  # connecting asks for them, too
     for request in (vehicle.send_capabilities_request, vehicle.send_capabilties_request):
@@ -109,17 +105,17 @@ def played(stage: Stage, tune: str | bytes) -> tuple[str, str]:
     return sent.tune, sent.tune2
 
 
-def test_a_tune_is_text_or_bytes(stage: Stage) -> None:
+def test_play_tune_accepts_str_and_bytes(stage: Stage) -> None:
     assert played(stage, "AAAA") == ("AAAA", "")
     assert played(stage, b"MFT240L8 O4aO5dc\0") == ("MFT240L8 O4aO5dc", "")
 
 
-def test_a_long_tune_has_two_parts(stage: Stage) -> None:
+def test_long_tune_has_two_parts(stage: Stage) -> None:
     tune = "abcdefghij" * 23
     assert played(stage, tune) == (tune[:30], tune[30:])
 
 
-def test_what_is_no_tune_is_not_sent(stage: Stage) -> None:
+def test_invalid_tune_is_rejected(stage: Stage) -> None:
     wrong: tuple[tuple[Any, str], ...] = (
         ("A" * 231, "231 characters"),
         ("ä", "ASCII"),
@@ -137,7 +133,7 @@ def test_what_is_no_tune_is_not_sent(stage: Stage) -> None:
     assert stage.sent_by(play, "PLAY_TUNE") == []
 
 
-def test_mavlink_1_has_no_tunes() -> None:
+def test_play_tune_with_mavlink_1_raises() -> None:
     def prepare(controller: FlightController) -> None:
         controller.capabilities &= ~8192
 
@@ -147,7 +143,7 @@ def test_mavlink_1_has_no_tunes() -> None:
             stage.vehicle.play_tune("A")
 
 
-def test_after_closing_everything_raises(stage: Stage) -> None:
+def test_maintenance_after_close_raises(stage: Stage) -> None:
     vehicle = stage.vehicle
     vehicle.close()
     for order in (

@@ -1,4 +1,4 @@
-"""``message_factory`` and ``_master``: what programs use of pymavlink's objects."""
+"""``message_factory`` and ``_master``: the parts of pymavlink's objects that programs use."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LIMIT_S = 100.0
 
 
 class Sent(list[Any]):
-    """What a factory sent."""
+    """Messages sent by a factory."""
 
     def bytes(self) -> bytes:
         encoder = FrameEncoder(SYSTEM, COMPONENT)
@@ -69,7 +69,7 @@ def values_of(message_class: Any, randomness: random.Random, *, texts_as_str: bo
 # --------------------------------------------------------------------------------------- factory
 
 
-def test_every_message_is_made_and_sent_as_pymavlink_does(factory: MessageFactory, sent: Sent) -> None:
+def test_message_factory_matches_pymavlink(factory: MessageFactory, sent: Sent) -> None:
     randomness, golden = random.Random(1), Buffer()
     theirs = v20.MAVLink(golden, SYSTEM, COMPONENT)
     for message_class in v20.mavlink_map.values():
@@ -87,7 +87,7 @@ def test_every_message_is_made_and_sent_as_pymavlink_does(factory: MessageFactor
     assert (factory.seq, factory.total_packets_sent) == (theirs.seq, theirs.total_packets_sent)
 
 
-def test_arguments_of_mavlink_1_are_enough(factory: MessageFactory, sent: Sent) -> None:
+def test_message_factory_accepts_mavlink_1_arguments(factory: MessageFactory, sent: Sent) -> None:
     randomness, expected = random.Random(2), []
     for message_class in v10.mavlink_map.values():
         if message_class.id < 0:
@@ -103,7 +103,7 @@ def test_arguments_of_mavlink_1_are_enough(factory: MessageFactory, sent: Sent) 
     assert b"".join(encoder.encode(from_pymavlink(message)) for message in sent) == theirs.data
 
 
-def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None:
+def test_message_factory_accepts_floats_and_strings(factory: MessageFactory, sent: Sent) -> None:
     factory.mount_control_send(0, 1, -9050.4, 0.0, 1e3, 0)
     factory.param_set_send(1, 1, param_id="WPNAV_SPEED", param_value=500, param_type=9.0)
     factory.play_tune_send(1, 1, bytearray(b"CDE"))
@@ -115,7 +115,7 @@ def test_floats_and_texts_are_taken(factory: MessageFactory, sent: Sent) -> None
     assert text.to_dict()["text"] == "gr\u00fc\u00df"
 
 
-def test_wrong_values_are_found_when_they_are_sent(factory: MessageFactory) -> None:
+def test_message_factory_checks_values_on_send(factory: MessageFactory) -> None:
     message = factory.mission_set_current_encode(1, 1, None)
     with pytest.raises(InvalidArgument, match=r"MISSION_SET_CURRENT\.seq"):
         from_pymavlink(message)
@@ -127,7 +127,7 @@ def test_wrong_values_are_found_when_they_are_sent(factory: MessageFactory) -> N
         _ = factory.nothing_encode
 
 
-def test_messages_of_the_programs_own_dialect(
+def test_message_factory_uses_programs_dialect(
     monkeypatch: pytest.MonkeyPatch, factory: MessageFactory, sent: Sent
 ) -> None:
     name = next(c.msgname for i, c in sorted(storm32.mavlink_map.items()) if i not in v20.mavlink_map)
@@ -138,12 +138,12 @@ def test_messages_of_the_programs_own_dialect(
     assert [type(message) for message in sent] == [message_class]
 
 
-def test_who_it_is(factory: MessageFactory) -> None:
+def test_probably_vehicle_heartbeat(factory: MessageFactory) -> None:
     assert (factory.srcSystem, factory.srcComponent, factory.seq) == (SYSTEM, COMPONENT, 0)
-    told: list[Any] = []
-    factory.set_send_callback(lambda message, extra: told.append((message.get_type(), extra)), "extra")
+    notified: list[Any] = []
+    factory.set_send_callback(lambda message, extra: notified.append((message.get_type(), extra)), "extra")
     factory.ping_send(1, 2, 3, 4)
-    assert told == [("PING", "extra")]
+    assert notified == [("PING", "extra")]
 
 
 # ---------------------------------------------------------------------------------------- master
@@ -192,7 +192,7 @@ def connection() -> Iterator[MAVConnection]:
 def connected(
     connection: MAVConnection, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Master, Vehicle]]:
-    """With a vehicle that was heard: a copter with ArduPilot, if the test does not want another one."""
+    """A master with a known vehicle: an ArduPilot copter by default."""
     monkeypatch.setattr(mavutil, "mavlink", v20)  # whatever dialect other programs of this process have set
     kind = getattr(request, "param", (2, 3))
     assert connection.master.target_component == 0
@@ -215,7 +215,7 @@ def until(condition: Callable[[], bool]) -> None:
 Connected = tuple[Master, Vehicle]
 
 
-def test_what_master_says(connected: Connected) -> None:
+def test_master_properties(connected: Connected) -> None:
     master, vehicle = connected
     assert (master.target_system, master.target_component) == (1, 1)
     assert (master.mav.srcSystem, master.mav.srcComponent) == (255, 0)
@@ -234,7 +234,7 @@ def test_what_master_says(connected: Connected) -> None:
     assert master.motors_armed()
 
 
-def test_what_master_sends(connected: Connected) -> None:
+def test_master_sends_messages(connected: Connected) -> None:
     master, vehicle = connected
     for call, name, expected in (
         (lambda: master.arducopter_arm(), "COMMAND_LONG", {"command": 400, "param1": 1}),
@@ -264,7 +264,7 @@ def test_what_master_sends(connected: Connected) -> None:
         assert (message.get_srcSystem(), message.get_srcComponent()) == (255, 0)
 
 
-def test_nonsense_is_not_sent(connected: Connected) -> None:
+def test_message_factory_rejects_invalid_values(connected: Connected) -> None:
     master, vehicle = connected
     with pytest.raises(KeyError, match="NOPE"):
         master.set_mode("NOPE")
@@ -275,7 +275,7 @@ def test_nonsense_is_not_sent(connected: Connected) -> None:
 
 
 @pytest.mark.parametrize("connected", [(2, 12)], indirect=True)
-def test_modes_of_px4(connected: Connected) -> None:
+def test_mode_mapping_px4(connected: Connected) -> None:
     master, vehicle = connected
     assert master.mode_mapping() == mavutil.px4_map
     calls: list[Callable[[], None]] = [
@@ -288,7 +288,7 @@ def test_modes_of_px4(connected: Connected) -> None:
         assert (message.command, message.param1, message.param2, message.param3) == (176, 29, 6, 0)
 
 
-def test_a_mode_is_set_by_the_vehicle_if_there_is_one(connected: Connected) -> None:
+def test_master_set_mode_uses_vehicle(connected: Connected) -> None:
     class Known:
         mode: Any = None
 
@@ -304,7 +304,7 @@ def test_a_mode_is_set_by_the_vehicle_if_there_is_one(connected: Connected) -> N
 # ------------------------------------------------------------------------------------- receiving
 
 
-def test_messages_are_received_one_after_the_other(connected: Connected) -> None:
+def test_recv_match_returns_messages_in_order(connected: Connected) -> None:
     master, vehicle = connected
     assert master.recv_match(type="ATTITUDE") is None, "nothing was kept before the first question"
     for number in range(3):
@@ -321,7 +321,7 @@ def test_messages_are_received_one_after_the_other(connected: Connected) -> None
     assert master.recv_match(type="ATTITUDE", blocking=True, timeout=0.01) is None
 
 
-def test_a_heartbeat_is_waited_for(connected: Connected) -> None:
+def test_wait_heartbeat(connected: Connected) -> None:
     master, vehicle = connected
     found: list[Any] = []
     waiting = threading.Thread(target=lambda: found.append(master.wait_heartbeat()))
@@ -332,7 +332,7 @@ def test_a_heartbeat_is_waited_for(connected: Connected) -> None:
     assert found[0].get_srcSystem() == 1
 
 
-def test_the_last_message_of_every_type(connected: Connected) -> None:
+def test_master_messages_has_last_of_every_type(connected: Connected) -> None:
     master, vehicle = connected
     timer = threading.Timer(0.05, vehicle.mav.raw_imu_send, range(10))
     timer.start()
@@ -345,7 +345,7 @@ def test_the_last_message_of_every_type(connected: Connected) -> None:
     assert master.messages.get("NONSENSE") is None
 
 
-def test_closing_ends_the_waiting(connected: Connected) -> None:
+def test_recv_match_ends_on_close(connected: Connected) -> None:
     master, _ = connected
     ended: list[BaseException] = []
 
@@ -364,7 +364,7 @@ def test_closing_ends_the_waiting(connected: Connected) -> None:
         master.arducopter_arm()
 
 
-def test_the_port_is_there_to_be_closed(connected: Connected) -> None:
+def test_master_port_can_be_closed(connected: Connected) -> None:
     master, _ = connected
     master.port.close()
     with pytest.raises(APIException, match="closed"):

@@ -41,9 +41,7 @@ CLASSES: dict[int, Any] = {**development.mavlink_map, **v20.mavlink_map}
 IDS = sorted(message_id for message_id in CLASSES if message_id >= 0)
 
 
-def raw_frame(
-    message_id: int, payload: bytes, *, version: int = 2, sequence: int = 5, signature: bytes = b""
-) -> bytes:
+def raw_frame(message_id: int, payload: bytes, *, version: int = 2, sequence: int = 5, signature: bytes = b"") -> bytes:
     source = bytes((sequence, SYSTEM, COMPONENT))
     if version == 1:
         head = b"\xfe" + bytes((len(payload),)) + source + bytes((message_id,))
@@ -81,7 +79,7 @@ def said(message: Any) -> dict[str, Any]:
 
 
 def payloads(message_class: Any, randomness: random.Random) -> Iterator[bytes]:
-    """Full, trimmed, empty as far as it goes, and longer than what is known."""
+    """Payloads: full, trimmed, as empty as possible, and longer than the message."""
     size = message_class.unpacker.size
     full = randomness.randbytes(size)
     yield full
@@ -94,7 +92,7 @@ def payloads(message_class: Any, randomness: random.Random) -> Iterator[bytes]:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_every_message_is_decoded_as_pymavlink_does(version: int) -> None:
+def test_message_of_every_message_matches_pymavlink(version: int) -> None:
     randomness = random.Random(version)
     for message_id in IDS:
         if version == 1 and message_id > 255:
@@ -108,12 +106,12 @@ def test_every_message_is_decoded_as_pymavlink_does(version: int) -> None:
 
 
 @given(st.sampled_from(IDS), st.binary(min_size=1, max_size=255), st.binary(min_size=13, max_size=13))
-def test_any_payload_is_decoded_as_pymavlink_does(message_id: int, payload: bytes, signature: bytes) -> None:
+def test_message_of_any_payload_matches_pymavlink(message_id: int, payload: bytes, signature: bytes) -> None:
     for raw in (raw_frame(message_id, payload), raw_frame(message_id, payload, signature=signature)):
         assert said(message_of(Frame.parse(raw))) == said(decoded(raw))
 
 
-def test_a_frame_from_the_framer_is_decoded_too() -> None:
+def test_message_of_frame_from_framer() -> None:
     raw = raw_frame(30, random.Random(3).randbytes(27))
     (frame,) = Framer().receive(raw)
     message = message_of(frame)
@@ -123,7 +121,7 @@ def test_a_frame_from_the_framer_is_decoded_too() -> None:
     assert message._timestamp > 1e9
 
 
-def test_what_a_message_does_not_have() -> None:
+def test_message_missing_attribute_raises() -> None:
     message = message_of(Frame.parse(raw_frame(30, b"\1")))
     with pytest.raises(AttributeError, match="nonsense"):
         _ = message.nonsense
@@ -133,7 +131,7 @@ def test_what_a_message_does_not_have() -> None:
     assert message.roll == 3.0
 
 
-def test_copies_are_whole_and_plain() -> None:
+def test_messages_can_be_copied_and_pickled() -> None:
     raw = raw_frame(253, b"\6landing")
     message = message_of(Frame.parse(raw))
     message.extra = "kept"
@@ -146,7 +144,7 @@ def test_copies_are_whole_and_plain() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_message_nobody_knows(version: int) -> None:
+def test_message_of_unknown_message(version: int) -> None:
     message_id = 212 if version == 1 else 70_000
     raw = raw_frame(message_id, b"\1\2\3", version=version)
     message = message_of(Frame.parse(raw))
@@ -161,9 +159,7 @@ def test_a_message_nobody_knows(version: int) -> None:
 
 
 @pytest.mark.parametrize("dialect", [v10, v10_common, v20])
-def test_classes_are_ardupilotmegas_of_mavlink_2(
-    monkeypatch: pytest.MonkeyPatch, dialect: ModuleType
-) -> None:
+def test_message_classes_are_ardupilotmega_mavlink_2(monkeypatch: pytest.MonkeyPatch, dialect: ModuleType) -> None:
     environment = dict(os.environ)
     monkeypatch.setattr(mavutil, "mavlink", dialect)
     message = message_of(Frame.parse(raw_frame(30, b"\1")))
@@ -172,7 +168,7 @@ def test_classes_are_ardupilotmegas_of_mavlink_2(
     assert os.environ == environment
 
 
-def test_classes_are_those_of_the_programs_dialect(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_message_classes_follow_programs_dialect(monkeypatch: pytest.MonkeyPatch) -> None:
     frame = Frame.parse(raw_frame(30, b"\1"))
     monkeypatch.setattr(mavutil, "mavlink", common)
     assert isinstance(message_of(frame), common.MAVLink_attitude_message)
@@ -181,7 +177,7 @@ def test_classes_are_those_of_the_programs_dialect(monkeypatch: pytest.MonkeyPat
     assert isinstance(rangefinder, v20.MAVLink_rangefinder_message), "common has none"
 
 
-def test_a_message_of_the_programs_dialect_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_message_of_programs_dialect_only(monkeypatch: pytest.MonkeyPatch) -> None:
     message_id = foreign(storm32)[0]
     message_class = storm32.mavlink_map[message_id]
     monkeypatch.setitem(CLASSES, message_id, message_class)
@@ -208,11 +204,11 @@ def encoded(message: Any, *, version: int = 2, target_system: int | None = None)
 
 
 def arguments(message: Any) -> list[Any]:
-    """What makes this message again."""
+    """Return source code that creates this message."""
     return [getattr(message, f"_{name}_raw", getattr(message, name)) for name in message.fieldnames]
 
 
-def test_every_message_is_sent_as_pymavlink_packs_it() -> None:
+def test_send_mavlink_every_message_matches_pymavlink() -> None:
     randomness = random.Random(4)
     for message_id in IDS:
         module = v20 if message_id in v20.mavlink_map else development
@@ -225,7 +221,7 @@ def test_every_message_is_sent_as_pymavlink_packs_it() -> None:
             assert isinstance(from_pymavlink(message), STANDARD[message_id])
 
 
-def test_messages_of_mavlink_1_classes_go_out_in_both_versions() -> None:
+def test_send_mavlink_mavlink_1_classes_with_both_versions() -> None:
     randomness = random.Random(5)
     for message_id, message_class in sorted(v10.mavlink_map.items()):
         raw = raw_frame(message_id, randomness.randbytes(message_class.unpacker.size), version=1)
@@ -237,7 +233,7 @@ def test_messages_of_mavlink_1_classes_go_out_in_both_versions() -> None:
 
 
 def foreign(dialect: Any) -> list[int]:
-    """What this dialect has and the standard has not, or has otherwise."""
+    """Return messages that only this dialect has, or that differ from the standard."""
     rows = STANDARD.rows
     return [
         message_id
@@ -247,7 +243,7 @@ def foreign(dialect: Any) -> list[int]:
 
 
 @pytest.mark.parametrize("dialect", [storm32, matrixpilot])
-def test_messages_of_other_dialects(monkeypatch: pytest.MonkeyPatch, dialect: Any) -> None:
+def test_send_mavlink_other_dialects(monkeypatch: pytest.MonkeyPatch, dialect: Any) -> None:
     randomness = random.Random(6)
     assert foreign(dialect)
     for message_id in foreign(dialect):
@@ -258,7 +254,7 @@ def test_messages_of_other_dialects(monkeypatch: pytest.MonkeyPatch, dialect: An
         assert encoded(message) == packed(message, dialect)
 
 
-def test_the_target_is_written_into_the_programs_message() -> None:
+def test_send_mavlink_sets_target_in_message() -> None:
     message = v20.MAVLink_command_long_message(0, 17, 400, 0, 1, 0, 0, 0, 0, 0, 0)
     sent = from_pymavlink(message, 9)
     assert (type(sent), sent.ID) == (messages.CommandLong, 76)
@@ -269,22 +265,20 @@ def test_the_target_is_written_into_the_programs_message() -> None:
     assert sent.to_dict()["param1"] == 1, "changed after it was sent"
 
 
-def test_a_message_without_a_target_gets_none() -> None:
+def test_send_mavlink_without_target_field() -> None:
     message = v20.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
     from_pymavlink(message, 9)
     assert not hasattr(message, "target_system")
 
 
-def test_aerokits_own_messages() -> None:
+def test_send_mavlink_accepts_aerokit_messages() -> None:
     message = messages.CommandLong(0, 1, 400, 0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     sent = from_pymavlink(message, 9)
     assert (sent, message.target_system) == (messages.CommandLong(9, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0), 0)
-    assert encoded(messages.Heartbeat(6, 8, 0, 0, 0, 3)) == packed(
-        v20.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
-    )
+    assert encoded(messages.Heartbeat(6, 8, 0, 0, 0, 3)) == packed(v20.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
 
 
-def test_a_subclass_of_a_program() -> None:
+def test_send_mavlink_accepts_subclass() -> None:
     class Item(v10.MAVLink_mission_item_message):  # type: ignore[misc]
         def __init__(self, x: float, y: float, z: float) -> None:
             super().__init__(0, 0, 1, 3, 16, 0, 1, 0, 0, 0, 0, x, y, z)
@@ -294,7 +288,7 @@ def test_a_subclass_of_a_program() -> None:
     assert (sent.x, sent.y, sent.z, sent.mission_type) == (-35.5, 149.25, 30, 0)
 
 
-def test_anything_with_the_fields_of_a_message() -> None:
+def test_send_mavlink_accepts_objects_with_fields() -> None:
     class Ping:
         time_usec, seq, target_system, target_component = 1, 2, 0, 0
 
@@ -318,17 +312,15 @@ class Number:
     ("given", "expected"),
     [(3, 3), (3.0, 3), (2.6, 3), (-0.4, 0), (True, 1), (Number(), 3), (decimal.Decimal("2.7"), 3)],
 )
-def test_numbers_for_integer_fields_are_rounded(given: Any, expected: int) -> None:
+def test_send_mavlink_rounds_integer_fields(given: Any, expected: int) -> None:
     sent = from_pymavlink(v20.MAVLink_mission_set_current_message(1, 1, given))
     assert isinstance(sent, messages.MissionSetCurrent)
     assert sent.seq == expected
     assert type(sent.seq) is int
 
 
-def test_numbers_for_real_fields() -> None:
-    message = v20.MAVLink_command_long_message(
-        1, 1, 22, 0, True, Number(), decimal.Decimal("1.5"), 3, math.nan, 0, 0
-    )
+def test_send_mavlink_real_fields() -> None:
+    message = v20.MAVLink_command_long_message(1, 1, 22, 0, True, Number(), decimal.Decimal("1.5"), 3, math.nan, 0, 0)
     sent = from_pymavlink(message)
     assert isinstance(sent, messages.CommandLong)
     assert (sent.param1, sent.param2, sent.param3, sent.param4) == (1, 2.6, 1.5, 3)
@@ -336,20 +328,20 @@ def test_numbers_for_real_fields() -> None:
 
 
 @pytest.mark.parametrize("text", ["MFT240", b"MFT240", bytearray(b"MFT240\0\0"), "MFT240\0"])
-def test_texts_are_str_or_bytes(text: Any) -> None:
+def test_send_mavlink_accepts_str_and_bytes(text: Any) -> None:
     message = v20.MAVLink_play_tune_message(1, 1, b"")
     message.tune = text
     assert from_pymavlink(message) == messages.PlayTune(1, 1, "MFT240")
 
 
-def test_texts_that_are_no_utf_8_are_sent_as_they_are() -> None:
+def test_send_mavlink_keeps_non_utf_8_texts() -> None:
     message = v20.MAVLink_play_tune_message(1, 1, b"\xff\xfe")
     assert encoded(message) == packed(message)
     message.tune = "é"
     assert from_pymavlink(message) == messages.PlayTune(1, 1, "é")
 
 
-def test_arrays_take_any_sequence_and_are_filled_up() -> None:
+def test_send_mavlink_pads_arrays() -> None:
     for data in ([1, 2.0], (1, 2), b"\1\2", bytearray(b"\1\2"), range(1, 3), [True, 2.4]):
         message = v20.MAVLink_file_transfer_protocol_message(0, 1, 1, data)
         assert from_pymavlink(message) == messages.FileTransferProtocol(0, 1, 1, b"\1\2")
@@ -395,19 +387,19 @@ def tune(text: Any) -> Any:
             "q = .*5 elements, at most 4",
         ),
         (v20.MAVLink_set_attitude_target_message(0, 1, 1, 0, None, 0, 0, 0, 0), "q = None .*4 numbers"),
-        (v20.MAVLink_bad_data(b"\1", "noise"), "nothing that can be sent"),
-        (v20.MAVLink_unknown(70_000, b"\1"), "nothing that can be sent"),
-        ("COMMAND_LONG", "no MAVLink message"),
-        (None, "no MAVLink message"),
+        (v20.MAVLink_bad_data(b"\1", "noise"), "not a message that can be sent"),
+        (v20.MAVLink_unknown(70_000, b"\1"), "not a message that can be sent"),
+        ("COMMAND_LONG", "not a MAVLink message"),
+        (None, "not a MAVLink message"),
     ],
 )
-def test_nonsense_is_refused(message: Any, said: str) -> None:
+def test_send_mavlink_rejects_invalid_values(message: Any, said: str) -> None:
     with pytest.raises(InvalidArgument, match=said) as caught:
         from_pymavlink(message, 1)
     assert isinstance(caught.value, ValueError)
 
 
-def test_a_missing_field_is_named() -> None:
+def test_send_mavlink_names_missing_field() -> None:
     message = command()
     del message.param3
     with pytest.raises(InvalidArgument, match=r"COMMAND_LONG.param3 .*missing"):

@@ -1,4 +1,4 @@
-"""What comes of commands on the vehicle: items, home, jumps, the current one; on ArduPilot and PX4."""
+"""Missions on the vehicle: items, home, jumps and the current command, on ArduPilot and PX4."""
 
 from __future__ import annotations
 
@@ -45,21 +45,21 @@ def px4() -> Iterator[tuple[FlightController, Vehicle]]:
 # --------------------------------------------------------------------------------------- items
 
 
-def test_what_cannot_be_right_is_told_before_anything_is_sent(
+def test_upload_invalid_commands_sends_nothing(
     three: Pair,
 ) -> None:
     controller, cmds = three
     before = controller.mark()
     wrong: dict[str, Any] = {"x": 91.0, "y": "east", "param1": None, "frame": 99, "command": "go"}
-    told = ("latitude", "could not convert", "NoneType", "MAV_FRAME", "invalid literal")
-    for (field, value), text in zip(wrong.items(), told, strict=True):
+    notified = ("latitude", "could not convert", "NoneType", "MAV_FRAME", "invalid literal")
+    for (field, value), text in zip(wrong.items(), notified, strict=True):
         cmds[0] = waypoint(**{field: value})
         with pytest.raises(InvalidArgument, match=text):
             cmds.upload()
     assert transfers(controller, before) == []
 
 
-def test_places_go_out_in_full_precision_in_every_frame(
+def test_mission_positions_have_full_precision(
     empty: Pair,
 ) -> None:
     controller, cmds = empty
@@ -68,16 +68,14 @@ def test_places_go_out_in_full_precision_in_every_frame(
         cmds.add(waypoint(-35.12345675, frame, y=149.7654321, z=30))
     cmds.upload()
     sent = controller.received("MISSION_ITEM_INT")[-6:]
-    assert [(each.x, each.y, each.frame) for each in sent] == [
-        (-351234568, 1497654321, frame) for frame in frames
-    ]
+    assert [(each.x, each.y, each.frame) for each in sent] == [(-351234568, 1497654321, frame) for frame in frames]
     cmds.download()
     cmds.wait_ready()
     assert {(each.x, each.y) for each in cmds} == {(-35.1234568, 149.7654321)}
     assert [each.frame for each in cmds] == [0, 3, 10, 0, 3, 10]
 
 
-def test_numbers_that_are_no_places(empty: Pair) -> None:
+def test_mission_params_5_and_6_that_are_no_positions(empty: Pair) -> None:
     controller, cmds = empty
     cmds.add(waypoint(frame=1, x=1.5, y=-2.00005, param4=math.nan))
     cmds.add(waypoint(command=JUMP, param1=1, param2=3, x=0, y=0, z=0))
@@ -89,7 +87,7 @@ def test_numbers_that_are_no_places(empty: Pair) -> None:
     assert sent[1].param1 == 1  # home is 0
 
 
-def test_jumps_come_back_as_they_were_written(three: Pair) -> None:
+def test_mission_jumps_round_trip(three: Pair) -> None:
     _, cmds = three
     cmds.add(waypoint(command=JUMP, param1=2, param2=3, x=0, y=0, z=0))
     cmds.upload()
@@ -101,7 +99,7 @@ def test_jumps_come_back_as_they_were_written(three: Pair) -> None:
 # ----------------------------------------------------------------------------- home as first row
 
 
-def test_the_home_row_of_a_waypoint_file_is_not_flown_to(
+def test_home_row_of_waypoint_file_is_not_flown(
     three: Pair,
 ) -> None:
     controller, cmds = three
@@ -118,7 +116,7 @@ def test_the_home_row_of_a_waypoint_file_is_not_flown_to(
     assert kept(controller)[1:] == [(16, -35.5, 30.0), (16, -35.7, 30.0)]
 
 
-def test_other_first_commands_are_commands(three: Pair) -> None:
+def test_first_command_that_is_not_home(three: Pair) -> None:
     _, cmds = three
     for cmd in (
         waypoint(-35.3, 3, current=1),
@@ -136,9 +134,9 @@ def test_other_first_commands_are_commands(three: Pair) -> None:
 # ---------------------------------------------------------------------------------------- next
 
 
-def next_becomes(cmds: CommandSequence, number: int, tell: Callable[[], None]) -> bool:
+def next_becomes(cmds: CommandSequence, number: int, report: Callable[[], None]) -> bool:
     def is_next() -> bool:
-        tell()
+        report()
         return cmds.next == number
 
     return becomes(is_next)
@@ -153,45 +151,43 @@ def becomes(is_true: Callable[[], bool]) -> bool:
     return False
 
 
-def test_next_is_told_and_chosen(three: Pair) -> None:
+def test_next_is_read_and_set(three: Pair) -> None:
     controller, cmds = three
     cmds.next = 2
     assert controller.wait_for("MISSION_SET_CURRENT").seq == 2
     assert next_becomes(cmds, 2, lambda: None)
-    assert next_becomes(cmds, 3, lambda: controller.tell("MISSION_CURRENT", seq=3))
+    assert next_becomes(cmds, 3, lambda: controller.report("MISSION_CURRENT", seq=3))
     with pytest.raises(InvalidArgument, match="next = -1"):
         cmds.next = -1
     with pytest.raises(TypeError):
         cmds.next = "x"  # type: ignore[assignment]
 
 
-def test_next_is_chosen_by_command_where_the_message_is_not_heard(
-    three: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRMED_S", 0.3)
+def test_next_unconfirmed_message_is_followed_by_command(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRM_TIMEOUT_S", 0.3)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2
     assert controller.wait_for_command(224).param1 == 2
 
 
-def test_next_is_not_ordered_again_into_a_silence(
+def test_next_is_not_repeated_while_vehicle_is_silent(
     three: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRMED_S", 0.3)
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.KNOWN_S", 0.2)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRM_TIMEOUT_S", 0.3)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.MODE_MAX_AGE_S", 0.2)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     controller.heartbeat_s = None
     cmds.next = 2
-    assert becomes(lambda: "next = 2 is not confirmed" in caplog.text)
+    assert becomes(lambda: "next = 2 was not confirmed" in caplog.text)
     assert not controller.commands(224)
 
 
 # ---------------------------------------------------------------------------------------- PX4
 
 
-def test_px4_hides_nothing_and_counts_alike(px4: tuple[FlightController, Vehicle]) -> None:
+def test_mission_px4_indices_match_ardupilot(px4: tuple[FlightController, Vehicle]) -> None:
     controller, vehicle = px4
     cmds = vehicle.commands
     cmds.download()
@@ -203,30 +199,30 @@ def test_px4_hides_nothing_and_counts_alike(px4: tuple[FlightController, Vehicle
     assert next_becomes(cmds, 2, lambda: None)
 
 
-def test_on_px4_next_is_0_unless_it_flies_as_on_ardupilot(px4: tuple[FlightController, Vehicle]) -> None:
+def test_next_px4_is_0_unless_flying(px4: tuple[FlightController, Vehicle]) -> None:
     controller, vehicle = px4
     cmds = vehicle.commands
 
-    def tell(**fields: int) -> Callable[[], None]:
-        told: dict[str, Any] = {"total": 2, "mission_state": 3, **fields}
-        return lambda: controller.tell("MISSION_CURRENT", **told)
+    def report(**fields: int) -> Callable[[], None]:
+        values: dict[str, Any] = {"total": 2, "mission_state": 3, **fields}
+        return lambda: controller.report("MISSION_CURRENT", **values)
 
-    assert next_becomes(cmds, 2, tell(seq=1))
-    assert next_becomes(cmds, 0, tell(seq=0))
+    assert next_becomes(cmds, 2, report(seq=1))
+    assert next_becomes(cmds, 0, report(seq=0))
     cmds.next = 1
     assert next_becomes(cmds, 1, lambda: None)
-    assert next_becomes(cmds, 0, tell(seq=1, mission_state=5))
-    assert next_becomes(cmds, 2, tell(seq=1))
-    assert next_becomes(cmds, 0, tell(seq=1, total=65535))
+    assert next_becomes(cmds, 0, report(seq=1, mission_state=5))
+    assert next_becomes(cmds, 2, report(seq=1))
+    assert next_becomes(cmds, 0, report(seq=1, total=65535))
     controller.base_mode |= 128
     controller.beat()
-    assert next_becomes(cmds, 1, tell(seq=0))
+    assert next_becomes(cmds, 1, report(seq=0))
 
 
-def test_px4_is_given_what_ardupilot_works_out_by_itself(px4: tuple[FlightController, Vehicle]) -> None:
+def test_mission_px4_gets_explicit_positions(px4: tuple[FlightController, Vehicle]) -> None:
     controller, vehicle = px4
-    controller.tell("GLOBAL_POSITION_INT", lat=470000000, lon=85000000, alt=500000)
-    controller.tell("GPS_RAW_INT", fix_type=3, lat=470000000, lon=85000000)
+    controller.report("GLOBAL_POSITION_INT", lat=470000000, lon=85000000, alt=500000)
+    controller.report("GPS_RAW_INT", fix_type=3, lat=470000000, lon=85000000)
     vehicle.wait_ready("location", timeout=LIMIT_S)
     for cmd in (
         waypoint(0, command=TAKE_OFF, y=0),
@@ -248,7 +244,7 @@ def test_px4_is_given_what_ardupilot_works_out_by_itself(px4: tuple[FlightContro
 # ------------------------------------------------------------------------------------ the rest
 
 
-def test_the_waypoint_loader_counts_home(three: Pair) -> None:
+def test_waypoint_loader_counts_home(three: Pair) -> None:
     _, cmds = three
     vehicle: Any = cmds._vehicle
     loader = vehicle._wploader
@@ -262,7 +258,7 @@ def test_the_waypoint_loader_counts_home(three: Pair) -> None:
 # -------------------------------------------------------------------------- the simulated copter
 
 
-def test_a_long_mission_goes_to_the_simulated_copter_and_back() -> None:
+def test_long_mission_round_trip() -> None:
     with served_copter() as address, connect(address, rate=None) as vehicle:
         cmds = vehicle.commands
         cmds.clear()
@@ -284,7 +280,7 @@ def test_a_long_mission_goes_to_the_simulated_copter_and_back() -> None:
         assert str(vehicle.home_location).startswith("LocationGlobal:lat=-35.36326")
 
 
-def test_a_vehicle_that_takes_floats_holds_places_as_exactly_as_they_are() -> None:
+def test_mission_float_vehicle_keeps_precision() -> None:
     with connected(HOME, FIRST, version=1, capabilities=1) as (controller, vehicle):
         controller.missions.asks_int = False
         for latitude, longitude in ((-34.3, 149.1662345), (47.3977419, -178.545594)):
@@ -297,7 +293,7 @@ def test_a_vehicle_that_takes_floats_holds_places_as_exactly_as_they_are() -> No
         assert vehicle.commands[0].x == pytest.approx(47.3977419, abs=4e-6)
 
 
-def test_a_home_that_the_vehicle_refuses_is_not_its_home() -> None:
+def test_rejected_home_location_is_restored() -> None:
     with connected(HOME, FIRST) as (controller, vehicle):
         vehicle.wait_ready("home_location", timeout=LIMIT_S)
         before = str(vehicle.home_location)
@@ -306,9 +302,9 @@ def test_a_home_that_the_vehicle_refuses_is_not_its_home() -> None:
         vehicle.wait_for(lambda: str(vehicle.home_location) == before, timeout=LIMIT_S, interval=0.01)
 
 
-def test_next_is_sent_once_where_it_is_not_confirmed(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_next_without_confirmation_is_sent_once(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message that is not answered could be repeated against a pilot: the order that follows has an answer."""
-    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRMED_S", 2.5)
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.CONFIRM_TIMEOUT_S", 2.5)
     controller, cmds = three
     controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
     cmds.next = 2

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from aerokit.dronekit.line import BackgroundCalls
+from aerokit.dronekit.classic_connection import BackgroundCalls
 from aerokit.errors import ConnectionClosed
 from aerokit.sync.loop_thread import LoopThread
 
@@ -22,7 +22,7 @@ def loop() -> Iterator[LoopThread]:
     thread.close()
 
 
-def test_what_is_sent_keeps_the_order_of_the_calls(loop: LoopThread) -> None:
+def test_background_calls_send_in_call_order(loop: LoopThread) -> None:
     orders, sent = BackgroundCalls(loop), []
 
     async def send_and_wait(name: str) -> None:
@@ -30,7 +30,7 @@ def test_what_is_sent_keeps_the_order_of_the_calls(loop: LoopThread) -> None:
         await asyncio.sleep(0)
 
     for number in range(50):
-        orders.give(f"kind {number % 7}", send_and_wait, f"order {number}") if number % 3 else orders.post(
+        orders.start(f"kind {number % 7}", send_and_wait, f"order {number}") if number % 3 else orders.post(
             sent.append, f"message {number}"
         )
     orders.wait(LIMIT_S)
@@ -41,7 +41,7 @@ def test_what_is_sent_keeps_the_order_of_the_calls(loop: LoopThread) -> None:
     assert not replaced or all(any(later % 7 == n % 7 for later in range(n + 1, 50)) for n in replaced)
 
 
-def test_a_newer_order_of_a_kind_replaces_the_older_one(loop: LoopThread) -> None:
+def test_background_call_replaces_older_of_same_kind(loop: LoopThread) -> None:
     orders, ended = BackgroundCalls(loop), []
 
     async def for_ever(name: str) -> None:
@@ -53,9 +53,9 @@ def test_a_newer_order_of_a_kind_replaces_the_older_one(loop: LoopThread) -> Non
     async def soon() -> None:
         pass
 
-    first = orders.give("mode", for_ever, "mode")
-    other = orders.give("home", for_ever, "home")
-    second = orders.give("mode", soon)
+    first = orders.start("mode", for_ever, "mode")
+    other = orders.start("home", for_ever, "home")
+    second = orders.start("mode", soon)
     second.result(LIMIT_S)
     with pytest.raises(ConnectionClosed, match="mode: a newer order"):
         first.result(LIMIT_S)
@@ -63,13 +63,11 @@ def test_a_newer_order_of_a_kind_replaces_the_older_one(loop: LoopThread) -> Non
     assert "home" not in ended
 
 
-def test_a_failure_is_one_warning_and_in_the_future(
-    loop: LoopThread, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_background_call_failure_is_logged_and_in_future(loop: LoopThread, caplog: pytest.LogCaptureFixture) -> None:
     async def fail() -> None:
         raise ValueError("the vehicle said no")
 
-    future = BackgroundCalls(loop).give("arm", fail)
+    future = BackgroundCalls(loop).start("arm", fail)
     with pytest.raises(ValueError, match="said no"):
         future.result(LIMIT_S)
     assert [(each.name, each.levelname, each.message) for each in caplog.records] == [
@@ -77,28 +75,28 @@ def test_a_failure_is_one_warning_and_in_the_future(
     ]
 
 
-def test_orders_end_with_the_loop(loop: LoopThread) -> None:
+def test_background_calls_end_with_loop(loop: LoopThread) -> None:
     async def for_ever() -> None:
         await asyncio.sleep(1000)
 
     orders = BackgroundCalls(loop)
-    future = orders.give("mode", for_ever)
+    future = orders.start("mode", for_ever)
     loop.close()
     done, _ = concurrent.futures.wait([future], LIMIT_S)
     assert done
     assert isinstance(future.exception(), ConnectionClosed)
     with pytest.raises(ConnectionClosed):
-        orders.give("mode", for_ever)
+        orders.start("mode", for_ever)
     with pytest.raises(ConnectionClosed):
         orders.post(print)
     orders.wait(0.0)
 
 
-def test_waiting_for_the_end_is_bounded(loop: LoopThread) -> None:
+def test_background_calls_wait_is_bounded(loop: LoopThread) -> None:
     async def for_ever() -> None:
         await asyncio.sleep(1000)
 
     orders = BackgroundCalls(loop)
-    future = orders.give("mode", for_ever)
+    future = orders.start("mode", for_ever)
     orders.wait(0.01)
     assert not future.done()

@@ -1,4 +1,4 @@
-"""``vehicle.parameters``: the mapping, setting, listening, waiting, and what goes wrong."""
+"""``vehicle.parameters``: the mapping, setting, listeners, waiting and failures."""
 
 from __future__ import annotations
 
@@ -44,44 +44,39 @@ def vehicle(fc: FlightController) -> Iterator[dronekit.Vehicle]:
         yield each
 
 
-def heard(vehicle: dronekit.Vehicle) -> None:
-    """All listeners have been told of what came before."""
+def wait_for_listeners(vehicle: dronekit.Vehicle) -> None:
+    """Wait until all listeners have run."""
     vehicle._handler.loop.call(lambda: None)
     done = threading.Event()
     vehicle._handler.listener_thread.post(done.set)
     assert done.wait(LIMIT_S)
 
 
-def told(vehicle: dronekit.Vehicle, fc: FlightController, name: str, value: float, **more: Any) -> None:
-    """The flight controller says a value, and that has been taken."""
+def notified(vehicle: dronekit.Vehicle, fc: FlightController, name: str, value: float, **more: Any) -> None:
+    """Send a value from the flight controller and wait until it is stored."""
     seen = threading.Event()
 
     def listener(*_: Any) -> None:
         seen.set()
 
     vehicle.add_message_listener("DEBUG", listener)
-    heard(vehicle)
+    wait_for_listeners(vehicle)
     fc.parameters.values[name] = value
-    fc.parameters.tell(name, **more)
-    fc.tell("DEBUG", ind=1)
+    fc.parameters.report(name, **more)
+    fc.report("DEBUG", ind=1)
     assert seen.wait(LIMIT_S)
     vehicle.remove_message_listener("DEBUG", listener)
-    heard(vehicle)
+    wait_for_listeners(vehicle)
 
 
 # ------------------------------------------------------------------------------------ the mapping
 
 
-def test_the_faces_of_a_mapping(vehicle: dronekit.Vehicle) -> None:
+def test_parameters_mapping_methods(vehicle: dronekit.Vehicle) -> None:
     parameters = vehicle.parameters
     expected = {"FOO": 1.0, "BAR": 2.5, "THR_MIN": 130.0}
     assert dict(parameters) == expected == dict(parameters.items()) == dict(parameters.iteritems())
-    assert (
-        list(parameters.keys())
-        == list(parameters.iterkeys())
-        == list(parameters.viewkeys())
-        == list(expected)
-    )
+    assert list(parameters.keys()) == list(parameters.iterkeys()) == list(parameters.viewkeys()) == list(expected)
     assert list(parameters.values()) == list(parameters.itervalues()) == list(parameters.viewvalues())
     assert parameters.viewitems() == expected.items()
     assert ("foo", 1.0) in parameters.items()
@@ -94,7 +89,7 @@ def test_the_faces_of_a_mapping(vehicle: dronekit.Vehicle) -> None:
     assert vehicle._params_map == expected
 
 
-def test_get_takes_no_default_as_its_second_argument(vehicle: dronekit.Vehicle) -> None:
+def test_parameters_get_second_argument_is_not_default(vehicle: dronekit.Vehicle) -> None:
     assert vehicle.parameters.get("NOPE", 5) is None
     assert vehicle.parameters.get("NOPE", default=5) == 5
     assert vehicle.parameters.get("foo", False) == 1.0
@@ -104,7 +99,7 @@ def test_get_takes_no_default_as_its_second_argument(vehicle: dronekit.Vehicle) 
         vehicle.parameters["a_name_that_no_message_can_carry"]
 
 
-def test_nothing_can_be_deleted(vehicle: dronekit.Vehicle) -> None:
+def test_parameters_cannot_be_deleted(vehicle: dronekit.Vehicle) -> None:
     parameters = vehicle.parameters
     with pytest.raises(dronekit.APIException, match=r"^Cannot delete value from parameters list\.$"):
         del parameters["FOO"]
@@ -117,10 +112,10 @@ def test_nothing_can_be_deleted(vehicle: dronekit.Vehicle) -> None:
     assert len(parameters) == 3
 
 
-def test_iterating_goes_on_while_parameters_come(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
+def test_parameters_iterate_during_download(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     names, items = iter(vehicle.parameters), iter(vehicle.parameters.items())
     assert (next(names), next(items)) == ("FOO", ("FOO", 1.0))
-    told(vehicle, fc, "NEW", 5.0)
+    notified(vehicle, fc, "NEW", 5.0)
     assert len(list(names)) == len(list(items)) == 2
     assert len(vehicle.parameters) == 4
 
@@ -128,9 +123,7 @@ def test_iterating_goes_on_while_parameters_come(vehicle: dronekit.Vehicle, fc: 
 # ---------------------------------------------------------------------------------------- setting
 
 
-def test_integers_go_as_integers_and_fractions_are_cut_off(
-    vehicle: dronekit.Vehicle, fc: FlightController
-) -> None:
+def test_integer_parameters_cut_off_fractions(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     parameters = vehicle.parameters
     parameters["thr_min"] = 99.7
     assert parameters["THR_MIN"] == 99.0
@@ -144,12 +137,10 @@ def test_integers_go_as_integers_and_fractions_are_cut_off(
     assert ("BAR", 8.0, 9) in sent
 
 
-def test_the_value_that_it_has_already_is_confirmed_too(
-    vehicle: dronekit.Vehicle, fc: FlightController
-) -> None:
+def test_parameter_set_unchanged_value_is_confirmed(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     assert vehicle.parameters.set("FOO", 1)
     fc.wait_for("PARAM_SET")
-    fc.parameters.values["FOO"] = 2.0  # and nobody was told
+    fc.parameters.values["FOO"] = 2.0  # without a message
     assert vehicle.parameters.set("FOO", 1)
     assert fc.parameters.values["FOO"] == 1.0
 
@@ -165,7 +156,7 @@ def test_the_value_that_it_has_already_is_confirmed_too(
         ("FOO", float("nan"), "FOO to nan: "),
     ],
 )
-def test_what_the_vehicle_does_not_take_is_false_and_an_error_in_the_log(
+def test_rejected_parameter_returns_false_and_logs_error(
     vehicle: dronekit.Vehicle,
     fc: FlightController,
     caplog: pytest.LogCaptureFixture,
@@ -184,17 +175,15 @@ def test_what_the_vehicle_does_not_take_is_false_and_an_error_in_the_log(
 
 
 @pytest.mark.parametrize("value", ["1", None, [1]])
-def test_what_is_no_number_is_a_mistake_of_the_program(
-    vehicle: dronekit.Vehicle, fc: FlightController, value: Any
-) -> None:
-    with pytest.raises(ValueError, match=r"FOO = .* is no number"):
+def test_parameter_set_non_number_raises(vehicle: dronekit.Vehicle, fc: FlightController, value: Any) -> None:
+    with pytest.raises(ValueError, match=r"FOO = .* is not a number"):
         vehicle.parameters["FOO"] = value
-    with pytest.raises(ValueError, match="is no text"):
+    with pytest.raises(ValueError, match="is not a string"):
         vehicle.parameters.set(5, 5)  # type: ignore[arg-type]
     assert not fc.received("PARAM_SET")
 
 
-def test_numbers_of_other_libraries(vehicle: dronekit.Vehicle) -> None:
+def test_parameters_accept_numpy_numbers(vehicle: dronekit.Vehicle) -> None:
     class Float:
         def __float__(self) -> float:
             return 4.5
@@ -209,14 +198,14 @@ def test_numbers_of_other_libraries(vehicle: dronekit.Vehicle) -> None:
     assert vehicle.parameters["FOO"] == 4.0
 
 
-def test_without_retries_nobody_waits(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
+def test_parameter_set_without_retries_returns_immediately(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     assert vehicle.parameters.set("FOO", 6, retries=0) is False
     fc.wait_for("PARAM_SET", lambda frame: frame.param_value == 6)
     vehicle.close()
     assert vehicle.parameters["FOO"] == 6.0
 
 
-def test_setting_from_a_listener(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
+def test_parameter_set_in_listener(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     results: list[object] = []
     done = threading.Event()
 
@@ -225,7 +214,7 @@ def test_setting_from_a_listener(vehicle: dronekit.Vehicle, fc: FlightController
         done.set()
 
     vehicle.parameters.add_attribute_listener("BAR", listener)
-    told(vehicle, fc, "BAR", 30.0)
+    notified(vehicle, fc, "BAR", 30.0)
     assert done.wait(LIMIT_S)
     assert results == [("BAR", 30.0, True, 31.0)]
 
@@ -233,14 +222,14 @@ def test_setting_from_a_listener(vehicle: dronekit.Vehicle, fc: FlightController
 # -------------------------------------------------------------------------------------- listening
 
 
-def test_every_parameter_is_told_once_and_then_that_all_are_there(fc: FlightController) -> None:
+def test_parameter_listeners_are_called_once_per_parameter(fc: FlightController) -> None:
     with connected(fc, _initialize=False) as vehicle:
         seen: list[tuple[object, str, object]] = []
         vehicle.parameters.add_attribute_listener("*", lambda *event: seen.append(event))
         vehicle.add_attribute_listener("parameters", lambda *event: seen.append(event))
         vehicle.initialize(rate=None)
         vehicle.parameters.wait_ready()
-        heard(vehicle)
+        wait_for_listeners(vehicle)
         parameters = vehicle.parameters
         assert seen[:-1] == [
             (parameters, "FOO", 1.0),
@@ -248,15 +237,13 @@ def test_every_parameter_is_told_once_and_then_that_all_are_there(fc: FlightCont
             (parameters, "THR_MIN", 130.0),
         ]
         assert seen[-1] == (vehicle, "parameters", parameters)
-        told(vehicle, fc, "FOO", 1.0)
+        notified(vehicle, fc, "FOO", 1.0)
         assert len(seen) == 4
-        told(vehicle, fc, "FOO", 2.0)
+        notified(vehicle, fc, "FOO", 2.0)
         assert seen[4:] == [(parameters, "FOO", 2.0)]
 
 
-def test_names_of_listeners_are_upper_cased_and_may_be_a_list(
-    vehicle: dronekit.Vehicle, fc: FlightController
-) -> None:
+def test_parameter_listener_names_are_upper_cased(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     seen: list[str] = []
     parameters = vehicle.parameters
 
@@ -264,10 +251,10 @@ def test_names_of_listeners_are_upper_cased_and_may_be_a_list(
     def listener(_: object, name: str, value: float) -> None:
         seen.append(name)
 
-    told(vehicle, fc, "FOO", 2.0)
-    told(vehicle, fc, "BAR", 2.0)
+    notified(vehicle, fc, "FOO", 2.0)
+    notified(vehicle, fc, "BAR", 2.0)
     parameters.remove_attribute_listener("bar", listener)
-    told(vehicle, fc, "BAR", 3.0)
+    notified(vehicle, fc, "BAR", 3.0)
     assert seen == ["FOO", "BAR"]
     parameters.notify_attribute_listeners("foo", 17.0)
     parameters.notify_attribute_listeners("foo", 17.0)
@@ -277,16 +264,14 @@ def test_names_of_listeners_are_upper_cased_and_may_be_a_list(
     assert seen == ["FOO", "BAR", *["FOO"] * 3]
 
 
-def test_the_decorators_argument_is_called_as_with_dronekit(
-    vehicle: dronekit.Vehicle, fc: FlightController
-) -> None:
+def test_parameter_decorator_argument_name(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     seen: list[str] = []
     vehicle.parameters.on_attribute(attr_name="foo")(lambda _, name, value: seen.append(name))
-    told(vehicle, fc, "FOO", 2.0)
+    notified(vehicle, fc, "FOO", 2.0)
     assert seen == ["FOO"]
 
 
-def test_names_of_the_dronekit_years_are_found_on_newer_firmware(fc: FlightController) -> None:
+def test_old_parameter_names_work_on_new_firmware(fc: FlightController) -> None:
     fc.parameters.values = {"LOIT_SPEED": 500.0, "MOT_SPIN_MIN": 0.125, "GPS1_TYPE": 1.0}
     with connected(fc, wait_ready=["parameters"]) as vehicle:
         for name, value, new in [
@@ -303,27 +288,27 @@ def test_names_of_the_dronekit_years_are_found_on_newer_firmware(fc: FlightContr
             vehicle.parameters["FLOW_ENABLE"]
 
 
-def test_without_listeners_nothing_is_queued(fc: FlightController) -> None:
+def test_parameters_without_listeners_queue_nothing(fc: FlightController) -> None:
     with connected(fc, wait_ready=["parameters"]) as vehicle:
         assert vehicle._handler.listener_thread._thread is None
 
 
-def test_parameters_of_others_do_not_count(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
+def test_parameters_of_other_components_are_ignored(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     own = dict(vehicle.parameters)
-    told(vehicle, fc, "FOO", 66.0, source=(1, 154), param_count=900)
-    told(vehicle, fc, "FOO", 67.0, source=(42, 1))
-    told(vehicle, fc, "ZOOM", 68.0, source=(1, 154))
+    notified(vehicle, fc, "FOO", 66.0, source=(1, 154), param_count=900)
+    notified(vehicle, fc, "FOO", 67.0, source=(42, 1))
+    notified(vehicle, fc, "ZOOM", 68.0, source=(1, 154))
     assert dict(vehicle.parameters) == own
 
 
 # ---------------------------------------------------------------------------------------- waiting
 
 
-def test_one_is_read_without_waiting_for_the_list(fc: FlightController) -> None:
+def test_single_parameter_is_read_before_list_completes(fc: FlightController) -> None:
 
     def only_by_name(frame: Received) -> None:
         if frame.param_id:
-            fc.parameters.tell(frame.param_id)
+            fc.parameters.report(frame.param_id)
 
     fc.answers["PARAM_REQUEST_LIST"] = lambda _: None
     fc.answers["PARAM_REQUEST_READ"] = only_by_name
@@ -335,16 +320,14 @@ def test_one_is_read_without_waiting_for_the_list(fc: FlightController) -> None:
         assert not vehicle.wait_ready("parameters", timeout=0.05, raise_exception=False)
 
 
-def test_a_vehicle_without_parameters(fc: FlightController, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameters_module, "READY_S", 0.2)
+def test_vehicle_without_parameters(fc: FlightController, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parameters_module, "WAIT_TIMEOUT_S", 0.2)
     fc.parameters.is_silent = True
     with connected(fc, wait_ready=False) as vehicle:
         parameters = vehicle.parameters
         assert len(parameters) == 0
         assert parameters.get("FOO", wait_ready=False) is None
-        with pytest.raises(
-            dronekit.TimeoutError, match=r"^wait_ready experienced a timeout after 0 seconds\.$"
-        ):
+        with pytest.raises(dronekit.TimeoutError, match=r"^wait_ready experienced a timeout after 0 seconds\.$"):
             parameters["FOO"]
         with pytest.raises(TimeoutError, match=r"^wait_ready experienced a timeout after 0.1 seconds\.$"):
             parameters.wait_ready(timeout=0.1)
@@ -353,10 +336,10 @@ def test_a_vehicle_without_parameters(fc: FlightController, monkeypatch: pytest.
         assert parameters["FOO"] == 1.0
 
 
-def test_a_download_that_failed_is_begun_again_by_who_waits(
+def test_failed_parameter_download_is_repeated_while_waiting(
     fc: FlightController, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("aerokit.dronekit.parameters.AGAIN_S", 0.01)
+    monkeypatch.setattr("aerokit.dronekit.parameters.RETRY_DELAY_S", 0.01)
     download, attempts = AsyncParameters.download, []
 
     async def fail_twice(parameters: AsyncParameters, **options: Any) -> Any:
@@ -373,7 +356,7 @@ def test_a_download_that_failed_is_begun_again_by_who_waits(
     assert lines == ["the parameters could not be downloaded: 2 of 3 parameters are missing"]
 
 
-def test_reading_waits_for_the_list_when_one_is_not_answered(fc: FlightController) -> None:
+def test_unanswered_parameter_waits_for_list(fc: FlightController) -> None:
     fc.answers["PARAM_REQUEST_READ"] = lambda _: None
     with connected(fc) as vehicle:
         assert vehicle.parameters["THR_MIN"] == 130.0
@@ -381,18 +364,16 @@ def test_reading_waits_for_the_list_when_one_is_not_answered(fc: FlightControlle
         assert vehicle.parameters._reading.is_complete
 
 
-def test_parameters_that_appear_later(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
+def test_parameters_added_later_are_found(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     assert "NEW" not in vehicle.parameters
     fc.parameters.values["NEW"] = 5.0
-    assert vehicle.parameters.set("FOO", 3)  # its answer says that there are four now
+    assert vehicle.parameters.set("FOO", 3)  # the answer contains a count of four
     assert vehicle.parameters["new"] == 5.0
     assert "NOPE" not in vehicle.parameters
 
 
-def test_what_is_known_outlives_reboot_and_connection(
-    vehicle: dronekit.Vehicle, fc: FlightController
-) -> None:
-    vehicle._handler.loop.call(vehicle.aio._talk._note_reboot)
+def test_parameters_survive_reboot_and_lost_link(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
+    vehicle._handler.loop.call(vehicle.aio._session._on_reboot)
     parameters = vehicle.parameters
     assert parameters["FOO"] == 1.0
     assert parameters.set("FOO", 2)
@@ -404,7 +385,7 @@ def test_what_is_known_outlives_reboot_and_connection(
         parameters["FOO"] = 3
 
 
-def test_before_the_vehicle_was_found(fc: FlightController) -> None:
+def test_parameters_before_connecting_raise(fc: FlightController) -> None:
     with connected(fc, _initialize=False) as vehicle:
         assert vehicle.parameters.get("FOO", False) is None
         assert len(vehicle.parameters) == 0
@@ -422,7 +403,7 @@ def copter() -> SimulatedCopter:
     return SimulatedCopter(boot_time_s=0.0)
 
 
-def test_all_of_a_copter(copter: SimulatedCopter) -> None:
+def test_parameters_of_simulated_copter(copter: SimulatedCopter) -> None:
     with served([copter]) as address, dronekit.connect(address, wait_ready=["parameters"]) as vehicle:
         parameters = vehicle.parameters
         assert dict(parameters) == {name: float(copter.parameters[name]) for name in copter.parameters}
@@ -432,7 +413,7 @@ def test_all_of_a_copter(copter: SimulatedCopter) -> None:
         assert copter.parameters["RTL_ALT"] == parameters["RTL_ALT"] == 3000
 
 
-def test_names_of_another_firmware_are_converted(copter: SimulatedCopter) -> None:
+def test_renamed_parameters_are_converted(copter: SimulatedCopter) -> None:
     own, other, factor = ("WPNAV_SPEED", "WP_SPD", 0.01)
     if own not in copter.parameters:
         own, other, factor = other, own, 100.0
@@ -448,24 +429,22 @@ def test_names_of_another_firmware_are_converted(copter: SimulatedCopter) -> Non
         assert other not in list(parameters)
 
 
-def test_a_download_of_the_program_itself_is_noticed(copter: SimulatedCopter) -> None:
+def test_parameters_include_download_by_aio(copter: SimulatedCopter) -> None:
     with served([copter]) as address, dronekit.connect(address, wait_ready=["parameters"]) as vehicle:
         seen: list[object] = []
         vehicle.parameters.add_attribute_listener("RTL_ALT", lambda *event: seen.append(event))
         copter.parameters["RTL_ALT"] = 4321.0
         vehicle.run(vehicle.aio.parameters.download, refresh=True)
-        heard(vehicle)
+        wait_for_listeners(vehicle)
         assert vehicle.parameters["RTL_ALT"] == 4321.0
         assert seen == [(vehicle.parameters, "RTL_ALT", 4321.0)]
 
 
-def test_integers_of_px4() -> None:
+def test_px4_integer_parameters() -> None:
     px4 = SimulatedPx4()
     with (
         start_blocking_portal() as portal,
-        portal.wrap_async_context_manager(
-            open_simulator([px4], "tcpin:127.0.0.1:0", speedup=20.0)
-        ) as simulator,
+        portal.wrap_async_context_manager(open_simulator([px4], "tcpin:127.0.0.1:0", speedup=20.0)) as simulator,
     ):
         address = simulator.addresses[0].replace("tcpin:", "tcp:")
         with dronekit.connect(address, wait_ready=["parameters"]) as vehicle:

@@ -21,14 +21,14 @@ def stage() -> Iterator[Stage]:
         yield each
 
 
-def test_state(stage: Stage) -> None:
+def test_privates_state(stage: Stage) -> None:
     vehicle = stage.vehicle
     assert [getattr(vehicle, name) for name in UNKNOWN] == [None] * len(UNKNOWN)
-    stage.tell("ATTITUDE", roll=1.0, pitch=2.0, yaw=3.0, **SPEEDS)
-    stage.tell("VFR_HUD", airspeed=4.0, groundspeed=5.0, heading=271)
-    stage.tell("SYS_STATUS", voltage_battery=12587, current_battery=150, battery_remaining=80)
-    stage.tell("GPS_RAW_INT", fix_type=3, eph=121, epv=200, satellites_visible=10)
-    stage.tell(
+    stage.report("ATTITUDE", roll=1.0, pitch=2.0, yaw=3.0, **SPEEDS)
+    stage.report("VFR_HUD", airspeed=4.0, groundspeed=5.0, heading=271)
+    stage.report("SYS_STATUS", voltage_battery=12587, current_battery=150, battery_remaining=80)
+    stage.report("GPS_RAW_INT", fix_type=3, eph=121, epv=200, satellites_visible=10)
+    stage.report(
         "GLOBAL_POSITION_INT",
         lat=-35 * 10**7,
         lon=149 * 10**7,
@@ -49,7 +49,7 @@ def test_state(stage: Stage) -> None:
     assert location._north is vehicle.gimbal._pitch is None
 
 
-def test_the_link_is_watched(stage: Stage) -> None:
+def test_privates_heartbeat(stage: Stage) -> None:
     """``if vehicle._heartbeat_timeout: land()``: a flag, whatever the limit is."""
     vehicle = stage.vehicle
     assert vehicle._heartbeat_timeout is False
@@ -59,7 +59,7 @@ def test_the_link_is_watched(stage: Stage) -> None:
     assert 0 <= vehicle._last_heartbeat < 60
 
 
-def test_transfers(stage: Stage) -> None:
+def test_privates_transfers(stage: Stage) -> None:
     vehicle = stage.vehicle
     vehicle.wait_ready("parameters")
     assert vehicle._params_count == len(vehicle._params_map) > 0
@@ -70,44 +70,44 @@ def test_transfers(stage: Stage) -> None:
     assert vehicle._mode_mapping_bynumber[4] == "GUIDED"
 
 
-def test_own_ids(stage: Stage) -> None:
+def test_privates_own_ids(stage: Stage) -> None:
     assert (stage.vehicle._master.source_system, stage.vehicle._master.source_component) == (255, 0)
 
 
-def test_a_subclass_may_have_its_own(stage: Stage) -> None:
+def test_privates_subclass_may_override(stage: Stage) -> None:
     stage.vehicle._yaw = "mine"
-    stage.tell("ATTITUDE", yaw=3.0)
+    stage.report("ATTITUDE", yaw=3.0)
     assert stage.vehicle._yaw == "mine"
     assert stage.vehicle.attitude.yaw == 3
 
 
-def test_types_are_written_by_programs(stage: Stage) -> None:
+def test_privates_can_be_assigned(stage: Stage) -> None:
     """DroneKit's own tests do, with those of a ground station."""
     stage.vehicle._vehicle_type, stage.vehicle._autopilot_type = 6, 8
     assert stage.vehicle._is_mode_available(0) in (True, False)
     assert str(stage.vehicle.version).startswith("UnknownAutoPilotUnknownVehicleType6-")
 
 
-def test_what_master_knows_of_messages_and_parameters(stage: Stage) -> None:
+def test_privates_master_messages_and_parameters(stage: Stage) -> None:
     master = stage.vehicle._master
     stage.vehicle.wait_ready("parameters")
     assert (master.param("FOO"), master.param("foo", 7), master.param("NOPE", 7)) == (1.0, 1.0, 7)
     assert master.field("ATTITUDE", "yaw", 5) == 5
     assert master.time_since("VFR_HUD") >= 0
-    stage.tell("ATTITUDE", yaw=0.25)
+    stage.report("ATTITUDE", yaw=0.25)
     assert master.field("ATTITUDE", "yaw") == 0.25
     assert master.field("ATTITUDE", "nonsense", 5) == 5
     assert 0 <= master.time_since("ATTITUDE") <= master.time_since("VFR_HUD")
 
 
 @pytest.mark.parametrize(("is_relative", "alt"), [(False, 600.0), (True, 16.5)])
-def test_where_master_says_it_is(stage: Stage, is_relative: bool, alt: float) -> None:
+def test_privates_master_location(stage: Stage, is_relative: bool, alt: float) -> None:
     found: list[Any] = []
     asking = threading.Thread(target=lambda: found.append(stage.vehicle._master.location(is_relative)))
     asking.start()
-    while asking.is_alive():  # what was said before the question does not count
-        stage.tell("GPS_RAW_INT", fix_type=2, lat=1, lon=1)
-        stage.tell("GPS_RAW_INT", fix_type=3, lat=-350000000, lon=1490000000)
-        stage.tell("VFR_HUD", alt=600.0, heading=271)
-        stage.tell("GLOBAL_POSITION_INT", relative_alt=16500)
+    while asking.is_alive():  # earlier messages do not count
+        stage.report("GPS_RAW_INT", fix_type=2, lat=1, lon=1)
+        stage.report("GPS_RAW_INT", fix_type=3, lat=-350000000, lon=1490000000)
+        stage.report("VFR_HUD", alt=600.0, heading=271)
+        stage.report("GLOBAL_POSITION_INT", relative_alt=16500)
     assert (found[0].lat, found[0].lng, found[0].alt, found[0].heading) == (-35.0, 149.0, alt, 271)

@@ -1,4 +1,4 @@
-"""DroneKit's API reference, entry by entry: names, arguments, defaults, what the text promises, its examples."""
+"""DroneKit's API reference, entry by entry: names, arguments, defaults, documented behaviour, examples."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def found(path: str) -> Any:
 
 
 @pytest.fixture(scope="module")
-def told() -> Iterator[Stage]:
-    """A vehicle that has told everything; tests only read it."""
+def notified() -> Iterator[Stage]:
+    """A vehicle with all values; tests only read it."""
     with on_stage(dronekit, {"mode": 4}, READY, answer_streams) as stage:
         stage.vehicle.wait_ready("ekf_ok", "capabilities", timeout=100)
         stage.settle()
@@ -51,7 +51,7 @@ def test_module_has(name: str) -> None:
 
 
 @for_each("module, name", [(module, name) for module in OTHER_NAMES for name in OTHER_NAMES[module]])
-def test_other_modules_have(module: str, name: str) -> None:
+def test_other_modules_have_names(module: str, name: str) -> None:
     assert found(f"{module}.{name}") is not None
 
 
@@ -129,8 +129,8 @@ def test_signature_of_wait_ready() -> None:
 
 
 @for_each("owner, name", [(owner, name) for owner in ATTRIBUTES for name in ATTRIBUTES[owner].split()])
-def test_attribute(told: Stage, owner: str, name: str) -> None:
-    vehicle = told.vehicle
+def test_attribute(notified: Stage, owner: str, name: str) -> None:
+    vehicle = notified.vehicle
     objects = {
         "Attitude": vehicle.attitude,
         "Battery": vehicle.battery,
@@ -155,8 +155,8 @@ def test_attribute(told: Stage, owner: str, name: str) -> None:
 # --------------------------------------------------------------------------------------- values
 
 
-def test_values_of_a_vehicle(told: Stage) -> None:
-    vehicle = told.vehicle
+def test_values_of_a_vehicle(notified: Stage) -> None:
+    vehicle = notified.vehicle
     assert str(vehicle.attitude) == "Attitude:pitch=0.5,yaw=-0.5,roll=0.25"
     assert str(vehicle.battery) == "Battery:voltage=12.587,current=1.5,level=77"
     assert str(vehicle.gps_0) == "GPSInfo:fix=3,num_sat=10"
@@ -175,7 +175,7 @@ def test_values_of_a_vehicle(told: Stage) -> None:
     assert 0 <= vehicle.last_heartbeat < 10
 
 
-def test_capabilities(told: Stage) -> None:
+def test_capabilities(notified: Stage) -> None:
     names = (
         *("mission_float", "param_float", "mission_int", "command_int", "param_union", "ftp"),
         *(
@@ -190,8 +190,8 @@ def test_capabilities(told: Stage) -> None:
         one = dronekit.Capabilities(1 << bit)
         assert [each for each in names if getattr(one, each)] == [name]
         assert getattr(one, name) is True
-    assert told.vehicle.capabilities.mission_int is True
-    assert told.vehicle.capabilities.ftp is False
+    assert notified.vehicle.capabilities.mission_int is True
+    assert notified.vehicle.capabilities.ftp is False
 
 
 def test_version_numbers() -> None:
@@ -201,7 +201,7 @@ def test_version_numbers() -> None:
     assert dronekit.Version(0x030302FF, 3, 2).is_stable()
 
 
-def test_equality_of_modes_and_states() -> None:
+def test_modes_and_states_equality() -> None:
     for kind in (dronekit.VehicleMode, dronekit.SystemStatus):
         one = kind("ACTIVE")
         assert one == kind("ACTIVE")
@@ -213,7 +213,7 @@ def test_equality_of_modes_and_states() -> None:
 
 
 @pytest.mark.parametrize("kind", [dronekit.LocationGlobal, dronekit.LocationGlobalRelative])
-def test_places_are_compared_by_identity_and_change(kind: Any) -> None:
+def test_locations_compare_by_identity_and_are_mutable(kind: Any) -> None:
     one = kind(1.0, 2.0)
     one.alt = 3.0
     assert (one.lat, one.lon, one.alt, one.local_frame, one.global_frame) == (1.0, 2.0, 3.0, None, None)
@@ -222,19 +222,14 @@ def test_places_are_compared_by_identity_and_change(kind: Any) -> None:
 # -------------------------------------------------------------------------------- mapping methods
 
 
-def test_channels_are_a_dictionary_to_read(told: Stage) -> None:
-    channels = told.vehicle.channels
+def test_channels_are_a_dict(notified: Stage) -> None:
+    channels = notified.vehicle.channels
     whole = {str(number): 1000 + number for number in range(1, 9)}
     assert dict in type(channels).__mro__
     assert channels.copy() == whole
     assert (channels.get("1"), channels.get("99"), channels.get("99", 7)) == (1001, None, 7)
     assert (channels.has_key("1"), channels.has_key("99")) == (True, False)
-    assert (
-        list(channels.items())
-        == list(channels.iteritems())
-        == list(channels.viewitems())
-        == list(whole.items())
-    )
+    assert list(channels.items()) == list(channels.iteritems()) == list(channels.viewitems()) == list(whole.items())
     assert list(channels.keys()) == list(channels.iterkeys()) == list(channels.viewkeys()) == list(whole)
     assert list(channels.values()) == list(channels.itervalues()) == list(channels.viewvalues())
     assert list(channels.values()) == list(whole.values())
@@ -254,14 +249,14 @@ def test_channels_are_a_dictionary_to_read(told: Stage) -> None:
         ("update", ({"1": 5},)),
     ],
 )
-def test_channels_are_not_written(told: Stage, name: str, arguments: tuple[Any, ...]) -> None:
-    before = dict(told.vehicle.channels)
+def test_channels_reject_writing(notified: Stage, name: str, arguments: tuple[Any, ...]) -> None:
+    before = dict(notified.vehicle.channels)
     with pytest.raises(TypeError):
-        getattr(told.vehicle.channels, name)(*arguments)
-    assert dict(told.vehicle.channels) == before
+        getattr(notified.vehicle.channels, name)(*arguments)
+    assert dict(notified.vehicle.channels) == before
 
 
-def test_overrides_are_a_dictionary(stage: Stage) -> None:
+def test_overrides_are_a_dict(stage: Stage) -> None:
     channels = stage.vehicle.channels
     channels.overrides = {"1": 1100, 2: 1200}
     overrides = channels.overrides
@@ -289,12 +284,7 @@ def test_parameters_are_a_mapping(stage: Stage) -> None:
     parameters = stage.vehicle.parameters
     whole = {"BAR": 2.5, "FOO": 1.0, "THR_MIN": 130.0}
     assert dict(parameters) == whole
-    assert (
-        sorted(parameters.keys())
-        == sorted(parameters.iterkeys())
-        == sorted(parameters.viewkeys())
-        == sorted(whole)
-    )
+    assert sorted(parameters.keys()) == sorted(parameters.iterkeys()) == sorted(parameters.viewkeys()) == sorted(whole)
     assert sorted(parameters.items()) == sorted(parameters.iteritems()) == sorted(parameters.viewitems())
     assert sorted(parameters.values()) == sorted(parameters.itervalues()) == sorted(parameters.viewvalues())
     assert sorted(parameters.values()) == sorted(whole.values())
@@ -311,21 +301,19 @@ def test_parameters_are_a_mapping(stage: Stage) -> None:
 # --------------------------------------------------------------------------------- other classes
 
 
-def test_command_is_a_mission_item() -> None:
+def test_command_is_mission_item() -> None:
     command = dronekit.Command(0, 0, 0, 3, 16, 0, 0, 1, 2, 3, 4, -34.25, 149.5, 30)
     assert (command.frame, command.command, command.x, command.y, command.z) == (3, 16, -34.25, 149.5, 30)
     assert (command.param1, command.param2, command.param3, command.param4) == (1, 2, 3, 4)
     assert (command.seq, command.current, command.autocontinue, command.target_system) == (0, 0, 0, 0)
     assert command.get_type() == "MISSION_ITEM"
     assert command.format_attr("z") == 30
-    assert str(command).startswith(
-        "MISSION_ITEM {target_system : 0, target_component : 0, seq : 0, frame : 3, "
-    )
+    assert str(command).startswith("MISSION_ITEM {target_system : 0, target_component : 0, seq : 0, frame : 3, ")
     command.z = 40
     assert command.z == 40
 
 
-def test_observers_of_ones_own() -> None:
+def test_own_observers() -> None:
     class Mine(dronekit.HasObservers):
         pass
 
@@ -340,7 +328,7 @@ def test_observers_of_ones_own() -> None:
     assert calls == [(True, "size", 1), (True, "size", 2)]
 
 
-def test_printers_of_errors(capsys: pytest.CaptureFixture[str]) -> None:
+def test_errprinter(capsys: pytest.CaptureFixture[str]) -> None:
     dronekit.util.errprinter("one", 2)
     dronekit.util.logger("three")
     printed: list[str] = []
@@ -358,6 +346,6 @@ def test_still_waiting_callback_logs(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_listeners_of_locations_get_the_locations(stage: Stage) -> None:
     events = stage.listen("global_frame", "*", to=stage.vehicle.location)
-    stage.tell("GLOBAL_POSITION_INT", **POSITION)
+    stage.report("GLOBAL_POSITION_INT", **POSITION)
     names = ["global_relative_frame", "global_frame", "global_frame"]
     assert [(source, name) for source, name, _ in events] == [("Locations", name) for name in names]

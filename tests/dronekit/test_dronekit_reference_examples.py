@@ -23,7 +23,7 @@ def stage() -> Iterator[Stage]:
         yield each
 
 
-def test_connecting_by_a_bare_address() -> None:
+def test_connect_bare_address() -> None:
     with FlightController() as fc:
         answer_streams(fc)
         names: dict[str, Any] = {}
@@ -104,8 +104,8 @@ def test_example(stage: Stage, name: str) -> None:
         "settle": stage.settle,
         "fence": stage.reached,
         "beat": stage.beat,
-        "move": lambda: stage.tell("GLOBAL_POSITION_INT", **POSITION),
-        "tilt": lambda: stage.tell("ATTITUDE", pitch=0.5),
+        "move": lambda: stage.report("GLOBAL_POSITION_INT", **POSITION),
+        "tilt": lambda: stage.report("ATTITUDE", pitch=0.5),
     }
     exec("from aerokit.dronekit import *", names)
     program = textwrap.dedent(EXAMPLES[name])
@@ -118,5 +118,5 @@ def test_example(stage: Stage, name: str) -> None:
         fc.wait_for(*SENT[name])
 
 
-def test_every_example_is_expected() -> None:
+def test_every_reference_example_is_listed() -> None:
     assert set(EXAMPLES) == set(PRINTED)

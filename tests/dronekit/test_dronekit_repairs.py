@@ -1,4 +1,4 @@
-"""DroneKit's faults, each with the scene in which it showed: what its documentation promises happens instead."""
+"""DroneKit's faults, each in the situation that showed it, and the documented behaviour."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def copter() -> Iterator[Stage]:
         yield stage
 
 
-# ------------------------------------------------------------------- whose messages are heard
+# ------------------------------------------------------------------ messages of other systems
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def copter() -> Iterator[Stage]:
         pytest.param((51, 68), {"type": 6, "autopilot": 8}, id="radio"),
     ],
 )
-def test_heartbeats_of_others_change_nothing(
+def test_heartbeats_of_other_components_are_ignored(
     copter: Stage, source: tuple[int, int], kind: dict[str, int]
 ) -> None:
     copter.fc.base_mode, copter.fc.system_status = 129, 4
@@ -52,11 +52,11 @@ def test_heartbeats_of_others_change_nothing(
     assert events == []
 
 
-def test_other_vehicles_do_not_move_this_one(copter: Stage) -> None:
+def test_other_vehicles_do_not_change_attributes(copter: Stage) -> None:
     other = (2, 1)
     copter.beat(source=other)
-    copter.tell("GLOBAL_POSITION_INT", lat=471000000, lon=85000000, alt=30, relative_alt=40)
-    copter.tell("ATTITUDE", roll=0.5)
+    copter.report("GLOBAL_POSITION_INT", lat=471000000, lon=85000000, alt=30, relative_alt=40)
+    copter.report("ATTITUDE", roll=0.5)
     events, heard = copter.listen("*"), []
     copter.vehicle.add_message_listener("VFR_HUD", lambda *_: heard.append(1))
     copter.reached()
@@ -67,7 +67,7 @@ def test_other_vehicles_do_not_move_this_one(copter: Stage) -> None:
         ("VFR_HUD", {"heading": 7}),
         ("GPS_RAW_INT", {"fix_type": 6}),
     ):
-        copter.tell(name, source=other, **fields)
+        copter.report(name, source=other, **fields)
     assert (copter.vehicle.attitude.roll, copter.vehicle.location.global_frame.lat) == (0.5, 47.1)
     assert (copter.vehicle.heading, copter.vehicle.battery, copter.vehicle.gps_0.fix_type) == (
         None,
@@ -78,20 +78,20 @@ def test_other_vehicles_do_not_move_this_one(copter: Stage) -> None:
     assert heard == []
 
 
-def test_parameters_of_others_are_theirs(copter: Stage) -> None:
+def test_parameters_of_other_systems_are_ignored(copter: Stage) -> None:
     parameters = copter.vehicle.parameters
     parameters.wait_ready()
     lists = len(copter.fc.received("PARAM_REQUEST_LIST"))
     for source in ((1, 154), (2, 1)):
         for name in ("FOO", "GMB_POS_HOLD"):
-            copter.fc.parameters.tell(name, source=source, param_value=99.0, param_count=33, param_index=1)
+            copter.fc.parameters.report(name, source=source, param_value=99.0, param_count=33, param_index=1)
     copter.settle()
     copter.reached()
     assert (parameters["FOO"], len(parameters), "GMB_POS_HOLD" in parameters) == (1.0, 3, False)
     assert len(copter.fc.received("PARAM_REQUEST_LIST")) == lists
 
 
-def test_unknown_mode_number_stops_nothing(copter: Stage) -> None:
+def test_unknown_mode_number_does_not_freeze_attributes(copter: Stage) -> None:
     copter.fc.base_mode, copter.fc.custom_mode, copter.fc.system_status = 129, 199, 4
     with copter.logged(having="HEARTBEAT") as lines:
         copter.beat()
@@ -103,7 +103,7 @@ def test_unknown_mode_number_stops_nothing(copter: Stage) -> None:
 # --------------------------------------------------------------------------------- MAVLink 2
 
 
-def test_nothing_of_the_process_changes() -> None:
+def test_connect_leaves_process_unchanged() -> None:
     before = dict(os.environ)
     with on_stage(dronekit, {"version": 2}) as two, on_stage(dronekit, {"version": 1}) as one:
         two.reached()
@@ -113,13 +113,13 @@ def test_nothing_of_the_process_changes() -> None:
     assert dict(os.environ) == before
 
 
-def test_play_tune_of_text_and_bytes(copter: Stage) -> None:
+def test_play_tune_str_and_bytes(copter: Stage) -> None:
     for tune in ("AAA", b"AAA"):
         (sent,) = copter.sent_by(partial(copter.vehicle.play_tune, tune), "PLAY_TUNE")
         assert (sent.target[0], sent.tune) == (1, "AAA")
 
 
-def test_play_tune_of_a_vehicle_that_has_no_such_message() -> None:
+def test_play_tune_mavlink_1_raises() -> None:
     with on_stage(dronekit, {"version": 1}, prepare=lambda fc: setattr(fc, "capabilities", 0)) as stage:
         assert caught(lambda: stage.vehicle.play_tune("AAA")).startswith("APIException")
 
@@ -127,7 +127,7 @@ def test_play_tune_of_a_vehicle_that_has_no_such_message() -> None:
 # ------------------------------------------------------------------------------------- modes
 
 
-def test_old_firmware_is_told_its_mode_by_the_old_message(copter: Stage) -> None:
+def test_old_firmware_gets_set_mode_message(copter: Stage) -> None:
     copter.fc.results[176] = 3
     copter.vehicle.wait_for_mode("LOITER", timeout=100)
     old = copter.fc.wait_for("SET_MODE")
@@ -135,7 +135,7 @@ def test_old_firmware_is_told_its_mode_by_the_old_message(copter: Stage) -> None
     assert copter.vehicle.mode == "LOITER"
 
 
-def test_refusals_are_warnings_with_the_reason(copter: Stage) -> None:
+def test_rejections_are_warnings_with_reason(copter: Stage) -> None:
     copter.fc.results[400] = 4
     copter.fc.reasons[400] = "PreArm: Compass not healthy"
     with copter.logged(having="ARM") as lines:
@@ -150,7 +150,7 @@ def test_lost_orders_are_repeated(copter: Stage) -> None:
     copter.vehicle.groundspeed = 5
     first = copter.fc.wait_for_command(178)
     again = copter.fc.wait_for_command(178, since=copter.fc.received().index(first) + 1)
-    copter.fc.tell("COMMAND_ACK", command=178, result=0)
+    copter.fc.report("COMMAND_ACK", command=178, result=0)
     assert again.params == first.params
 
 
@@ -159,10 +159,10 @@ def test_lost_orders_are_repeated(copter: Stage) -> None:
 
 def tell_streams(fc: FlightController) -> None:
     for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "VFR_HUD", "GPS_RAW_INT", "SYS_STATUS"):
-        fc.tell(name)
+        fc.report(name)
 
 
-def test_connecting_to_nobody_ends_and_leaves_nothing() -> None:
+def test_connect_without_vehicle_raises_and_closes() -> None:
     before = threading.active_count()
     with pytest.raises(dronekit.APIException, match="Timeout in initializing connection"):
         dronekit.connect("udpin:127.0.0.1:0", heartbeat_timeout=0.2)
@@ -179,12 +179,12 @@ def test_connecting_to_nobody_ends_and_leaves_nothing() -> None:
         ("/dev/no-such-device,57600", serial.SerialException),
     ],
 )
-def test_errors_of_addresses(address: str, error: type[Exception]) -> None:
+def test_address_errors(address: str, error: type[Exception]) -> None:
     with pytest.raises(error):
         dronekit.connect(address, heartbeat_timeout=1)
 
 
-def test_connecting_to_a_vehicle_without_parameters_returns() -> None:
+def test_connect_vehicle_without_parameters_returns() -> None:
     def prepare(fc: FlightController) -> None:
         fc.parameters.is_silent = True
 
@@ -195,7 +195,7 @@ def test_connecting_to_a_vehicle_without_parameters_returns() -> None:
 
 
 @pytest.mark.parametrize("names", ["mode", ["mode", "armed"], ("attitude",)])
-def test_wait_ready_of_connect_takes_names(names: Any) -> None:
+def test_connect_wait_ready_accepts_names(names: Any) -> None:
     def prepare(fc: FlightController) -> None:
         fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
 
@@ -203,7 +203,7 @@ def test_wait_ready_of_connect_takes_names(names: Any) -> None:
         assert stage.vehicle.wait_ready(*([names] if isinstance(names, str) else names), timeout=1)
 
 
-def test_wait_ready_of_connect_has_its_timeout() -> None:
+def test_connect_wait_ready_uses_timeout() -> None:
     missing: set[str] = set()
     with FlightController() as fc, pytest.raises(dronekit.TimeoutError, match=r"after 0\.3 seconds"):
         dronekit.connect(
@@ -217,15 +217,15 @@ def test_wait_ready_of_connect_has_its_timeout() -> None:
     assert "nosuch" in missing
 
 
-def test_status_printer_ends_with_its_vehicle(copter: Stage) -> None:
+def test_status_printer_is_removed_on_close(copter: Stage) -> None:
     printed: list[str] = []
     with on_stage(dronekit, {}, {"status_printer": printed.append}) as stage:
-        stage.tell("STATUSTEXT", severity=2, text=b"PreArm: no ")
-    copter.tell("STATUSTEXT", severity=2, text=b"of another")
+        stage.report("STATUSTEXT", severity=2, text=b"PreArm: no ")
+    copter.report("STATUSTEXT", severity=2, text=b"of another")
     assert printed == ["PreArm: no"]
 
 
-def test_subclass_with_attributes_of_its_own() -> None:
+def test_subclass_with_own_attributes() -> None:
     class Own(dronekit.Vehicle):
         def __init__(self, *args: Any) -> None:
             super().__init__(*args)
@@ -239,12 +239,12 @@ def test_subclass_with_attributes_of_its_own() -> None:
     with on_stage(dronekit, {}, {"vehicle_class": Own}) as stage:
         assert isinstance(stage.vehicle, Own)
         events = stage.listen("pressure")
-        stage.tell("SCALED_PRESSURE", press_abs=1013.25)
+        stage.report("SCALED_PRESSURE", press_abs=1013.25)
         assert stage.vehicle.pressure == 1013.25
         assert events == [("Own", "pressure", "1013.25")]
 
 
-def test_initializing_later() -> None:
+def test_initialize_later() -> None:
     with FlightController(mode=5) as fc:
         fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
         vehicle = dronekit.connect(fc.address, _initialize=False)
@@ -258,7 +258,7 @@ def test_initializing_later() -> None:
 # ------------------------------------------------------------------------------------ the link
 
 
-def test_a_link_that_is_lost_comes_back() -> None:
+def test_lost_link_reconnects() -> None:
     def prepare(fc: FlightController) -> None:
         fc.answers["REQUEST_DATA_STREAM"] = lambda _: tell_streams(fc)
 
@@ -271,7 +271,7 @@ def test_a_link_that_is_lost_comes_back() -> None:
         until(lambda: len(stage.fc.received("REQUEST_DATA_STREAM")) > streams)
 
 
-def test_closing_delivers_what_was_ordered() -> None:
+def test_close_delivers_recent_orders() -> None:
     with FlightController(mode=4) as fc:
         vehicle = dronekit.connect(fc.address, rate=None)
         vehicle.mode = "RTL"
@@ -280,7 +280,7 @@ def test_closing_delivers_what_was_ordered() -> None:
         assert fc.wait_for_command(176).params[:2] == (1, 6)
 
 
-def test_closing_from_a_listener() -> None:
+def test_close_in_listener() -> None:
     closed = threading.Event()
     with on_stage(dronekit, {"mode": 4}) as stage:
 
@@ -289,7 +289,7 @@ def test_closing_from_a_listener() -> None:
             closed.set()
 
         stage.vehicle.add_attribute_listener("heading", close)
-        stage.fc.tell("VFR_HUD", heading=271)
+        stage.fc.report("VFR_HUD", heading=271)
         assert closed.wait(100)
         with pytest.raises(dronekit.APIException):
             stage.vehicle.mode = "RTL"
@@ -298,7 +298,7 @@ def test_closing_from_a_listener() -> None:
 # ------------------------------------------------------------------------------------ listeners
 
 
-def test_a_listener_that_blocks_stops_neither_reception_nor_heartbeat(copter: Stage) -> None:
+def test_blocking_listener_does_not_stop_reception_or_heartbeat(copter: Stage) -> None:
     blocks, go_on = threading.Event(), threading.Event()
 
     def block(*_: Any) -> None:
@@ -306,17 +306,17 @@ def test_a_listener_that_blocks_stops_neither_reception_nor_heartbeat(copter: St
         assert go_on.wait(100)
 
     copter.vehicle.add_attribute_listener("heading", block)
-    copter.fc.tell("VFR_HUD", heading=271)
+    copter.fc.report("VFR_HUD", heading=271)
     assert blocks.wait(100)
     since = copter.fc.mark()
-    copter.fc.tell("VFR_HUD", heading=5)
+    copter.fc.report("VFR_HUD", heading=5)
     until(lambda: copter.vehicle.heading == 5)
     copter.fc.wait_for("HEARTBEAT", since=since)
     go_on.set()
     copter.settle()
 
 
-def test_listeners_may_call_whatever_blocks(copter: Stage) -> None:
+def test_listeners_may_call_blocking_methods(copter: Stage) -> None:
     seen: list[Any] = []
 
     def use(vehicle: Any, name: str, value: Any) -> None:
@@ -329,11 +329,11 @@ def test_listeners_may_call_whatever_blocks(copter: Stage) -> None:
         seen.append(vehicle.armed)
 
     copter.vehicle.add_attribute_listener("heading", use)
-    copter.tell("VFR_HUD", heading=271)
+    copter.report("VFR_HUD", heading=271)
     assert seen == [1.0, True, "LOITER", True, True]
 
 
-def test_a_listener_that_removes_itself_hides_nothing_from_the_next(copter: Stage) -> None:
+def test_listener_removing_itself_hides_nothing_from_next(copter: Stage) -> None:
     calls: list[str] = []
 
     def once(vehicle: Any, name: str, value: Any) -> None:
@@ -343,13 +343,13 @@ def test_a_listener_that_removes_itself_hides_nothing_from_the_next(copter: Stag
     copter.vehicle.add_attribute_listener("heading", once)
     copter.vehicle.add_attribute_listener("heading", lambda *_: calls.append("next"))
     for heading in (1, 2):
-        copter.tell("VFR_HUD", heading=heading)
+        copter.report("VFR_HUD", heading=heading)
     assert calls == ["once", "next", "next"]
 
 
 def test_long_texts_are_joined_and_odd_severities_logged(copter: Stage) -> None:
     with copter.logged("autopilot", having="d") as lines:
-        copter.fc.tell("STATUSTEXT", severity=4, text=b"x" * 50, id=7, chunk_seq=0)
-        copter.fc.tell("STATUSTEXT", severity=4, text=b" and the end", id=7, chunk_seq=1)
-        copter.tell("STATUSTEXT", severity=9, text=b"odd")
+        copter.fc.report("STATUSTEXT", severity=4, text=b"x" * 50, id=7, chunk_seq=0)
+        copter.fc.report("STATUSTEXT", severity=4, text=b" and the end", id=7, chunk_seq=1)
+        copter.report("STATUSTEXT", severity=9, text=b"odd")
     assert lines == [f"WARNING {'x' * 50} and the end", "DEBUG odd"]

@@ -1,4 +1,4 @@
-"""DroneKit's faults with parameters, missions, channels, gimbals and messages: what happens instead."""
+"""DroneKit's faults with parameters, missions, channels, gimbals and messages, and the corrected behaviour."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def copter() -> Iterator[Stage]:
 # ----------------------------------------------------------------------------------- parameters
 
 
-def test_what_is_set_while_the_list_comes_stays_set() -> None:
+def test_parameter_set_during_download_is_kept() -> None:
     def prepare(fc: FlightController) -> None:
         def tell_two(_: Any) -> None:
-            fc.parameters.tell("FOO")
-            fc.parameters.tell("BAR")
+            fc.parameters.report("FOO")
+            fc.parameters.report("BAR")
 
         fc.answers["PARAM_REQUEST_LIST"] = tell_two
         fc.answers["PARAM_REQUEST_READ"] = lambda _: None
@@ -35,29 +35,29 @@ def test_what_is_set_while_the_list_comes_stays_set() -> None:
     with on_stage(dronekit, prepare=prepare) as stage:
         stage.fc.wait_for("PARAM_REQUEST_LIST")
         assert stage.vehicle.parameters.set("FOO", 0.5)
-        stage.fc.parameters.tell("THR_MIN")
+        stage.fc.parameters.report("THR_MIN")
         stage.vehicle.parameters.wait_ready()
         assert stage.vehicle.parameters["FOO"] == 0.5
 
 
-def test_another_count_loses_nothing(copter: Stage) -> None:
+def test_changed_parameter_count_loses_nothing(copter: Stage) -> None:
     parameters = copter.vehicle.parameters
     parameters.wait_ready()
     copter.fc.parameters.values["NEW"] = 8.0
-    copter.fc.parameters.tell("NEW")
+    copter.fc.parameters.report("NEW")
     copter.settle()
     assert (parameters["NEW"], parameters["FOO"], len(parameters)) == (8.0, 1.0, 4)
 
 
-def test_same_value_is_confirmed(copter: Stage) -> None:
+def test_unchanged_parameter_value_is_confirmed(copter: Stage) -> None:
     copter.vehicle.parameters.wait_ready()
-    copter.reached()  # no value of the download comes any more, which would confirm it
+    copter.reached()  # no value of the download can confirm it now
     answer = copter.fc.answers["PARAM_SET"]
     results: list[bool] = []
     told_before: list[bool] = []
 
     def tell_later(frame: Any) -> None:
-        told_before.append(bool(results))  # what is sent again may come later
+        told_before.append(bool(results))  # retries may arrive later
         answer(frame)
 
     copter.fc.answers["PARAM_SET"] = tell_later
@@ -69,7 +69,7 @@ def test_same_value_is_confirmed(copter: Stage) -> None:
 # ------------------------------------------------------------------------------------- missions
 
 
-def test_upload_without_a_download_keeps_the_first_command(copter: Stage) -> None:
+def test_upload_without_download_keeps_first_command(copter: Stage) -> None:
     copter.fc.missions.items = [HOME, THIRD]
     commands = copter.vehicle.commands
     commands.clear()
@@ -81,7 +81,7 @@ def test_upload_without_a_download_keeps_the_first_command(copter: Stage) -> Non
 
 
 @pytest.mark.parametrize("result", [4, 15], ids=["NO_SPACE", "DENIED"])
-def test_refused_upload_raises_and_the_next_one_works(copter: Stage, result: int) -> None:
+def test_rejected_upload_raises_and_next_works(copter: Stage, result: int) -> None:
     commands = copter.vehicle.commands
     commands.clear()
     commands.add(waypoint(copter, TAKEOFF))
@@ -93,7 +93,7 @@ def test_refused_upload_raises_and_the_next_one_works(copter: Stage, result: int
     assert [command for command, *_ in kept(copter)] == [16, 22]
 
 
-def test_unanswered_upload_times_out_and_the_next_one_works(copter: Stage) -> None:
+def test_unanswered_upload_times_out_and_next_works(copter: Stage) -> None:
     commands = copter.vehicle.commands
     commands.clear()
     commands.add(waypoint(copter, TAKEOFF))
@@ -106,7 +106,7 @@ def test_unanswered_upload_times_out_and_the_next_one_works(copter: Stage) -> No
 
 
 @pytest.mark.parametrize("asks_int", [True, False])
-def test_upload_answers_both_requests_and_is_exact(copter: Stage, asks_int: bool) -> None:
+def test_upload_answers_both_request_types_exactly(copter: Stage, asks_int: bool) -> None:
     copter.fc.missions.asks_int = asks_int
     commands = copter.vehicle.commands
     commands.clear()
@@ -116,7 +116,7 @@ def test_upload_answers_both_requests_and_is_exact(copter: Stage, asks_int: bool
     assert (x, y) == ((-35.3632611, 149.1652301) if asks_int else pytest.approx((x, y)))
 
 
-def test_lost_items_are_asked_for_again(copter: Stage) -> None:
+def test_lost_mission_items_are_requested_again(copter: Stage) -> None:
     copter.fc.missions.items = [HOME, FIRST, SECOND, THIRD]
     copter.fc.missions.lost = {1: 1, 3: 1}
     assert [each.seq for each in downloaded(copter)] == [1, 2, 3]
@@ -131,7 +131,7 @@ def test_empty_mission(autopilot: int) -> None:
         assert len(downloaded(stage)) == 0
 
 
-def test_a_download_that_fails_wedges_nothing(copter: Stage) -> None:
+def test_failed_download_does_not_block_next(copter: Stage) -> None:
     copter.fc.missions.items = [HOME, FIRST]
     answer = copter.fc.answers.pop("MISSION_REQUEST_LIST")
     commands = copter.vehicle.commands
@@ -145,7 +145,7 @@ def test_a_download_that_fails_wedges_nothing(copter: Stage) -> None:
 # -------------------------------------------------------------------------- channels and gimbal
 
 
-def test_every_way_of_changing_overrides_sends(copter: Stage) -> None:
+def test_every_override_change_sends(copter: Stage) -> None:
     overrides = copter.vehicle.channels.overrides
     assert channels_of(copter, lambda: overrides.update({"1": 1100, "2": 1200})) == [(1100, 1200, *(0,) * 6)]
     assert channels_of(copter, lambda: overrides.setdefault("3", 1300)) == [(1100, 1200, 1300, *(0,) * 5)]
@@ -155,12 +155,12 @@ def test_every_way_of_changing_overrides_sends(copter: Stage) -> None:
 
 
 @pytest.mark.parametrize("angles", [(-90, 0, 0), (-45.5, 0, 12.5)])
-def test_gimbal_is_ordered_by_commands_that_firmware_knows(copter: Stage, angles: tuple[float, ...]) -> None:
+def test_gimbal_uses_supported_commands(copter: Stage, angles: tuple[float, ...]) -> None:
     (sent,) = copter.sent_by(lambda: copter.vehicle.gimbal.rotate(*angles))
     assert (sent.command, sent.target[0], sent.params[:2]) == (1000, 1, (angles[0], angles[2]))
 
 
-def test_gimbal_of_old_firmware(copter: Stage) -> None:
+def test_gimbal_old_firmware(copter: Stage) -> None:
     copter.fc.results.update({1000: 3, 205: 3})
     copter.vehicle.gimbal.rotate(-90, 0, 0)
     configure, control = copter.fc.wait_for("MOUNT_CONFIGURE"), copter.fc.wait_for("MOUNT_CONTROL")
@@ -172,14 +172,14 @@ def test_gimbal_of_old_firmware(copter: Stage) -> None:
     )
 
 
-def test_gimbal_looks_at_places_above_the_sea_too(copter: Stage) -> None:
+def test_gimbal_target_location_above_sea_level(copter: Stage) -> None:
     place = dronekit.LocationGlobal(-35.1, 149.2, 600)
     copter.vehicle.gimbal.target_location(place)
     sent = copter.fc.wait_for("COMMAND_INT", lambda frame: frame.command == 195)
     assert (sent.frame, sent.x, sent.y, sent.z) == (5, -351000000, 1492000000, 600)
 
 
-def test_any_message_of_pymavlink_is_sent(copter: Stage) -> None:
+def test_send_mavlink_any_pymavlink_message(copter: Stage) -> None:
     message = message_of("PARAM_REQUEST_READ", param_id=b"FOO", param_index=-1, target_component=4)
     sent = copter.sent_by(lambda: copter.vehicle.send_mavlink(message), "PARAM_REQUEST_READ")
     assert [frame.param_id for frame in sent if frame.target == (1, 4)] == ["FOO"]

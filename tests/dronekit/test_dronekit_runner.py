@@ -59,11 +59,11 @@ def run(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProc
 # ------------------------------------------------------------------------------------- alias
 
 
-def test_nothing_is_called_dronekit_unless_asked() -> None:
+def test_import_aerokit_does_not_alias_dronekit() -> None:
     assert "dronekit" not in sys.modules
 
 
-def test_install_makes_every_import_of_programs_work() -> None:
+def test_install_aliases_all_imports() -> None:
     install()
     install()
     program: dict[str, Any] = {}
@@ -86,18 +86,18 @@ def test_install_makes_every_import_of_programs_work() -> None:
         importlib.import_module("dronekit.none")
 
 
-def test_uninstall_takes_it_back() -> None:
+def test_uninstall_undoes_install() -> None:
     uninstall()
     install()
     uninstall()
     assert not [name for name in sys.modules if name.split(".")[0] == "dronekit"]
 
 
-def test_install_refuses_beside_another_dronekit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_install_with_another_dronekit_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     other = types.ModuleType("dronekit")
     other.__file__ = "/elsewhere/dronekit/__init__.py"
     monkeypatch.setitem(sys.modules, "dronekit", other)
-    with pytest.raises(ImportError, match=r"another dronekit was imported already, from /elsewhere/"):
+    with pytest.raises(ImportError, match=r"another dronekit was imported before, from /elsewhere/"):
         install()
     uninstall()
     assert sys.modules["dronekit"] is other
@@ -106,7 +106,7 @@ def test_install_refuses_beside_another_dronekit(monkeypatch: pytest.MonkeyPatch
 # ------------------------------------------------------------------------------------ program
 
 
-def test_a_program_finds_what_it_finds_with_python(tmp_path: Path) -> None:
+def test_program_environment_matches_python(tmp_path: Path) -> None:
     path = program(tmp_path, PROBE)
     arguments = ("program.py", "--connect", "udp:1", "-h", "--", "-m", "")
     plain = run(*arguments, cwd=tmp_path)
@@ -116,15 +116,13 @@ def test_a_program_finds_what_it_finds_with_python(tmp_path: Path) -> None:
     assert json.loads(ours.stdout)[1:3] == [str(path), list(arguments)]
 
 
-def test_a_module_finds_what_it_finds_with_python(tmp_path: Path) -> None:
+def test_module_environment_matches_python(tmp_path: Path) -> None:
     program(
         tmp_path,
         "import json, sys\njson.dump([__name__, sys.argv, sys.path[0], __spec__.name], sys.stdout)\n",
     )
     arguments = ("-m", "program", "-x")
-    assert (
-        run("-m", "aerokit.dronekit", *arguments, cwd=tmp_path).stdout == run(*arguments, cwd=tmp_path).stdout
-    )
+    assert run("-m", "aerokit.dronekit", *arguments, cwd=tmp_path).stdout == run(*arguments, cwd=tmp_path).stdout
 
 
 @pytest.mark.parametrize(
@@ -132,7 +130,7 @@ def test_a_module_finds_what_it_finds_with_python(tmp_path: Path) -> None:
     ["import sys\n\ndef fail():\n    raise ValueError('no')\n\nfail()\n", "x = = 1\n"],
     ids=["raises", "syntax"],
 )
-def test_tracebacks_and_exit_codes_are_those_of_python(text: str, tmp_path: Path) -> None:
+def test_tracebacks_and_exit_codes_match_python(text: str, tmp_path: Path) -> None:
     path = program(tmp_path, text)
     plain, ours = run(path), run("-m", "aerokit", "run", path)
     assert (ours.returncode, ours.stderr) == (plain.returncode, plain.stderr)
@@ -140,14 +138,14 @@ def test_tracebacks_and_exit_codes_are_those_of_python(text: str, tmp_path: Path
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
-def test_ctrl_c_ends_a_program_as_python_does(tmp_path: Path) -> None:
+def test_ctrl_c_in_program_matches_python(tmp_path: Path) -> None:
     path = program(tmp_path, "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
     ours = run("-m", "aerokit.dronekit", path)
     assert ours.returncode == -signal.SIGINT
     assert ours.stderr.count("File ") == 1
 
 
-def test_missing_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_program_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert aerokit_main(["run", str(tmp_path / "none.py")]) == 2
     assert "can't open file" in capsys.readouterr().err
     with pytest.raises(SystemExit) as caught:
@@ -155,7 +153,7 @@ def test_missing_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert caught.value.code == 2
 
 
-def test_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_text(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         aerokit_main(["run", "--help"])
     assert caught.value.code == 0
@@ -165,7 +163,7 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
 # --------------------------------------------------------------------------------- in-process
 
 
-def test_run_script_puts_sys_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_script_restores_sys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     argv, path, main = sys.argv[:], sys.path[:], sys.modules["__main__"]
     runner.run_script(program(tmp_path, PROBE), ["a", "--b"])
     name, file, its_argv, its_path, *_ = json.loads(capsys.readouterr().out)
@@ -175,7 +173,7 @@ def test_run_script_puts_sys_back(tmp_path: Path, capsys: pytest.CaptureFixture[
     del sys.modules["beside"]
 
 
-def test_run_script_lets_through_what_the_program_raises(tmp_path: Path) -> None:
+def test_run_script_propagates_exceptions(tmp_path: Path) -> None:
     main = sys.modules["__main__"]
     with pytest.raises(SystemExit) as caught:
         runner.run_script(program(tmp_path, "import sys, dronekit\nsys.exit(3)"))
@@ -185,7 +183,7 @@ def test_run_script_lets_through_what_the_program_raises(tmp_path: Path) -> None
         runner.run_script(tmp_path / "none.py")
 
 
-def test_folders_and_zip_files_are_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_and_zip_files_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     program(tmp_path, "import dronekit, sys\nprint(sys.argv[1:], __name__)\n", "__main__.py")
     with zipfile.ZipFile(tmp_path / "program.pyz", "w") as archive:
         archive.write(tmp_path / "__main__.py", "__main__.py")
@@ -203,9 +201,7 @@ print(vehicle.mode.name)
 """
 
 
-def test_vehicles_that_a_program_leaves_open_are_closed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_open_vehicles_are_closed_after_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with served_copter() as address:
         threads = set(threading.enumerate())
         runner.run_script(program(tmp_path, LEFT_OPEN), [address])

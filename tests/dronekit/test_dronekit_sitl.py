@@ -58,14 +58,14 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_program_that_starts_its_own_vehicle_gets_one(tmp_path: Path) -> None:
+def test_program_starts_own_simulated_vehicle(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(OWN.format(instance=free_instance()))
     ended = run(program)
     assert (ended.returncode, ended.stdout.splitlines()) == (0, ["True False", "0"]), ended.stderr
 
 
-def test_a_taken_port_is_an_error_and_a_second_launch_needs_restart() -> None:
+def test_sitl_port_in_use_raises() -> None:
     instance = free_instance()
     sitl, other = SITL(instance=instance), SITL(instance=instance)
     sitl.launch([])
@@ -83,14 +83,14 @@ def test_a_taken_port_is_an_error_and_a_second_launch_needs_restart() -> None:
     assert sitl.poll() == 0
 
 
-def test_half_a_place_and_unknown_systems_are_refused() -> None:
+def test_sitl_invalid_position_or_system_raises() -> None:
     with pytest.raises(InvalidArgument, match="both lat and lon"):
         start_default(lat=1.0)
     with pytest.raises(InvalidArgument, match="not one of"):
         SITL().download("boat", "stable")
 
 
-def test_with_sim_there_is_a_vehicle(
+def test_sim_option_serves_vehicle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     program = tmp_path / "program.py"
@@ -110,9 +110,9 @@ def test_with_sim_there_is_a_vehicle(
         code = runner.main(["--sim", "--speedup", "10", str(program), f"tcp:127.0.0.1:{port}"], "aerokit run")
     finally:
         uninstall()
-    told = capsys.readouterr()
-    assert (code, told.out) == (0, "STABILIZE\n")
-    assert f"a simulated copter is on tcp:127.0.0.1:{port}" in told.err
+    notified = capsys.readouterr()
+    assert (code, notified.out) == (0, "STABILIZE\n")
+    assert f"a simulated copter is on tcp:127.0.0.1:{port}" in notified.err
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_with_sim_there_is_a_vehicle(
         (["-m", "no_such_module"], "No module named no_such_module"),
     ],
 )
-def test_own_errors_have_no_traceback(arguments: list[str], text: str, tmp_path: Path) -> None:
+def test_runner_errors_have_no_traceback(arguments: list[str], text: str, tmp_path: Path) -> None:
     program = [] if "-m" in arguments else [tmp_path / "p.py"]
     (tmp_path / "p.py").write_text("")
     ended = run(*arguments, *program)

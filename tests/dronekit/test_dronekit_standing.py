@@ -1,4 +1,4 @@
-"""Orders that get no answer are sent again, but not against a newer order, a pilot, or what they have brought about.
+"""Unanswered orders are repeated, but not after a newer order, a pilot's takeover, or their effect.
 
 The rules by themselves are in tests/vehicle/commanding/test_posted.py.
 """
@@ -36,7 +36,7 @@ def vehicle(copter: FlightController) -> Iterator[dronekit.Vehicle]:
 
 
 def lose_answers(copter: FlightController, *commands: int, does: bool) -> None:
-    """The vehicle does what it is told, or not, and nobody hears its answers."""
+    """The vehicle executes orders, or not, and its answers are lost."""
     answer = copter.answers["COMMAND_LONG"]
 
     def take(frame: Received) -> Any:
@@ -54,9 +54,7 @@ def wait_for(is_true: Any) -> None:
         time.sleep(0.005)
 
 
-def test_what_was_told_is_not_ordered_again_against_the_pilot(
-    copter: FlightController, vehicle: dronekit.Vehicle
-) -> None:
+def test_confirmed_order_is_not_repeated_against_pilot(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
     lose_answers(copter, ARM, SET_MODE, does=True)
     vehicle.armed = True
     vehicle.mode = "GUIDED"
@@ -68,17 +66,17 @@ def test_what_was_told_is_not_ordered_again_against_the_pilot(
     assert (vehicle.armed, vehicle.mode.name) == (False, "LOITER")
 
 
-def test_arming_without_an_answer_says_that_it_may_still_be_carried_out(
+def test_unanswered_arming_warns_about_late_effect(
     copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
 ) -> None:
     lose_answers(copter, ARM, does=False)
     vehicle.armed = True
     vehicle._handler.calls.wait(LIMIT_S)
     (record,) = caplog.records
-    assert record.message.endswith("; it may still be carried out, and nobody watches for that")
+    assert record.message.endswith("; it may still be carried out")
 
 
-def test_a_pilot_who_takes_over_before_the_order_has_come_keeps_the_vehicle(
+def test_pilot_takeover_before_order_arrives_is_kept(
     copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
 ) -> None:
     lose_answers(copter, SET_MODE, REPOSITION, does=False)
@@ -93,20 +91,18 @@ def test_a_pilot_who_takes_over_before_the_order_has_come_keeps_the_vehicle(
     assert ends == ["another order was given", "the mode changed to LOITER"]
 
 
-def test_disarming_waits_for_no_answer_to_arming(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
+def test_disarming_does_not_wait_for_arming(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
     lose_answers(copter, ARM, does=False)
     vehicle.armed = True
     copter.wait_for_command(ARM)
-    vehicle.armed = False  # HEARTBEAT has told nothing else, but the arming may still come
+    vehicle.armed = False  # HEARTBEAT reports disarmed, but the arming may still be executed
     copter.wait_for("COMMAND_LONG", lambda frame: frame.command == ARM and frame.param1 == 0)
     assert [each.param1 for each in copter.commands()] == [1, 0]
-    copter.tell("COMMAND_ACK", command=ARM, result=2)
-    copter.tell("COMMAND_ACK", command=ARM, result=2)  # so that closing does not wait
+    copter.report("COMMAND_ACK", command=ARM, result=2)
+    copter.report("COMMAND_ACK", command=ARM, result=2)  # so that closing does not wait
 
 
-def test_disarm_waits_for_the_answer_when_arming_is_under_way(
-    copter: FlightController, vehicle: dronekit.Vehicle
-) -> None:
+def test_disarm_during_arming_waits_for_answer(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
     lose_answers(copter, ARM, does=False)
     vehicle.armed = True
     copter.wait_for_command(ARM)
@@ -115,17 +111,15 @@ def test_disarm_waits_for_the_answer_when_arming_is_under_way(
     copter.wait_for("COMMAND_LONG", lambda frame: frame.command == ARM and frame.param1 == 0)
     assert disarming.is_alive()
     acks: dict[str, Any] = {"target_system": 255, "target_component": 0}
-    copter.tell("COMMAND_ACK", command=ARM, result=0, **acks)  # to the arming
-    copter.tell("COMMAND_ACK", command=ARM, result=0, **acks)
+    copter.report("COMMAND_ACK", command=ARM, result=0, **acks)  # to the arming
+    copter.report("COMMAND_ACK", command=ARM, result=0, **acks)
     disarming.join(LIMIT_S)
     assert not disarming.is_alive()
     assert [each.param1 for each in copter.commands()] == [1, 0]
 
 
 @pytest.mark.parametrize("wait", ["arm", "wait_for_mode"])
-def test_what_is_not_waited_for_any_more_is_not_ordered_again(
-    copter: FlightController, vehicle: dronekit.Vehicle, wait: str
-) -> None:
+def test_abandoned_order_is_not_repeated(copter: FlightController, vehicle: dronekit.Vehicle, wait: str) -> None:
     lose_answers(copter, ARM, SET_MODE, does=False)
     orders: dict[str, Any] = {
         "arm": vehicle.arm,
@@ -137,7 +131,7 @@ def test_what_is_not_waited_for_any_more_is_not_ordered_again(
     assert len(copter.commands()) == 1
 
 
-def test_a_raw_set_point_is_newer_than_a_place_that_was_posted(
+def test_raw_setpoint_overrules_simple_goto(
     copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
 ) -> None:
     lose_answers(copter, REPOSITION, does=False)
@@ -155,19 +149,15 @@ def test_a_raw_set_point_is_newer_than_a_place_that_was_posted(
     assert "not sent again: another order was given" in caplog.text
 
 
-def test_a_place_that_is_posted_ends_the_flight_of_the_new_api(
-    copter: FlightController, vehicle: dronekit.Vehicle
-) -> None:
+def test_simple_goto_ends_go_to(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
     order = vehicle.aio._arbiter.order()
     vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
     vehicle._handler.calls.wait(LIMIT_S)
     assert order.end == "another order was given"
 
 
-def test_what_is_sent_to_old_firmware_instead_is_part_of_the_order(
-    copter: FlightController, vehicle: dronekit.Vehicle
-) -> None:
-    """What has no answer and follows the refusal does not follow a newer order, nor a pilot."""
+def test_fallback_for_old_firmware_belongs_to_order(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
+    """The unacknowledged fallback message is not sent after a newer order or a pilot's takeover."""
     copter.results = {REPOSITION: UNSUPPORTED, SET_MODE: UNSUPPORTED}
     vehicle.simple_goto(dronekit.LocationGlobalRelative(-35.0, 149.0, 20.0))
     copter.wait_for("COMMAND_INT", lambda frame: frame.command == REPOSITION)

@@ -1,4 +1,4 @@
-"""The values of the DroneKit API: their texts to the character, their names, and what equals what."""
+"""Values of the DroneKit API: exact texts, attribute names, equality."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ TEXTS: list[tuple[Any, str]] = [
 
 
 @pytest.mark.parametrize(("value", "text"), TEXTS, ids=[text for _, text in TEXTS])
-def test_texts(value: Any, text: str) -> None:
+def test_value_texts(value: Any, text: str) -> None:
     assert str(value) == text
     assert repr(value) == text
     assert str(pickle.loads(pickle.dumps(copy.copy(value)))) == text
 
 
-def test_attributes_have_the_names_that_programs_use() -> None:
+def test_values_have_dronekit_attribute_names() -> None:
     assert vars(Attitude(1, 2, 3)) == {"pitch": 1, "yaw": 2, "roll": 3}
     assert vars(GPSInfo(1, 2, 3, 4)) == {"eph": 1, "epv": 2, "fix_type": 3, "satellites_visible": 4}
     assert vars(Rangefinder(1, 2)) == {"distance": 1, "voltage": 2}
@@ -78,14 +78,14 @@ def test_attributes_have_the_names_that_programs_use() -> None:
         assert (location.local_frame, location.global_frame) == (None, None)
 
 
-def test_values_may_be_changed_and_extended() -> None:
+def test_values_are_mutable() -> None:
     place: Any = LocationGlobalRelative(1, 2, 3)
     place.alt += 10
     place.name = "over there"
     assert str(place) == "LocationGlobalRelative:lat=1,lon=2,alt=13"
 
 
-def test_locations_are_equal_only_to_themselves() -> None:
+def test_locations_compare_by_identity() -> None:
     place = LocationGlobal(1, 2, 3)
     assert place == place
     assert place != LocationGlobal(1, 2, 3)
@@ -99,7 +99,7 @@ def test_distance_home() -> None:
 
 
 @pytest.mark.parametrize("kind", [VehicleMode, SystemStatus])
-def test_modes_and_states_equal_their_names(kind: Any) -> None:
+def test_modes_and_states_equal_names(kind: Any) -> None:
     value = kind("AUTO")
     assert value == "AUTO"
     assert "AUTO" == value  # noqa: SIM300
@@ -111,7 +111,7 @@ def test_modes_and_states_equal_their_names(kind: Any) -> None:
     assert kind("AUTO") in {"AUTO"}
 
 
-def test_version_says_what_kind_of_release_it_is() -> None:
+def test_version_release_type() -> None:
     release, candidate, unknown = (Version(raw, ARDUPILOT, QUAD) for raw in (0x030302FF, 0x030300D7, None))
     assert (release.major, release.minor, release.patch, release.release) == (3, 3, 2, 255)
     assert (release.is_stable(), release.release_type(), release.release_version()) == (True, "rc", 0)
@@ -137,19 +137,19 @@ CAPABILITIES = [
 ]
 
 
-def test_capabilities_are_bits() -> None:
+def test_capabilities_from_bits() -> None:
     for bit, name in enumerate(CAPABILITIES):
         assert [each for each, value in vars(Capabilities(1 << bit)).items() if value] == [name]
     assert repr(Capabilities(0b100001)) == "Capabilities(mission_float, ftp)"
 
 
 @pytest.mark.parametrize("bits", [None, 0])
-def test_unknown_capabilities_are_none_of_them(bits: int | None) -> None:
+def test_unknown_capabilities_are_false(bits: int | None) -> None:
     assert list(vars(Capabilities(bits))) == CAPABILITIES
     assert not any(vars(Capabilities(bits)).values())
 
 
-def test_timeout_error_is_also_the_built_in_one() -> None:
+def test_timeout_error_is_builtin() -> None:
     import builtins
 
     assert issubclass(TimeoutError, builtins.TimeoutError)
@@ -159,18 +159,18 @@ def test_timeout_error_is_also_the_built_in_one() -> None:
     assert str(APIException("no")) == "no"
 
 
-def test_util_prints_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
+def test_errprinter_prints_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     errprinter("one", 2)
     logger("three")
-    told = capsys.readouterr()
-    assert (told.out, told.err) == ("", "one 2\nthree\n")
+    notified = capsys.readouterr()
+    assert (notified.out, notified.err) == ("", "one 2\nthree\n")
 
 
-def test_errprinter_handler_hands_on_what_is_logged() -> None:
-    told: list[str] = []
-    handler = ErrprinterHandler(told.append)
+def test_errprinter_handler_passes_records() -> None:
+    notified: list[str] = []
+    handler = ErrprinterHandler(notified.append)
     handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
     log = logging.Logger("texts")
     log.addHandler(handler)
     log.warning("PreArm: %s", "RC not calibrated")
-    assert told == ["WARNING PreArm: RC not calibrated"]
+    assert notified == ["WARNING PreArm: RC not calibrated"]

@@ -1,4 +1,4 @@
-"""Fleets fly, lose members and end by policy: on simulated copters, on virtual time."""
+"""Fleet actions, lost members and policies with simulated copters on virtual time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from aerokit.fleets.events import (
     MemberBack,
     MemberFailed,
     MemberLost,
-    MemberTakenBack,
+    MemberReclaimed,
     MemberTakenOver,
-    PolicyCarriedOut,
-    PolicyOrdered,
+    PolicyApplied,
+    PolicyCompleted,
 )
 from aerokit.fleets.members import Member, MemberState
-from aerokit.fleets.policy import Failure, PolicyName, PolicyOrder
+from aerokit.fleets.policy import MemberFailure, PolicyName, PolicyOrder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.position import Position
 
@@ -36,7 +36,7 @@ def north(by_m: float) -> Any:
     return target
 
 
-async def test_ten_take_off_lose_one_and_land_by_policy() -> None:
+async def test_ten_members_land_by_policy_after_one_is_lost() -> None:
     async with open_stage(10, on_error="land_others") as stage:
         fleet = stage.fleet
         (await fleet.wait_ready()).raise_for_errors()
@@ -44,37 +44,40 @@ async def test_ten_take_off_lose_one_and_land_by_policy() -> None:
         result = await fleet.take_off(10, stagger_s=0.5)
         assert len(result) == 10
         assert result.is_complete
-        await fleet.all_at_altitude(10)
+        await fleet.wait_at_altitude(10)
         stage.forget()
         stage.copters["north/4"].faults.silent = True
         result = await fleet.go_to(north(300))
         assert list(result.failed) == ["north/4"]
         assert len(result.stopped) == 9
         others = [name for name in stage.copters if name != "north/4"]
-        assert all(
-            not stage.copters[name].is_armed or stage.copters[name].motion.is_on_ground for name in others
-        )
-        assert all(stage.modes_ordered(name) == ["LAND"] for name in others)  # once, and no hold before it
+        assert all(not stage.copters[name].is_armed or stage.copters[name].motion.is_on_ground for name in others)
+        assert all(stage.modes_ordered(name) == ["LAND"] for name in others)  # once, without a hold before
         assert stage.modes_ordered("north/4") == []
         (lost,) = [each for each in fleet if each.state is MemberState.LOST]
         assert lost.name == "north/4"
-        told = stage.events()
-        assert [type(each) for each in told] == [MemberLost, MemberFailed, PolicyOrdered, PolicyCarriedOut]
-        assert told[2].orders == dict.fromkeys(others, "land")
-        with pytest.raises(FleetError, match="0 of 10 did it") as caught:
+        received = stage.events()
+        assert [type(event) for event in received] == [
+            MemberLost,
+            MemberFailed,
+            PolicyApplied,
+            PolicyCompleted,
+        ]
+        assert received[2].orders == dict.fromkeys(others, "land")
+        with pytest.raises(FleetError, match="0 of 10 succeeded") as caught:
             result.raise_for_errors()
         assert set(caught.value.errors) == set(stage.copters)
 
 
-async def test_a_lost_one_comes_back_and_takes_part_again() -> None:
-    async with open_stage(2, on_error="go_on") as stage:
+async def test_lost_member_returns_and_is_available_again() -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
         await stage.take_off()
         stage.copters["north/2"].faults.silent = True
         await anyio.sleep(6)
         assert stage.fleet.members["north/2"].state is MemberState.LOST
         result = await stage.fleet.hold()
         assert list(result) == ["north/1"]
-        assert "no heartbeat" in result.left_out["north/2"]
+        assert "no heartbeat" in result.skipped["north/2"]
         stage.copters["north/2"].faults.silent = False
         await anyio.sleep(2)
         assert [type(each) for each in stage.events()] == [MemberLost, MemberBack]
@@ -84,7 +87,7 @@ async def test_a_lost_one_comes_back_and_takes_part_again() -> None:
 @pytest.mark.parametrize(
     ("policy", "mode"), [("hold_others", "BRAKE"), ("return_others", "RTL"), ("land_others", "LAND")]
 )
-async def test_the_others_get_the_order_of_the_policy_once(policy: str, mode: str) -> None:
+async def test_policy_orders_each_other_member_once(policy: str, mode: str) -> None:
     async with open_stage(3, on_error=policy) as stage:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
@@ -93,10 +96,10 @@ async def test_the_others_get_the_order_of_the_policy_once(policy: str, mode: st
         assert list(result.failed) == ["north/1"]
         assert stage.modes_ordered("north/2") == stage.modes_ordered("north/3") == [mode]
         assert stage.modes_ordered("north/1") == []
-        assert f"it was told to {policy.partition('_')[0]}" in str(result.stopped["north/2"])
+        assert f"the policy ordered it to {policy.partition('_')[0]}" in str(result.stopped["north/2"])
 
 
-async def test_who_has_done_it_already_is_told_too() -> None:
+async def test_policy_orders_members_that_have_finished() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
         near, far = (stage.fleet.vehicles[name].position.value for name in ("north/1", "north/2"))
@@ -113,24 +116,26 @@ async def test_who_has_done_it_already_is_told_too() -> None:
         assert list(result.stopped) == ["north/1"]
 
 
-async def test_go_on_leaves_the_others_alone() -> None:
-    async with open_stage(3, on_error="go_on") as stage:
+async def test_policy_continue_others_does_not_stop_them() -> None:
+    async with open_stage(3, on_error="continue_others") as stage:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
         result = await stage.fleet.go_to(north(30))
         assert list(result.failed) == ["north/1"]
         assert not result.stopped
         assert result["north/2"] is None
-        assert not stage.events(PolicyOrdered)
+        assert not stage.events(PolicyApplied)
         assert stage.fleet.members["north/1"].state is MemberState.FAILED
         stage.copters["north/1"].faults.commands.clear()
         assert (await stage.fleet.go_to(north(5))).is_complete
-        assert [each.state for each in stage.fleet] == [MemberState.IN] * 3
+        assert [each.state for each in stage.fleet] == [MemberState.ACTIVE] * 3
 
 
-async def test_the_rule_of_the_group_of_who_failed_holds() -> None:
+async def test_policy_of_failed_members_group_applies() -> None:
     async with open_stage(
-        3, groups={"camera": ["north/1"], "show": ["north/[23]"]}, on_error_of={"camera": "go_on"}
+        3,
+        groups={"camera": ["north/1"], "show": ["north/[23]"]},
+        on_error_by_group={"camera": "continue_others"},
     ) as stage:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
@@ -143,18 +148,18 @@ async def test_the_rule_of_the_group_of_who_failed_holds() -> None:
         assert list(stage.fleet.group("show").members) == ["north/2", "north/3"]
 
 
-async def test_a_function_decides() -> None:
-    asked: list[Failure] = []
+async def test_policy_function_decides_per_member() -> None:
+    failures: list[MemberFailure] = []
 
-    def decide(failure: Failure) -> Mapping[str, PolicyOrder]:
-        asked.append(failure)
+    def decide(failure: MemberFailure) -> Mapping[str, PolicyOrder]:
+        failures.append(failure)
         return {"north/2": "land"}
 
     async with open_stage(3, on_error=decide) as stage:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
         result = await stage.fleet.go_to(north(20))
-        assert [(each.member, each.action, each.others) for each in asked] == [
+        assert [(each.member, each.action, each.others) for each in failures] == [
             ("north/1", "go_to", ("north/2", "north/3"))
         ]
         assert stage.modes_ordered("north/2") == ["LAND"]
@@ -162,19 +167,19 @@ async def test_a_function_decides() -> None:
         assert stage.copters["north/2"].motion.is_on_ground
 
 
-async def test_a_function_that_makes_no_sense_ends_in_holding() -> None:
-    def decide(failure: Failure) -> PolicyName:
+async def test_policy_function_with_invalid_result_makes_others_hold() -> None:
+    def decide(failure: MemberFailure) -> PolicyName:
         return "explode"  # type: ignore[return-value]
 
     async with open_stage(2, on_error=decide) as stage:
         await stage.take_off()
         stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
-        with pytest.raises(InvalidArgument, match="the policy decided 'explode'"):
+        with pytest.raises(InvalidArgument, match="the policy function returned 'explode'"):
             await stage.fleet.go_to(north(100))
         assert stage.mode_of("north/2") == "BRAKE"
 
 
-async def test_cancelling_is_one_stop_for_all() -> None:
+async def test_cancellation_holds_all_members_at_once() -> None:
     async with open_stage(5) as stage:
         await stage.take_off()
         started = now()
@@ -188,7 +193,7 @@ async def test_cancelling_is_one_stop_for_all() -> None:
         assert max(times.values()) - min(times.values()) < 0.001
 
 
-async def test_cancelling_stops_those_that_were_there_already_too() -> None:
+async def test_cancellation_holds_members_that_have_arrived() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
         here = {name: each.position.value for name, each in stage.fleet.vehicles.items()}
@@ -200,7 +205,7 @@ async def test_cancelling_stops_those_that_were_there_already_too() -> None:
         assert stage.modes == {"north/1": "BRAKE", "north/2": "BRAKE"}
 
 
-async def test_cancelled_landing_goes_on() -> None:
+async def test_cancelled_landing_continues() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
         with anyio.move_on_after(2):
@@ -209,26 +214,26 @@ async def test_cancelled_landing_goes_on() -> None:
         assert set(stage.modes.values()) == {"LAND"}
 
 
-async def test_a_pilot_takes_one_out_of_the_fleet() -> None:
-    async with open_stage(3, on_error="go_on") as stage:
+async def test_member_taken_over_by_pilot_is_skipped_until_reclaimed() -> None:
+    async with open_stage(3, on_error="continue_others") as stage:
         await stage.take_off()
         stage.pilot_takes("north/2")
         await anyio.sleep(2)
         member = stage.fleet.members["north/2"]
-        assert (member.state, member.why) == (MemberState.TAKEN_OVER, "the mode changed to LOITER")
+        assert (member.state, member.reason) == (MemberState.TAKEN_OVER, "the mode changed to LOITER")
         stage.forget()
         for order in (stage.fleet.go_to(north(10)), stage.fleet.hold(), stage.fleet.set_mode("GUIDED")):
             result = await order
-            assert result.left_out == {"north/2": "taken over: the mode changed to LOITER"}
+            assert result.skipped == {"north/2": "taken over: the mode changed to LOITER"}
             assert result.is_complete
         assert stage.orders_to("north/2") == []
-        stage.fleet.take_back("north/2")
-        assert [type(each) for each in stage.events()] == [MemberTakenOver, MemberTakenBack]
+        stage.fleet.reclaim("north/2")
+        assert [type(each) for each in stage.events()] == [MemberTakenOver, MemberReclaimed]
         assert len(await stage.fleet.land()) == 3
         assert stage.modes_ordered("north/2") == ["LAND"]
 
 
-async def test_a_pilot_who_takes_one_during_an_action_keeps_it() -> None:
+async def test_pilot_takeover_during_action_is_respected() -> None:
     async with open_stage(3) as stage:
         await stage.take_off()
 
@@ -247,7 +252,7 @@ async def test_a_pilot_who_takes_one_during_an_action_keeps_it() -> None:
         (await stage.fleet.land()).raise_for_errors()
 
 
-async def test_who_is_under_a_failsafe_is_left_alone() -> None:
+async def test_member_in_failsafe_gets_no_orders() -> None:
     async with open_stage(3, on_error="land_others") as stage:
         await stage.take_off()
         await stage.fleet.vehicles["north/3"].parameters.set("BATT_FS_LOW_ACT", 2)  # RTL
@@ -260,7 +265,7 @@ async def test_who_is_under_a_failsafe_is_left_alone() -> None:
         assert stage.modes_ordered("north/1") == ["LAND"]
 
 
-async def test_one_that_does_not_arm_disarms_nobody_and_flies_nobody() -> None:
+async def test_failed_arming_leaves_all_on_ground() -> None:
     async with open_stage(3) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()
         stage.copters["north/2"].faults.refuse(MavCmd.COMPONENT_ARM_DISARM)
@@ -272,7 +277,7 @@ async def test_one_that_does_not_arm_disarms_nobody_and_flies_nobody() -> None:
         assert all(each.motion.is_on_ground for each in stage.copters.values())
 
 
-async def test_a_barrier_waits_for_the_slowest_and_says_who_is_missing() -> None:
+async def test_barrier_waits_for_slowest_and_names_missing_members() -> None:
     async with open_stage(3) as stage:
         await stage.take_off()
         began = now()
@@ -282,13 +287,13 @@ async def test_a_barrier_waits_for_the_slowest_and_says_who_is_missing() -> None
 
         await stage.fleet.barrier(is_time)
         assert now() - began == pytest.approx(9.0, abs=0.5)
-        with pytest.raises(FleetError, match="all_at_altitude") as caught:
-            await stage.fleet.all_at_altitude(50, timeout=2)
+        with pytest.raises(FleetError, match="wait_at_altitude") as caught:
+            await stage.fleet.wait_at_altitude(50, timeout=2)
         (late,) = [each for each in caught.value.errors.values() if isinstance(each, OperationTimeout)]
         assert "north/1, north/2, north/3" in str(late)
 
 
-async def test_several_networks_with_the_same_ids_are_one_fleet() -> None:
+async def test_networks_with_same_system_ids_form_one_fleet() -> None:
     async with open_stage(2, networks=("north", "south")) as stage:
         assert list(stage.fleet.members) == ["north/1", "north/2", "south/1", "south/2"]
         await stage.take_off()
@@ -300,8 +305,8 @@ async def test_several_networks_with_the_same_ids_are_one_fleet() -> None:
         assert stage.copters["south/1"].motion.is_on_ground
 
 
-async def test_do_takes_a_method_or_a_function_with_its_own_deadline() -> None:
-    async with open_stage(2, on_error="go_on") as stage:
+async def test_do_accepts_method_name_or_function_with_timeout() -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
         await stage.take_off()
         assert (await stage.fleet.do("set_mode", "LOITER")).is_complete
         assert stage.mode_of("north/1") == "LOITER"
@@ -318,7 +323,7 @@ async def test_do_takes_a_method_or_a_function_with_its_own_deadline() -> None:
                 await stage.fleet.do(wrong)
 
 
-async def test_staggered_ones_begin_one_after_the_other() -> None:
+async def test_stagger_delays_consecutive_members() -> None:
     async with open_stage(3) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.arm()).raise_for_errors()
@@ -329,7 +334,7 @@ async def test_staggered_ones_begin_one_after_the_other() -> None:
         assert [later - times[0] for later in times] == pytest.approx([0.0, 2.0, 4.0], abs=0.3)
 
 
-async def test_what_cannot_be_ordered_stops_nobody() -> None:
+async def test_rejected_arguments_do_not_stop_running_action() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
         flying = asyncio.create_task(stage.fleet.go_to(north(20)))
@@ -344,7 +349,7 @@ async def test_what_cannot_be_ordered_stops_nobody() -> None:
         assert (await flying).is_complete
 
 
-async def test_nobody_is_stopped_from_landing_because_another_one_cannot() -> None:
+async def test_failed_landing_does_not_stop_other_landings() -> None:
     async with open_stage(3) as stage:
         await stage.take_off()
         stage.copters["north/2"].faults.refuse(MavCmd.DO_SET_MODE)
@@ -353,4 +358,4 @@ async def test_nobody_is_stopped_from_landing_because_another_one_cannot() -> No
         assert not result.stopped
         assert stage.copters["north/1"].motion.is_on_ground
         assert stage.copters["north/3"].motion.is_on_ground
-        assert not stage.events(PolicyOrdered)
+        assert not stage.events(PolicyApplied)

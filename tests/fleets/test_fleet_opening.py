@@ -1,4 +1,4 @@
-"""Who becomes a member, by which name; streams of all of them; what is refused; the blocking twin."""
+"""Opening a fleet: members and their names, streams, invalid arguments, the blocking twin."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from aerokit.errors import (
     OperationRejected,
     SubscriptionOverflow,
 )
-from aerokit.fleets.events import FleetEvent, MemberTakenOver, StateTold, Told
+from aerokit.fleets.events import FleetEvent, MemberEvent, MemberTakenOver, StateUpdate
 from aerokit.fleets.members import MemberState
-from aerokit.fleets.policy import Failure, FleetResult, Rules
+from aerokit.fleets.policy import FleetResult, MemberFailure, PolicyRules
 from aerokit.missions import Mission
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sync.generator import FILES, generate
@@ -32,7 +32,7 @@ def copters(*ids: int) -> list[SimulatedCopter]:
     return [SimulatedCopter(system_id=each, boot_time_s=0.0, seed=each) for each in ids]
 
 
-async def test_connections_vehicles_and_links_become_one_fleet() -> None:
+async def test_fleet_accepts_connections_vehicles_and_links() -> None:
     async with (
         simulated_link(copters(1, 2)) as north,
         simulated_link(copters(1)) as south,
@@ -44,21 +44,21 @@ async def test_connections_vehicles_and_links_become_one_fleet() -> None:
         async with aerokit.fleet(sources, groups={"two": ["north/*"]}, roles={"eyes": ["scout"]}) as fleet:
             assert list(fleet.members) == ["scout", "north/1", "north/2", "west/9"]
             assert fleet.vehicles["scout"] is vehicle
-            assert [each.name for each in fleet.group("two")] == ["north/1", "north/2"]
-            assert [each.name for each in fleet.role("eyes")] == ["scout"]
+            assert [member.name for member in fleet.group("two")] == ["north/1", "north/2"]
+            assert [member.name for member in fleet.role("eyes")] == ["scout"]
             assert "north/2" in fleet
             assert len(fleet["*/[19]"]) == 2
             with pytest.raises(InvalidArgument, match="group = 'three' is not allowed: the groups are two"):
                 fleet.group("three")
             with pytest.raises(InvalidArgument, match="role = 'x' is not allowed: the roles are eyes"):
                 fleet.role("x")
-            with pytest.raises(InvalidArgument, match=r"'east/\*' is no member"):
+            with pytest.raises(InvalidArgument, match=r"no fleet member matches 'east/\*'"):
                 fleet["east/*"]
         assert connection.is_open
         assert not vehicle.is_silent
 
 
-async def test_networks_without_a_name_are_numbered_and_ids_may_be_named() -> None:
+async def test_fleet_numbers_unnamed_networks_and_selects_system_ids() -> None:
     async with (
         simulated_link(copters(1, 2, 3)) as one,
         simulated_link(copters(2)) as two,
@@ -67,7 +67,7 @@ async def test_networks_without_a_name_are_numbered_and_ids_may_be_named() -> No
         assert list(fleet.members) == ["1/1", "1/3", "2/2"]
 
 
-async def test_one_that_the_program_has_already_is_not_found_twice() -> None:
+async def test_fleet_vehicle_already_connected_is_not_duplicated() -> None:
     async with (
         simulated_link(copters(1, 2)) as link,
         aerokit.open_connection(link) as connection,
@@ -81,76 +81,74 @@ async def test_one_that_the_program_has_already_is_not_found_twice() -> None:
         with pytest.raises(InvalidArgument, match="'a' and 'b' are the same vehicle"):
             async with aerokit.fleet({"a": own, "b": own}):
                 raise AssertionError
-        with pytest.raises(InvalidArgument, match="two vehicles are called 'north/2'"):
+        with pytest.raises(InvalidArgument, match="two vehicles are named 'north/2'"):
             async with aerokit.fleet({"north/2": own, "north": connection}):
                 raise AssertionError
 
 
-async def test_who_is_missing_is_told() -> None:
+async def test_fleet_missing_vehicles_are_listed_in_error() -> None:
     async with simulated_link(copters(1, 2)) as link:
         with pytest.raises(ConnectFailed, match=r"within 4 s 2 of 3 vehicles were found: north/1, north/2$"):
             async with aerokit.fleet({"north": link}, count=3, timeout=4):
                 raise AssertionError
 
 
-async def test_a_network_without_vehicles_is_named(caplog: pytest.LogCaptureFixture) -> None:
+async def test_fleet_network_without_vehicles_is_named_in_error(caplog: pytest.LogCaptureFixture) -> None:
     async with (
         simulated_link(copters(1)) as north,
         simulated_link(copters(2)) as south,
         aerokit.open_connection(south) as quiet,
         aerokit.connect(quiet) as own,
     ):
-        text = "within 6 s no vehicle was heard on south; found were north/1\n  - network south: "
+        text = "within 6 s no vehicle was found on south; found: north/1\n  - network south: "
         with pytest.raises(ConnectFailed, match=text):
             async with aerokit.fleet({"north": north, "south": quiet}, timeout=6):
                 raise AssertionError
-        (told,) = [each.getMessage() for each in caplog.records]
-        assert told == (
-            "a fleet is waiting: after 5 s no vehicle was heard on south; found were north/1; it waits for 6 s"
-        )
-        with pytest.raises(ConnectFailed, match=r"within 1 s 1 of 2 vehicles were found, 1 of them given"):
+        (text,) = [record.getMessage() for record in caplog.records]
+        assert text == ("fleet: no vehicle was found on south; found: north/1 after 5 s; waiting up to 6 s in total")
+        with pytest.raises(ConnectFailed, match=r"within 1 s 1 of 2 vehicles were found, 1 of them passed as vehicles"):
             async with aerokit.fleet({"scout": own, "south": quiet}, count=2, timeout=1):
                 raise AssertionError
 
 
-async def test_named_ones_that_are_not_heard_are_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_fleet_missing_system_id_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     async with simulated_link(copters(1, 2)) as link:
         with pytest.raises(ConnectFailed, match="system 7"):
             async with aerokit.fleet({"north": link}, system_ids=[1, 7], timeout=12):
                 raise AssertionError
-        (told,) = [each.getMessage() for each in caplog.records]
-        assert told == "a fleet is waiting: after 5 s nothing is heard of north/7; it waits for 12 s"
+        (text,) = [record.getMessage() for record in caplog.records]
+        assert text == "fleet: no heartbeat of north/7 after 5 s; waiting up to 12 s in total"
 
 
 @pytest.mark.parametrize(
     ("options", "match"),
     [
         ({"on_error": "panic"}, "on_error = 'panic'"),
-        ({"on_error_of": {"a": "panic"}}, "on_error"),
-        ({"on_error_of": {"typo": "land_others"}, "groups": {"two": ["1/*"]}}, "the groups are two"),
+        ({"on_error_by_group": {"a": "panic"}}, "on_error"),
+        ({"on_error_by_group": {"typo": "land_others"}, "groups": {"two": ["1/*"]}}, "the groups are two"),
         ({"count": 0}, "count = 0"),
         ({"min_distance_m": 0.0}, "min_distance_m"),
-        ({"too_close": "shout"}, "too_close"),
+        ({"on_too_close": "shout"}, "on_too_close"),
         ({"system_ids": [0]}, "system_ids: 0"),
-        ({"system_ids": {"x": [1]}}, "'x' is no network"),
-        ({"groups": {"a": ["nobody"]}}, "'nobody' is no member"),
+        ({"system_ids": {"x": [1]}}, "'x' is not a network"),
+        ({"groups": {"a": ["nobody"]}}, "no fleet member matches 'nobody'"),
         ({"groups": {"a": ["north/1"], "b": ["north/*"]}}, "two groups"),
     ],
 )
-async def test_wrong_arguments_are_refused(options: dict[str, Any], match: str) -> None:
+async def test_fleet_invalid_arguments_are_rejected(options: dict[str, Any], match: str) -> None:
     async with simulated_link(copters(1)) as link:
         with pytest.raises(InvalidArgument, match=match):
             async with aerokit.fleet({"north": link}, **options):
                 raise AssertionError
 
 
-async def test_a_fleet_of_nobody_is_refused() -> None:
+async def test_fleet_without_sources_is_rejected() -> None:
     with pytest.raises(InvalidArgument, match="needs an address"):
         async with aerokit.fleet():
             raise AssertionError
 
 
-async def test_one_stream_has_the_events_and_states_of_all() -> None:
+async def test_streams_have_events_and_states_of_all_members() -> None:
     async with open_stage(2, networks=("north", "south")) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()
         with (
@@ -161,13 +159,13 @@ async def test_one_stream_has_the_events_and_states_of_all() -> None:
         ):
             await stage.fleet.arm()
             (await stage.fleet["south/2"].set_mode("GUIDED")).raise_for_errors()
-            told = await modes.get(timeout=5)
-            assert isinstance(told, Told)
-            assert (told.member, told.event.after) == ("south/2", "GUIDED")  # type: ignore[attr-defined]
+            event = await modes.get(timeout=5)
+            assert isinstance(event, MemberEvent)
+            assert (event.member, event.event.after) == ("south/2", "GUIDED")  # type: ignore[attr-defined]
             seen: set[tuple[str, str]] = set()
             with anyio.fail_after(5):
                 async for state in states:
-                    assert isinstance(state, StateTold)
+                    assert isinstance(state, StateUpdate)
                     seen.add((state.member, state.state))
                     if len(seen) == 8:
                         break
@@ -176,25 +174,25 @@ async def test_one_stream_has_the_events_and_states_of_all() -> None:
                 async for _ in few:
                     pass
         for wrong in ((), ("height",)):
-            with pytest.raises(InvalidArgument, match="is no state"):
+            with pytest.raises(InvalidArgument, match="is not a state"):
                 stage.fleet.states(*wrong)
         with pytest.raises(InvalidArgument, match="a class of Event"):
             stage.fleet.events(int)  # type: ignore[arg-type]
 
 
-async def test_who_is_let_go_gets_no_orders() -> None:
+async def test_released_member_gets_no_orders_until_reclaimed() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
-        stage.fleet.let_go("north/2", "it films")
+        stage.fleet.release("north/2", "it films")
         result = await stage.fleet.hold()
-        assert result.left_out == {"north/2": "left: it films"}
-        assert stage.fleet.members["north/2"].state is MemberState.LEFT
+        assert result.skipped == {"north/2": "released: it films"}
+        assert stage.fleet.members["north/2"].state is MemberState.RELEASED
         assert not stage.orders_to("north/2")
-        stage.fleet.take_back("north/2")
+        stage.fleet.reclaim("north/2")
         assert (await stage.fleet.land()).is_complete
 
 
-async def test_all_are_let_go_at_once_and_nothing_is_left() -> None:
+async def test_fleet_exit_detaches_all_vehicles() -> None:
     async with simulated_link(copters(1, 2, 3)) as link, aerokit.open_connection(link) as connection:
         before = len(connection.bus._event_sinks), set(connection.attached)
         async with aerokit.fleet(connection, count=3) as fleet:
@@ -205,7 +203,7 @@ async def test_all_are_let_go_at_once_and_nothing_is_left() -> None:
             pass
 
 
-async def test_arguments_of_wrong_types_are_refused_and_nothing_is_sent() -> None:
+async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None:
     async with open_stage(2) as stage:
         fleet: Any = stage.fleet
         (await stage.fleet.wait_ready()).raise_for_errors()
@@ -223,23 +221,23 @@ async def test_arguments_of_wrong_types_are_refused_and_nothing_is_sent() -> Non
             ("do", (print, 1), {}),
             ("go_to", ({"north/1": (47, 8)},), {}),
             ("go_to", ({"north/9": place},), {}),
-            ("go_to", ({"north/1": place},), {"apart": "yes"}),
-            ("plan_apart", ({"north/1": place},), {"by": "luck"}),
-            ("plan_apart", ({"north/1": place},), {}),
+            ("go_to", ({"north/1": place},), {"separation": "yes"}),
+            ("plan_separation", ({"north/1": place},), {"by": "luck"}),
+            ("plan_separation", ({"north/1": place},), {}),
             ("barrier", (True,), {}),
-            ("all_at_altitude", (None,), {}),
+            ("wait_at_altitude", (None,), {}),
             ("upload", ({"north/1": 5},), {}),
             ("upload", ({"north/9": Mission()},), {}),
-            ("upload", ({"north/1": Mission()},), {"at_once": 0}),
+            ("upload", ({"north/1": Mission()},), {"max_concurrent": 0}),
             ("compare_missions", ({"north/1": Mission()},), {}),
             ("form", (line,), {"leader": 1}),
             ("form", ("line",), {"leader": "north/1"}),
             ("following", (line,), {"leader": "north/1", "rate_hz": 1000}),
             ("fly_show", ("show", place), {}),
             ("send_corrections", ("text",), {}),
-            ("take_back", (1,), {}),
-            ("take_back", ("north/9",), {}),
-            ("let_go", ("north/9",), {}),
+            ("reclaim", (1,), {}),
+            ("reclaim", ("north/9",), {}),
+            ("release", ("north/9",), {}),
             ("group", (None,), {}),
             ("events", (), {"capacity": 0}),
         ]
@@ -255,39 +253,37 @@ async def test_arguments_of_wrong_types_are_refused_and_nothing_is_sent() -> Non
         assert not stage.orders_to("north/2")
 
 
-def test_results_say_what_became_of_whom() -> None:
+def test_fleet_result_shows_failed_and_skipped_members() -> None:
     error = ValueError("no")
-    result = FleetResult(
-        "land", {"a": None, "b": error}, failed={"b": error}, stopped={}, left_out={"c": "lost"}
-    )
-    assert repr(result) == "<FleetResult of land: 1 of 2 done; failed: b; left out: c>"
+    result = FleetResult("land", {"a": None, "b": error}, failed={"b": error}, stopped={}, skipped={"c": "lost"})
+    assert repr(result) == "<FleetResult of land: 1 of 2 done; failed: b; skipped: c>"
     assert dict(result) == {"a": None, "b": error}
-    with pytest.raises(aerokit.errors.FleetError, match=r"land: 1 of 2 did it\n  - b: no"):
+    with pytest.raises(aerokit.errors.FleetError, match=r"land: 1 of 2 succeeded\n  - b: no"):
         result.raise_for_errors()
 
 
-def test_rules_take_nothing_else() -> None:
-    failure = Failure("a", "", "go_to", ValueError(), ("b", "c"))
-    assert Rules("go_on", {}).decide(failure) == {}
-    assert Rules("return_others", {}).decide(failure) == {"b": "return", "c": "return"}
-    assert Rules(lambda _: None, {}).decide(failure) == {}
-    assert Rules(lambda _: "land_others", {}).decide(failure) == {"b": "land", "c": "land"}
-    for decided in ({"x": "land"}, {"b": "jump"}, "halt", 7):
-        with pytest.raises(InvalidArgument, match="the policy decided"):
-            Rules(lambda _, it=decided: it, {}).decide(failure)  # type: ignore[misc]
+def test_policy_rules_reject_invalid_decisions() -> None:
+    failure = MemberFailure("a", "", "go_to", ValueError(), ("b", "c"))
+    assert PolicyRules("continue_others", {}).decide(failure) == {}
+    assert PolicyRules("return_others", {}).decide(failure) == {"b": "return", "c": "return"}
+    assert PolicyRules(lambda _: None, {}).decide(failure) == {}
+    assert PolicyRules(lambda _: "land_others", {}).decide(failure) == {"b": "land", "c": "land"}
+    for decision in ({"x": "land"}, {"b": "jump"}, "halt", 7):
+        with pytest.raises(InvalidArgument, match="the policy function returned"):
+            PolicyRules(lambda _, it=decision: it, {}).decide(failure)  # type: ignore[misc]
 
 
-def test_the_blocking_twin_flies_a_fleet() -> None:
+def test_blocking_twin_flies_fleet() -> None:
     from aerokit.testing.served import hosted_flight
 
     with hosted_flight("copter", boot_time_s=0.0) as served:
         with sync.fleet({"north": served.address}, count=1) as fleet:
             assert repr(fleet) == "<Fleet of 1: north/1>"
-            with fleet.events(events.ArmedChanged) as told:
+            with fleet.events(events.ArmedChanged) as received:
                 fleet.wait_ready().raise_for_errors()
                 fleet.arm().raise_for_errors()
                 assert fleet.take_off(5).is_complete
-                assert told.get(timeout=5).member == "north/1"
+                assert received.get(timeout=5).member == "north/1"
             assert isinstance(fleet.vehicles["north/1"], sync.Vehicle)
             assert fleet.vehicles["north/1"].is_armed
             assert fleet["north/*"].land()["north/1"] is None
@@ -295,5 +291,5 @@ def test_the_blocking_twin_flies_a_fleet() -> None:
             sync.fleet({"north": served.address}, count=0)
 
 
-def test_the_twins_are_what_the_generator_writes() -> None:
+def test_fleet_twins_match_generator_output() -> None:
     assert FILES["fleet_twins"].read_text(encoding="utf-8") == generate("fleet_twins")

@@ -1,4 +1,4 @@
-"""What a fleet does together: ways that cross, distances in flight, missions, formations, corrections."""
+"""Crossing paths, distances in flight, missions, formations, corrections."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aerokit.errors import (
     ValueUnknownError,
 )
 from aerokit.fleets.actions import fragments, rtcm_messages
-from aerokit.fleets.events import FollowingStopped, PathsDecided, PolicyCarriedOut, TooClose
+from aerokit.fleets.events import FollowingStopped, PathsCompared, PolicyCompleted, TooClose
 from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.opening import fleet
@@ -27,7 +27,7 @@ from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
 from aerokit.position import Position
 from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.sim.px4.modes import POSITION, custom_mode
-from aerokit.sim.track import least_distance_m, record_track
+from aerokit.testing.track import min_distance_m, record_track
 
 pytestmark = pytest.mark.anyio
 
@@ -38,37 +38,37 @@ def swapped(stage: Stage) -> dict[str, Position]:
     return {one: here[other], other: here[one]}
 
 
-async def test_two_that_change_places_fly_in_layers() -> None:
+async def test_go_to_swapped_positions_flies_in_layers() -> None:
     async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
         await stage.take_off()
         tracks = [record_track(each) for each in stage.copters.values()]
         targets = swapped(stage)
         (await stage.fleet.go_to(targets)).raise_for_errors()
-        assert least_distance_m(*tracks)[0] > 4.0
+        assert min_distance_m(*tracks)[0] > 4.0
         for name, target in targets.items():
             assert stage.fleet.vehicles[name].distance_to(target) < 2
-        (told,) = stage.events(PathsDecided)
-        assert told.decided.decision == "layers"
-        assert "north/1 and north/2" in told.decided.why
+        (received,) = stage.events(PathsCompared)
+        assert received.deconfliction.decision == "layers"
+        assert "north/1 and north/2" in received.deconfliction.reason
         assert not stage.events(TooClose)
 
 
-async def test_ways_that_cross_are_refused_and_nothing_is_sent() -> None:
+async def test_go_to_refused_separation_sends_nothing() -> None:
     async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
         await stage.take_off()
-        plan = stage.fleet.plan_apart(swapped(stage), by="refuse")
+        plan = stage.fleet.plan_separation(swapped(stage), by="refuse")
         assert plan.decision == "refused"
         with pytest.raises(OperationRejected, match="nothing was sent"):
-            await stage.fleet.go_to(swapped(stage), apart=plan)
+            await stage.fleet.go_to(swapped(stage), separation=plan)
         onto = {"north/1": stage.fleet.vehicles["north/2"].position.value}
         with pytest.raises(OperationRejected, match="north/2"):
             await stage.fleet.go_to(onto)
         assert not stage.orders_to("north/1")
         with pytest.raises(InvalidArgument, match="speed_m_s"):
-            stage.fleet.plan_apart(onto, by="corridors")
+            stage.fleet.plan_separation(onto, by="corridors")
 
 
-async def test_corridors_are_flown_one_after_the_other() -> None:
+async def test_go_to_with_corridors_delays_starts() -> None:
     async with open_stage(2, spacing_m=30) as stage:
         await stage.take_off()
         one, other = (each.position.value for each in stage.fleet.vehicles.values())
@@ -76,41 +76,39 @@ async def test_corridors_are_flown_one_after_the_other() -> None:
             "north/1": one.offset(north_m=30, east_m=30),
             "north/2": other.offset(north_m=30, east_m=-30),
         }
-        plan = stage.fleet.plan_apart(targets, min_distance_m=8, by="corridors", speed_m_s=5, slack_s=2)
+        plan = stage.fleet.plan_separation(targets, min_distance_m=8, by="corridors", speed_m_s=5, slack_s=2)
         assert plan.decision == "corridors"
         assert plan.delays_s["north/2"] >= 3
         tracks = [record_track(each) for each in stage.copters.values()]
-        (await stage.fleet.go_to(targets, apart=plan, speed_m_s=5)).raise_for_errors()
-        assert least_distance_m(*tracks)[0] > 7
+        (await stage.fleet.go_to(targets, separation=plan, speed_m_s=5)).raise_for_errors()
+        assert min_distance_m(*tracks)[0] > 7
 
 
-async def test_two_that_come_too_near_hold_both_and_only_ours() -> None:
+async def test_too_close_members_hold_if_program_flies_them() -> None:
     async with open_stage(3, spacing_m=20, min_distance_m=6.0) as stage:
         await stage.take_off()
         stage.pilot_takes("north/2")
         stage.forget()
         one = stage.fleet.vehicles["north/1"]
         with pytest.raises(OperationRejected, match="another order"):
-            await one.go_to(stage.fleet.vehicles["north/3"].position.value)  # by itself: nobody has compared
+            await one.go_to(stage.fleet.vehicles["north/3"].position.value)  # the vehicle's own go_to compares no paths
         await anyio.sleep(3)
         first = stage.events(TooClose)
-        assert [(each.member, each.other, each.ordered) for each in first] == [
-            ("north/1", "north/2", ("north/1",))
-        ]
+        assert [(each.member, each.other, each.ordered) for each in first] == [("north/1", "north/2", ("north/1",))]
         assert first[0].distance_m < 6
         assert stage.modes == {"north/1": "BRAKE", "north/2": "LOITER", "north/3": "GUIDED"}
         assert stage.orders_to("north/2") == []
 
 
-async def test_it_may_only_be_told() -> None:
-    async with open_stage(2, spacing_m=20, min_distance_m=6.0, too_close="tell") as stage:
+async def test_too_close_report_only_sends_no_orders() -> None:
+    async with open_stage(2, spacing_m=20, min_distance_m=6.0, on_too_close="report") as stage:
         await stage.take_off()
         vehicle = stage.fleet.vehicles["north/1"]
         await vehicle.go_to(stage.fleet.vehicles["north/2"].position.value.offset(east_m=-3))
         await vehicle.go_to(vehicle.position.value.offset(east_m=-15))
         await vehicle.go_to(vehicle.position.value.offset(east_m=15))
-        told = stage.events(TooClose)
-        assert [each.ordered for each in told] == [(), ()]  # once for each time
+        received = stage.events(TooClose)
+        assert [each.ordered for each in received] == [(), ()]  # once for each approach
         assert stage.mode_of("north/2") == "GUIDED"
 
 
@@ -125,10 +123,10 @@ def mission_of(row: float) -> Mission:
     )
 
 
-async def test_missions_are_distributed_and_started_together() -> None:
+async def test_missions_upload_and_start_together() -> None:
     async with open_stage(3) as stage:
         missions = {name: mission_of(10.0 * number) for number, name in enumerate(stage.copters)}
-        with pytest.raises(OperationRejected, match=r"upload\(\) comes first"):
+        with pytest.raises(OperationRejected, match=r"call upload\(\) first"):
             await stage.fleet.start_missions()
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.upload(missions)).raise_for_errors()
@@ -137,20 +135,17 @@ async def test_missions_are_distributed_and_started_together() -> None:
         (await stage.fleet.arm()).raise_for_errors()
         (await stage.fleet.start_missions()).raise_for_errors()
         starts = [
-            at
-            for name in stage.copters
-            for at, each in stage.orders_to(name)
-            if each.command == MavCmd.MISSION_START
+            at for name in stage.copters for at, each in stage.orders_to(name) if each.command == MavCmd.MISSION_START
         ]
         assert len(starts) == 3
         assert max(starts) - min(starts) < 0.5
         (await stage.fleet.wait_missions_finished(timeout=200)).raise_for_errors()
         assert all(each.motion.is_on_ground for each in stage.copters.values())
-        assert all(each.state is MemberState.IN for each in stage.fleet)
+        assert all(each.state is MemberState.ACTIVE for each in stage.fleet)
 
 
-async def test_nobody_starts_when_one_has_not_taken_its_mission() -> None:
-    async with open_stage(2, on_error="go_on") as stage:
+async def test_start_missions_after_failed_upload_starts_none() -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
         missions = {name: mission_of(10.0 * number) for number, name in enumerate(stage.copters)}
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.upload(missions)).raise_for_errors()
@@ -160,21 +155,21 @@ async def test_nobody_starts_when_one_has_not_taken_its_mission() -> None:
         with pytest.raises(FleetError, match="north/2"):
             await stage.fleet.upload(changed)
         stage.copters["north/2"].faults.silent = False
-        with pytest.raises(OperationRejected, match=r"upload\(\) comes first"):
+        with pytest.raises(OperationRejected, match=r"call upload\(\) first"):
             await stage.fleet.start_missions()
         assert all(each.motion.is_on_ground for each in stage.copters.values())
 
 
-async def test_missions_whose_ways_meet_are_refused() -> None:
+async def test_upload_conflicting_missions_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()
-        with pytest.raises(OperationRejected, match="come too near"):
+        with pytest.raises(OperationRejected, match="come too close"):
             await stage.fleet.upload({"north/1": mission_of(10), "north/2": mission_of(10)})
-        (told,) = stage.events(PathsDecided)
-        assert told.decided.conflicts[0].distance_m == pytest.approx(0, abs=0.1)
+        (received,) = stage.events(PathsCompared)
+        assert received.deconfliction.conflicts[0].distance_m == pytest.approx(0, abs=0.1)
 
 
-async def test_a_formation_is_taken_and_kept_while_the_leader_moves() -> None:
+async def test_formation_is_formed_and_kept_while_leader_moves() -> None:
     async with open_stage(4) as stage:
         await stage.take_off()
         names = ["north/2", "north/3", "north/4"]
@@ -196,7 +191,7 @@ async def test_a_formation_is_taken_and_kept_while_the_leader_moves() -> None:
 
 
 @pytest.mark.parametrize("policy", ["hold_others", "land_others"])
-async def test_when_the_leader_is_taken_over_the_followers_hold(policy: str) -> None:
+async def test_following_leader_taken_over_makes_followers_hold(policy: str) -> None:
     async with open_stage(3, on_error=policy) as stage:
         await stage.take_off()
         line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
@@ -210,8 +205,8 @@ async def test_when_the_leader_is_taken_over_the_followers_hold(policy: str) -> 
         assert stage.modes == {"north/1": "LOITER", "north/2": "BRAKE", "north/3": "BRAKE"}
 
 
-async def test_errors_of_form_call_it_form_and_name_who_is_not_where_one_knows() -> None:
-    async with open_stage(3, min_distance_m=5.0, on_error="go_on") as stage:
+async def test_form_errors_name_action_and_member() -> None:
+    async with open_stage(3, min_distance_m=5.0, on_error="continue_others") as stage:
         with pytest.raises(InvalidArgument, match="there are no groups"):
             stage.fleet.group("alpha")
         await stage.take_off()
@@ -232,7 +227,7 @@ async def test_errors_of_form_call_it_form_and_name_who_is_not_where_one_knows()
             await stage.fleet.go_to(lambda each: each.vehicle.position.fresh(1).offset(north_m=1))
 
 
-async def test_when_the_leader_is_lost_the_followers_hold() -> None:
+async def test_following_leader_lost_makes_followers_hold() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
         line = Formation.line(["north/2"], 8.0, frame="north")
@@ -245,8 +240,8 @@ async def test_when_the_leader_is_lost_the_followers_hold() -> None:
         assert stage.mode_of("north/2") == "BRAKE"
 
 
-async def test_the_program_in_the_block_is_told_at_once_that_nobody_follows_any_more() -> None:
-    async with open_stage(3, on_error="go_on") as stage:
+async def test_following_raise_if_stopped_raises_after_leader_takeover() -> None:
+    async with open_stage(3, on_error="continue_others") as stage:
         await stage.take_off()
         line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
         async with stage.fleet.following(line, leader="north/1") as following:
@@ -262,15 +257,15 @@ async def test_the_program_in_the_block_is_told_at_once_that_nobody_follows_any_
                 while True:
                     following.raise_if_stopped()
                     await anyio.sleep(0.1)
-        (told,) = stage.events(FollowingStopped)  # and leaving the block does not raise it again
-        assert told.member == "north/1"
-        assert "the leader north/1 is taken over: the mode changed to LOITER" in told.why
-        assert told.orders == {"north/2": "hold"}
-        assert told.left_alone == {"north/3": "taken over: the mode changed to LOITER"}
+        (received,) = stage.events(FollowingStopped)  # leaving the block does not raise again
+        assert received.member == "north/1"
+        assert "the leader north/1 is taken over: the mode changed to LOITER" in received.reason
+        assert received.orders == {"north/2": "hold"}
+        assert received.skipped == {"north/3": "taken over: the mode changed to LOITER"}
         assert stage.modes == {"north/1": "LOITER", "north/2": "BRAKE", "north/3": "LOITER"}
 
 
-async def test_it_is_told_before_the_others_have_landed_by_policy() -> None:
+async def test_following_stopped_is_published_before_policy_completes() -> None:
     async with open_stage(3, on_error="land_others") as stage:
         await stage.take_off()
         line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
@@ -280,14 +275,14 @@ async def test_it_is_told_before_the_others_have_landed_by_policy() -> None:
                 stage.pilot_takes("north/3")
                 with anyio.fail_after(3):
                     assert "north/3" in await following.wait_stopped()
-        told = [each for each in stage.events() if isinstance(each, (FollowingStopped, PolicyCarriedOut))]
-        assert len(told) == 1
-        assert isinstance(told[0], FollowingStopped)
-        assert told[0].orders == {"north/2": "land"}
-        assert list(told[0].left_alone) == ["north/3"]
+        received = [each for each in stage.events() if isinstance(each, (FollowingStopped, PolicyCompleted))]
+        assert len(received) == 1
+        assert isinstance(received[0], FollowingStopped)
+        assert received[0].orders == {"north/2": "land"}
+        assert list(received[0].skipped) == ["north/3"]
 
 
-async def test_a_block_that_is_left_is_not_told_of() -> None:
+async def test_following_block_exit_publishes_no_event() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()
         line = Formation.line(["north/2"], 8.0, frame="north")
@@ -298,7 +293,7 @@ async def test_a_block_that_is_left_is_not_told_of() -> None:
         assert await following.wait_stopped() == ""
 
 
-async def test_a_mistake_of_the_programs_policy_is_why_nobody_follows() -> None:
+async def test_following_policy_function_error_makes_followers_hold() -> None:
     def wrong(_: object) -> None:
         raise ZeroDivisionError("mine")
 
@@ -310,13 +305,13 @@ async def test_a_mistake_of_the_programs_policy_is_why_nobody_follows() -> None:
                 await anyio.sleep(3)
                 stage.pilot_takes("north/3")
                 await following.wait_stopped()
-        (told,) = stage.events(FollowingStopped)
-        assert told.orders == {"north/2": "hold"}
+        (received,) = stage.events(FollowingStopped)
+        assert received.orders == {"north/2": "hold"}
         assert stage.mode_of("north/2") == "BRAKE"
 
 
-async def test_a_follower_that_is_taken_over_leaves_it_to_the_policy() -> None:
-    async with open_stage(3, on_error="go_on") as stage:
+async def test_following_continues_after_takeover_of_one_follower() -> None:
+    async with open_stage(3, on_error="continue_others") as stage:
         await stage.take_off()
         line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
         async with stage.fleet.following(line, leader="north/1") as following:
@@ -328,7 +323,7 @@ async def test_a_follower_that_is_taken_over_leaves_it_to_the_policy() -> None:
         assert stage.modes == {"north/1": "GUIDED", "north/2": "LOITER", "north/3": "BRAKE"}
 
 
-async def test_formations_that_make_no_sense_are_refused() -> None:
+async def test_invalid_formations_are_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         wrong: list[tuple[Formation, str, str]] = [
             (Formation({"north/9": Offset(10)}), "north/1", "north/9"),
@@ -340,7 +335,7 @@ async def test_formations_that_make_no_sense_are_refused() -> None:
                 stage.fleet.following(formation, leader=leader)
 
 
-def test_offsets_turn_with_the_heading() -> None:
+def test_formation_offset_rotates_with_heading() -> None:
     ahead = Formation({"a": Offset(10, 2, 1)}, "heading")
     east = ahead.offset_of("a", 90.0)
     assert (east.north_m, east.east_m, east.up_m) == pytest.approx((-2, 10, 1))
@@ -350,7 +345,7 @@ def test_offsets_turn_with_the_heading() -> None:
     assert math.hypot(*follow_velocity((100, 100, 0), (0, 0, 0), gain=1, max_speed_m_s=7)) == pytest.approx(7)
 
 
-async def test_corrections_go_out_once_for_each_link() -> None:
+async def test_send_corrections_sends_once_per_link() -> None:
     async with open_stage(2, networks=("north", "south")) as stage:
         stage.forget()
         message = b"\xd3\x00\xc8" + bytes(range(200)) + b"crc"
@@ -374,7 +369,7 @@ async def test_corrections_go_out_once_for_each_link() -> None:
         (720, [180] * 4),
     ],
 )
-def test_a_message_is_whole_when_four_are_there_or_one_is_not_full(size: int, lengths: list[int]) -> None:
+def test_rtcm_fragments_end_with_a_short_or_fourth_one(size: int, lengths: list[int]) -> None:
     pieces = fragments(bytes(size), 37)
     assert [each.len for each in pieces] == lengths
     assert {each.flags >> 3 for each in pieces} == {37 & 31}
@@ -382,7 +377,7 @@ def test_a_message_is_whole_when_four_are_there_or_one_is_not_full(size: int, le
     assert [each.flags >> 1 & 3 for each in pieces] == list(range(len(lengths)))
 
 
-def test_rtcm_messages_are_told_apart() -> None:
+def test_rtcm_messages_are_split() -> None:
     one, other = b"\xd3\x00\x02ab123", b"\xd3\x00\x00456"
     assert list(rtcm_messages(one + other)) == [one, other]
     assert list(rtcm_messages(b"no rtcm")) == [b"no rtcm"]
@@ -390,7 +385,7 @@ def test_rtcm_messages_are_told_apart() -> None:
         fragments(bytes(721), 0)
 
 
-async def test_a_px4_whose_mission_ends_is_not_taken_over() -> None:
+async def test_px4_after_mission_end_is_not_taken_over() -> None:
     async with (
         simulated_link([SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]) as link,
         fleet({"south": link}, count=2) as both,
@@ -412,17 +407,18 @@ async def test_a_px4_whose_mission_ends_is_not_taken_over() -> None:
         (await both.start_missions()).raise_for_errors()
         (await both.wait_missions_finished(timeout=300)).raise_for_errors()
         await anyio.sleep(5)
-        assert [each.state for each in both] == [MemberState.IN] * 2
+        assert [each.state for each in both] == [MemberState.ACTIVE] * 2
         assert both.vehicles["south/2"].mode_name == "LOITER"
-        (
-            await both["south/2"].go_to(lambda each: each.vehicle.position.value.offset(north_m=10))
-        ).raise_for_errors()
+        (await both["south/2"].go_to(lambda each: each.vehicle.position.value.offset(north_m=10))).raise_for_errors()
         (await both.land()).raise_for_errors()
 
 
-async def test_px4s_fly_as_a_fleet_and_a_pilot_is_noticed() -> None:
+async def test_px4_fleet_flies_and_detects_pilot() -> None:
     px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
-    async with simulated_link(px4s) as link, fleet({"south": link}, count=2, on_error="go_on") as both:
+    async with (
+        simulated_link(px4s) as link,
+        fleet({"south": link}, count=2, on_error="continue_others") as both,
+    ):
         for order in (both.wait_ready(), both.arm(), both.take_off(10)):
             (await order).raise_for_errors()
         (await both.go_to(lambda each: each.vehicle.position.value.offset(north_m=20))).raise_for_errors()
@@ -430,14 +426,14 @@ async def test_px4s_fly_as_a_fleet_and_a_pilot_is_noticed() -> None:
         async with both.following(line, leader="south/1") as following:
             await anyio.sleep(20)
             assert following.error_m("south/2") < 1.5
-        assert [each.state for each in both] == [MemberState.IN] * 2
+        assert [each.state for each in both] == [MemberState.ACTIVE] * 2
         px4s[0].switch_to(POSITION)
         await anyio.sleep(2)
         (await both.land()).raise_for_errors()
         assert both.members["south/1"].state is MemberState.TAKEN_OVER
 
 
-async def test_a_px4_that_has_landed_and_tells_its_next_mode_before_its_heartbeat_is_not_taken_over() -> None:
+async def test_px4_mode_report_before_heartbeat_is_no_takeover() -> None:
     px4s = [SimulatedPx4(system_id=each, boot_time_s=1.0, seed=each) for each in (1, 2)]
     async with simulated_link(px4s) as link, fleet({"south": link}, count=2) as both:
         for order in (both.wait_ready(), both.arm(), both.take_off(6)):
@@ -445,22 +441,22 @@ async def test_a_px4_that_has_landed_and_tells_its_next_mode_before_its_heartbea
         higher = both.vehicles["south/2"]
         await higher.go_to(higher.position.value.offset(up_m=6))
 
-        async def tell() -> None:
+        async def report_mode() -> None:
             while px4s[0].is_armed:  # noqa: ASYNC110
                 await anyio.sleep(0.01)
-            heard = both.vehicles["south/1"].armed.updated_at
+            updated_at = both.vehicles["south/1"].armed.updated_at
             px4s[0].send(m.CurrentMode(0, custom_mode(px4s[0].mode), custom_mode(px4s[0].mode)))
             await both.vehicles["south/1"].mode.wait_until(lambda mode: mode.name == "LOITER")
-            assert both.vehicles["south/1"].armed.updated_at == heard, "no HEARTBEAT came meanwhile"
+            assert both.vehicles["south/1"].armed.updated_at == updated_at, "no HEARTBEAT in between"
 
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(tell)
+            tasks.start_soon(report_mode)
             (await both.land()).raise_for_errors()
-        assert [each.state for each in both] == [MemberState.IN] * 2
+        assert [each.state for each in both] == [MemberState.ACTIVE] * 2
 
 
-async def test_one_that_falls_out_between_two_layers_stops_the_others_there() -> None:
-    async with open_stage(3, spacing_m=40, min_distance_m=5.0, on_error="go_on") as stage:
+async def test_takeover_between_layers_stops_others_there() -> None:
+    async with open_stage(3, spacing_m=40, min_distance_m=5.0, on_error="continue_others") as stage:
         await stage.take_off()
         here = [each.position.value for each in stage.fleet.vehicles.values()]
         targets = dict(zip(stage.copters, (here[1], here[0], here[2].offset(north_m=20)), strict=True))
@@ -473,12 +469,12 @@ async def test_one_that_falls_out_between_two_layers_stops_the_others_there() ->
         result = await stage.fleet.go_to(targets)
         await taking
         assert list(result.failed) == ["north/3"]
-        for name in ("north/1", "north/2"):  # up, and not across
+        for name in ("north/1", "north/2"):  # climbed, but not crossed
             assert stage.fleet.vehicles[name].distance_to(targets[name]) > 30
             assert stage.mode_of(name) == "GUIDED"
 
 
-async def test_place_or_mission_too_far_away_is_refused_before_anybody_flies() -> None:
+async def test_target_or_mission_too_far_away_is_rejected() -> None:
     far = Position(-47.0, -81.0, altitude_relative_m=20.0)
     async with open_stage(2) as stage:
         await stage.take_off()

@@ -1,4 +1,4 @@
-"""Targets of the protocols: each exchange with a vehicle that answers anything, and then nothing."""
+"""Fuzz targets of the protocols: each exchange with a vehicle that answers anything, and then nothing."""
 
 from __future__ import annotations
 
@@ -24,24 +24,22 @@ from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.missions import MissionClear, MissionSetCurrent
+from aerokit.protocols.missions import MissionClear, SetCurrentItem
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 
 __all__ = ["EXCHANGE_TARGETS"]
 
 MOST_ANSWERS, MOST_DEADLINES = 150, 3000
-LONGEST_TEXT = 4000
-_ITEMS = [
-    MissionItem(16, MavFrame.GLOBAL_RELATIVE_ALT, x=473977420 + n, y=85455940, z=20.0) for n in range(5)
-]
+MAX_TEXT_LENGTH = 4000
+_ITEMS = [MissionItem(16, MavFrame.GLOBAL_RELATIVE_ALT, x=473977420 + n, y=85455940, z=20.0) for n in range(5)]
 _WANTED = [Parameter("A", 1.5, ParameterType.REAL32), Parameter("B", 7, ParameterType.INT32)]
 _NAMES = ("A", "B", "C", "_HASH_CHECK", "", "\ufffd" * 5)
 Op = MavFtpOpcode
 
 
 class _Talk:
-    """An exchange, what it asked last, and a clock."""
+    """An exchange, its last request, and a clock."""
 
     def __init__(self, exchange: Exchange[Any], script: Script) -> None:
         self.exchange, self.script = exchange, script
@@ -70,7 +68,7 @@ class _Talk:
             self.exchange.result()
         except AerokitError as error:
             text = str(error)
-        assert len(text) < LONGEST_TEXT
+        assert len(text) < MAX_TEXT_LENGTH
 
     def _expire(self) -> None:
         deadline = self.exchange.deadline
@@ -96,7 +94,7 @@ class _Talk:
         self._take()
 
     def _message(self, message_class: type[Message], kind: int) -> Message:
-        """Any bytes; or near to what was asked for."""
+        """Any bytes, or a variation of the expected answer."""
         if kind < 90:
             return message_class.decode(self.script.take(self.script.byte() % (message_class.LENGTH + 1)))
         if message_class is m.FileTransferProtocol:
@@ -126,9 +124,7 @@ class _Talk:
             return bytes(array_length) if kind == "uint8_t" else (0,) * array_length
         if kind in ("float", "double"):
             return struct.unpack("<f", struct.pack("<f", self.script.number()))[0]
-        number = (
-            self.script.byte() if self.script.byte() < 200 else int.from_bytes(self.script.take(4), "little")
-        )
+        number = self.script.byte() if self.script.byte() < 200 else int.from_bytes(self.script.take(4), "little")
         if name in ("seq", "id", "ofs", "param_index", "count"):
             number = number % 8 * (LOG_BLOCK if name == "ofs" else 1) if number < 256 else number
         size = 8 * int(kind.strip("uint_")) // 8
@@ -136,14 +132,10 @@ class _Talk:
         return number - (1 << size) if kind[0] == "i" and number >> (size - 1) else number
 
     def _ftp_reply(self) -> bytes:
-        asked = (
-            FtpMessage.decode(self.last.payload) if isinstance(self.last, m.FileTransferProtocol) else None
-        )
+        asked = FtpMessage.decode(self.last.payload) if isinstance(self.last, m.FileTransferProtocol) else None
         asked = asked or FtpMessage(0, Op.READFILE, 0, 0, Op.NONE, offset=0, data=b"")
         choice = self.script.byte()
-        data = bytes((DATA_SIZE if choice < 150 else choice - 150,)) * (
-            DATA_SIZE if choice < 150 else choice - 150
-        )
+        data = bytes((DATA_SIZE if choice < 150 else choice - 150,)) * (DATA_SIZE if choice < 150 else choice - 150)
         ahead = 1 + (self.script.byte() if choice & 1 else 0)
         offset = asked.offset + (self.script.byte() * DATA_SIZE if choice & 2 else 0)
         if choice & 28 == 28:
@@ -172,19 +164,17 @@ EXCHANGES: dict[str, Callable[[], Exchange[Any]]] = {
     "command": _command,
     "ftp_request": lambda: FtpRequest(_client(), Op.OPENFILERO, path="/a", session=1, data=b"/a"),
     "ftp_download": lambda: FtpDownload(_client(), "/a", _sink(DATA_SIZE), session=1, size=5000),
-    "ftp_download_virtual": lambda: FtpDownload(
-        _client(), "@PARAM/param.pck", _sink(DATA_SIZE), session=1, size=0
-    ),
+    "ftp_download_virtual": lambda: FtpDownload(_client(), "@PARAM/param.pck", _sink(DATA_SIZE), session=1, size=0),
     "ftp_upload": lambda: FtpUpload(_client(), "/a", bytes(2000), session=1),
     "mission_download": lambda: MissionDownload(1, 1, window=4),
     "mission_download_one_by_one": lambda: MissionDownload(1, 1, window=1),
     "mission_upload": lambda: MissionUpload(1, 1, _ITEMS, window=4),
     "mission_upload_one_by_one": lambda: MissionUpload(1, 1, _ITEMS, window=1),
     "mission_clear": lambda: MissionClear(1, 1),
-    "mission_current": lambda: MissionSetCurrent(1, 1, 2),
+    "mission_current": lambda: SetCurrentItem(1, 1, 2),
     "parameter_list": lambda: ParameterList(1, 1, bytewise=False),
     "parameter_list_bytewise": lambda: ParameterList(1, 1, bytewise=True),
-    "parameter_reads": lambda: ParameterReads(1, 1, ["A", "B", "C"], bytewise=False, are_doubtful=True),
+    "parameter_reads": lambda: ParameterReads(1, 1, ["A", "B", "C"], bytewise=False, probe=True),
     "parameter_writes": lambda: ParameterWrites(1, 1, _WANTED, bytewise=True, before={"A": 0.0}),
     "setting_list": lambda: SettingList(1, 1),
     "setting_reads": lambda: SettingReads(1, 1, ["A", "B", "C"]),

@@ -1,4 +1,4 @@
-"""Targets of files from outside: plans, parameter files and packs, metadata, dialects."""
+"""Fuzz targets of files: plans, parameter files and packs, metadata, dialects."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from target import Target
 from aerokit.errors import FileFormatError, InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import Dialect
 from aerokit.missions import Mission
-from aerokit.missions.pack import unpack_items
 from aerokit.missions.plan_file import format_plan, parse_plan
 from aerokit.missions.waypoint_file import format_waypoints, parse_waypoints
+from aerokit.missions.wire import unpack_items
 from aerokit.parameters import (
     pack_parameters,
     parse_definition,
@@ -24,13 +24,13 @@ from aerokit.parameters import (
 )
 from aerokit.parameters.files import parameter_file_text
 from aerokit.parameters.pack import HEADER, read_header
-from aerokit.parameters.setting import setting_bytes, setting_value
+from aerokit.parameters.parameter import setting_bytes, setting_value
 
 __all__ = ["FILE_TARGETS"]
 
 
 def fuzz_plan(data: bytes) -> None:
-    """What is read is written, and read again as the same; with other items, too."""
+    """A plan that can be read is written and read again unchanged, also with other items."""
     try:
         plan = parse_plan(data.decode(errors="surrogateescape"))
     except FileFormatError:
@@ -44,7 +44,7 @@ def fuzz_plan(data: bytes) -> None:
 
 
 def fuzz_waypoints(data: bytes) -> None:
-    """What is read is written, and read again as the same."""
+    """A waypoint file that can be read is written and read again unchanged."""
     try:
         mission = parse_waypoints(data.decode(errors="surrogateescape"))
         text = format_waypoints(mission)
@@ -55,7 +55,7 @@ def fuzz_waypoints(data: bytes) -> None:
 
 
 def fuzz_parameter_file(data: bytes) -> None:
-    """What is read is written in each format, and read again as the same numbers."""
+    """A parameter file that can be read is written in each format, and read again with the same numbers."""
     try:
         file = parse_parameter_file(data.decode(errors="surrogateescape"))
     except FileFormatError:
@@ -71,7 +71,7 @@ def fuzz_parameter_file(data: bytes) -> None:
 
 
 def fuzz_parameter_pack(data: bytes) -> None:
-    """Each reader of packed files: a table, or our error."""
+    """Each reader of packed files returns a table, or raises our error."""
     with suppress(RemoteProtocolError):
         unpack_items(data)
     try:
@@ -88,7 +88,7 @@ def fuzz_parameter_pack(data: bytes) -> None:
 
 
 def fuzz_metadata(data: bytes) -> None:
-    """What is said of each parameter can be used with any number."""
+    """All metadata that can be read accepts any number."""
     try:
         metadata = parse_metadata(data)
     except FileFormatError:
@@ -96,12 +96,12 @@ def fuzz_metadata(data: bytes) -> None:
     for name, known in metadata.items():
         for value in (0, 5, -1.5, math.inf, math.nan, 1e300, *known.values):
             assert isinstance(known.describe(value), str)
-            known.complaint(value)
+            known.problem(value)
         assert name == known.name
 
 
 def fuzz_camera_definition(data: bytes) -> None:
-    """Whatever it says, each setting takes a value or refuses it, while the others have any of their options."""
+    """Each setting of any definition accepts a value or raises, for any options of the others."""
     try:
         camera = parse_definition(data)
     except FileFormatError:
@@ -109,7 +109,7 @@ def fuzz_camera_definition(data: bytes) -> None:
     values = {name: each.options[-1].value for name, each in camera.settings.items() if each.options}
     for told in ({}, values):
         for name, each in camera.localized("de").settings.items():
-            assert name not in camera.rulers(name)
+            assert name not in camera.dependencies(name)
             for value in (
                 0,
                 1.5,
@@ -125,7 +125,7 @@ def fuzz_camera_definition(data: bytes) -> None:
 
 
 def fuzz_dialect(data: bytes) -> None:
-    """A dialect whose messages can be made, sent and read, or our error."""
+    """A dialect whose messages can be created, sent and read, or our error."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "fuzzed.xml"
         path.write_bytes(data)

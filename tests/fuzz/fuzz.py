@@ -1,8 +1,8 @@
 """Fuzzing from the command line: ``python tests/fuzz/fuzz.py [--runs N] [TARGET …]``; see ``nox -s fuzz``.
 
-With atheris, which follows what code an input reaches, where it is installed; else with random bytes and changed
-pieces of the corpus. Each target runs in a process of its own, as an input that fails ends it. Such an input is left in
-``fuzz-failures/``: mend the fault, and put the file into ``tests/fuzz/corpus/TARGET/``.
+Uses atheris, which is coverage-guided, if it is installed, else random bytes and mutations of the corpus. Each target
+runs in its own process, because a failing input ends it. Failing inputs are stored in ``fuzz-failures/``: fix the
+fault, and move the file to ``tests/fuzz/corpus/TARGET/``.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Fuzz aerokit.")
     parser.add_argument("targets", nargs="*", metavar="TARGET", help="all of them by default")
     parser.add_argument("--runs", type=int, default=RUNS, help=f"inputs for each target ({RUNS})")
-    parser.add_argument(
-        "--grow", type=Path, metavar="DIR", help="keep inputs that reach new code there, by target"
-    )
+    parser.add_argument("--grow", type=Path, metavar="DIR", help="keep inputs that reach new code there, by target")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--plain", action="store_true", help="without atheris")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
@@ -87,7 +85,7 @@ def fuzz_with_atheris(name: str, options: argparse.Namespace) -> None:
     with atheris.instrument_imports(include=["aerokit"]):
         from targets import TARGETS
 
-        TARGETS[name](b"")  # what is imported at the first use
+        TARGETS[name](b"")  # imports on first use
     folders = [str(CORPUS / name)] if (CORPUS / name).is_dir() else []
     if options.grow is not None:
         grown = options.grow / name
@@ -100,7 +98,7 @@ def fuzz_with_atheris(name: str, options: argparse.Namespace) -> None:
 
 
 def changed(known: list[bytes], chance: random.Random, longest: int) -> bytes:
-    """An input of the corpus with some bytes changed, cut out or put in; or random ones."""
+    """Return an input of the corpus with some bytes changed, removed or inserted, or random bytes."""
     if not known or chance.random() < 0.3:
         return chance.randbytes(chance.randrange(longest))
     data = bytearray(chance.choice(known))

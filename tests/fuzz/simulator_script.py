@@ -1,6 +1,6 @@
-"""Bytes as a script of what a simulated vehicle hears: messages, commands, parameters, plans, noise, and time.
+"""Interprets bytes as a script for a simulated vehicle: messages, commands, parameters, plans, noise, time.
 
-The bytes choose, the grammar makes most of it valid: a fuzzer that had to find checksums and target ids by itself would
+The bytes choose, and the grammar makes most choices valid. A fuzzer that had to find checksums and target ids would
 never get past the framer.
 """
 
@@ -14,7 +14,7 @@ from aerokit.mavlink import STANDARD, Framer, Message
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.frame import MAGIC_V2, x25
-from aerokit.sim.parameters import Parameters
+from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle
 
 __all__ = ["Script", "play"]
@@ -26,12 +26,12 @@ NUMBERS = (
     *(0.5, 1e-30, 1e9, -1e9, 1e30, -1e30, 3.4e38, -3.4e38, 21196.0, 65535.0, 2147483647.0, -2147483648.0),
     *(47.397742, 8.545594, 473977420.0, 85455940.0, 4294967296.0, 16777217.0, math.nan, math.inf, -math.inf),
 )
-LONGEST_WAIT_S = 20.0
+MAX_WAIT_S = 20.0
 _SENDER = (255, 190)
 
 
 def wire_offsets(message_class: type[Message]) -> dict[str, int]:
-    """Where each field begins in a payload."""
+    """Return the offset of each field in a payload."""
     base = [field for field in message_class.FIELDS if not field.extension]
     base.sort(key=lambda field: -_size(field.type))
     offsets, at = {}, 0
@@ -46,7 +46,7 @@ def _size(kind: str) -> int:
 
 
 def framed(message_id: int, payload: bytes, sequence: int) -> bytes:
-    """A MAVLink 2 frame of a ground station, whatever its payload says."""
+    """Return a MAVLink 2 frame of a ground station with any payload."""
     payload = payload.rstrip(b"\0") or b"\0"
     header = bytes((len(payload), 0, 0, sequence & 0xFF, *_SENDER)) + message_id.to_bytes(3, "little")
     crc = x25(header + payload + STANDARD.extras[message_id])
@@ -54,7 +54,7 @@ def framed(message_id: int, payload: bytes, sequence: int) -> bytes:
 
 
 class Script:
-    """Reads one choice after the other out of the bytes; zeros when they have come to their end."""
+    """Reads choices from the bytes; zeros after their end."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -72,7 +72,7 @@ class Script:
         return self._data[self._at - count : self._at].ljust(count, b"\0")
 
     def number(self) -> float:
-        """One that is known to hurt, or any 32 bits."""
+        """A known troublesome number, or any 32 bits."""
         code = self.byte()
         if code < 200:
             return NUMBERS[code % len(NUMBERS)]
@@ -117,7 +117,7 @@ class _Player:
         self.hear(framed(message_id, payload, self.sequence))
 
     def _wait(self) -> None:
-        self.wait(self.script.byte() ** 2 / 255**2 * LONGEST_WAIT_S)
+        self.wait(self.script.byte() ** 2 / 255**2 * MAX_WAIT_S)
 
     def _noise(self) -> None:
         self.hear(self.script.take(self.script.byte()))
@@ -141,14 +141,12 @@ class _Player:
         return x, y, self.script.number()
 
     def _message(self) -> None:
-        """Any bytes in a message that it listens to, mostly with its own ids."""
+        """Any bytes in a message that the vehicle processes, mostly with its own ids."""
         message_class = STANDARD[self.ids[self.script.byte() % len(self.ids)]]
-        self._send_to_it(
-            message_class, bytearray(self.script.take(self.script.byte() % (message_class.LENGTH + 1)))
-        )
+        self._send_to_it(message_class, bytearray(self.script.take(self.script.byte() % (message_class.LENGTH + 1))))
 
     def _message_of_numbers(self) -> None:
-        """The same, but each number is one that is known to hurt."""
+        """The same, with known troublesome numbers."""
         message_class = STANDARD[self.ids[self.script.byte() % len(self.ids)]]
         payload = bytearray(message_class.LENGTH)
         offsets = wire_offsets(message_class)
@@ -176,9 +174,9 @@ class _Player:
         if not names:
             return
         name = names[number % len(names)]
-        kind = parameters.type(name) if isinstance(parameters, Parameters) else 9
+        kind = parameters.type(name) if isinstance(parameters, SimParameters) else 9
         value = self.script.number()
-        if kind == 6 and not hasattr(self.vehicle, "guided") and math.isfinite(value):  # PX4: the bits of it
+        if kind == 6 and not hasattr(self.vehicle, "guided") and math.isfinite(value):  # PX4 expects its bits
             (value,) = _F32.unpack(struct.pack("<i", max(-(1 << 31), min((1 << 31) - 1, int(value)))))
         try:
             self.say(m.ParamSet(self.vehicle.system_id, 1, name, value, kind))
@@ -186,7 +184,7 @@ class _Player:
             return
 
     def _plan(self) -> None:
-        """A whole upload of some items, and perhaps a start."""
+        """A complete upload of some items, and perhaps a mission start."""
         kind, count = self.script.byte() % 3, self.script.byte() % 6
         target = (self.vehicle.system_id, 1)
         self.say(m.MissionCount(*target, count, kind))
@@ -206,7 +204,7 @@ class _Player:
 
 
 def play(vehicle: SimulatedVehicle, data: bytes, most_steps: int = 60) -> None:
-    """Let the vehicle hear it, and see that it goes on afterwards and has sent nothing but frames."""
+    """Run the script, and check that the vehicle survives and sends only valid frames."""
     player = _Player(vehicle, Script(data))
     for _ in range(most_steps):
         if not player.script.has_more:

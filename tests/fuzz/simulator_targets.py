@@ -1,4 +1,4 @@
-"""Targets of the simulator: each kind of vehicle, on the ground, in the air, and while it boots."""
+"""Fuzz targets of the simulator: each vehicle type on the ground, in the air, and while it boots."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from target import Target
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd
-from aerokit.sim import RecordedVehicle
 from aerokit.sim.components import SimulatedCamera, SimulatedGimbal
 from aerokit.sim.kinds import kind_names, simulated
 from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.testing import RecordedVehicle
 
 __all__ = ["SIMULATOR_TARGETS"]
 
@@ -31,7 +31,7 @@ def _tell(vehicle: SimulatedVehicle, command: int, *params: float) -> None:
 
 
 def take_off(vehicle: SimulatedVehicle, kind: str) -> None:
-    """In the air, or on the way."""
+    """A vehicle in the air, or taking off."""
     if kind in _MODES:
         _tell(vehicle, MavCmd.DO_SET_MODE, 1, _MODES[kind])
     _tell(vehicle, MavCmd.COMPONENT_ARM_DISARM, 1, _FORCE)

@@ -1,4 +1,4 @@
-"""What a fuzz target is: one function that takes bytes, and what it may raise."""
+"""`Target`: a function that takes bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FuzzOne = Callable[[bytes], None]
 
 @dataclass(frozen=True)
 class Target:
-    """``fuzz_one`` raises AssertionError, or what it tests does, when something is wrong; ``longest`` bytes go in."""
+    """``fuzz_one`` raises AssertionError, or any other error, for a fault. ``longest`` is the maximum input size."""
 
     name: str
     fuzz_one: FuzzOne

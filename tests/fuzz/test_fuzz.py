@@ -1,4 +1,4 @@
-"""Each fuzz target on its corpus, and on a bounded number of inputs made of it; ``nox -s fuzz`` goes further."""
+"""Runs each fuzz target on its corpus, and on a limited number of mutations; ``nox -s fuzz`` runs more."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from targets import TARGETS
 
 HERE = Path(__file__).parent
 CORPUS = HERE / "corpus"
-KNOWN = {name: [path.read_bytes() for path in sorted((CORPUS / name).iterdir())] for name in TARGETS}
+RECOGNIZED = {name: [path.read_bytes() for path in sorted((CORPUS / name).iterdir())] for name in TARGETS}
 
 edits = st.tuples(st.floats(0, 1), st.integers(0, 4), st.binary(max_size=4))
-"""Where, how many bytes are cut out there, and what is put in."""
+"""Position, number of bytes to remove there, and bytes to insert."""
 
 
 def edited(data: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
@@ -29,16 +29,14 @@ def edited(data: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
 
 
 @for_each("path", sorted(CORPUS.glob("*/*")))
-def test_known_inputs(path: Path) -> None:
+def test_known_fuzz_inputs(path: Path) -> None:
     TARGETS[path.parent.name](path.read_bytes())
 
 
 @pytest.mark.parametrize("examples", [8, exhaustive(40)])
 @pytest.mark.parametrize("name", TARGETS)
-def test_other_inputs(name: str, examples: int) -> None:
-    inputs = st.builds(edited, st.sampled_from(KNOWN[name]), st.lists(edits, max_size=6)) | st.binary(
-        max_size=300
-    )
+def test_random_fuzz_inputs(name: str, examples: int) -> None:
+    inputs = st.builds(edited, st.sampled_from(RECOGNIZED[name]), st.lists(edits, max_size=6)) | st.binary(max_size=300)
 
     @settings(max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
     @given(inputs)
@@ -48,12 +46,12 @@ def test_other_inputs(name: str, examples: int) -> None:
     fuzz()
 
 
-def test_each_folder_of_the_corpus_is_of_a_target() -> None:
+def test_corpus_folders_match_targets() -> None:
     assert {path.name for path in CORPUS.iterdir()} == set(TARGETS)
 
 
 @pytest.mark.exhaustive
-def test_the_command_line_finds_what_is_wrong(tmp_path: Path) -> None:
+def test_fuzz_command_line_reports_crash(tmp_path: Path) -> None:
     command = [sys.executable, str(HERE / "fuzz.py"), "--plain", "--runs", "20", "address", "waypoints"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""Targets of the wire: framer, decoder, signing, recordings, addresses."""
+"""Fuzz targets of the wire: framer, decoder, signing, recordings, addresses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, x25
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import Signing, SigningKey
 from aerokit.mavlink.tlog import read_tlog
-from aerokit.sim import RecordedVehicle
+from aerokit.testing import RecordedVehicle
 from aerokit.transport import parse_address
 from aerokit.transport.create import create_link
 
@@ -23,9 +23,9 @@ _IDS = sorted(STANDARD.rows)
 
 
 def fuzz_framer(data: bytes) -> None:
-    """Any bytes, in one piece and in two: the same frames, nothing raised, nothing lost count of.
+    """Any bytes, in one piece and in two, give the same frames and counts, and raise nothing.
 
-    Of unknown messages nobody can check the checksum: what is taken for one depends on what is there of it.
+    Frames of unknown messages are excepted: without a checksum, they depend on how much of the data is available.
     """
     whole, parts, all_of_it = Framer(), Framer(), Framer()
     all_of_it.keep_unknown = True
@@ -39,13 +39,13 @@ def fuzz_framer(data: bytes) -> None:
 
 
 def decode(message: Message) -> None:
-    """What is done with every message: shown, compared, and sent again by some."""
+    """Use a message in every way: format it, compare it, send it again."""
     assert message == message
     assert repr(message)
     assert len(message.to_dict()) == len(message.FIELDS)
     try:
         again = type(message).decode(message.encode())
-    except InvalidArgument:  # what was no UTF-8 takes more room than it had
+    except InvalidArgument:  # invalid UTF-8 can become longer
         assert any("\ufffd" in str(value) for value in message.to_dict().values())
         return
     assert again == message
@@ -58,7 +58,7 @@ def fuzz_decoder(data: bytes) -> None:
 
 
 def fuzz_signing(data: bytes) -> None:
-    """Frames with any signature: refused, whatever they are; those that we sign are let in, once."""
+    """Frames with any signature are refused; those that we sign are accepted once."""
     ours, theirs = Signing(_KEY, link_id=1), Signing(_KEY, link_id=2)
     for frame in Framer().receive(data, 1.0):
         assert not theirs.accepts(frame) or frame.message_id == 109
@@ -78,14 +78,14 @@ def _checked(body: bytes) -> bytes:
 
 
 def fuzz_tlog(data: bytes) -> None:
-    """Any file: records with whole frames in them, or nothing."""
+    """Any file gives records with whole frames, or nothing."""
     for time, raw in read_tlog(io.BytesIO(data)):
         assert 0 <= time < 1 << 33
         assert len(raw) <= 280
 
 
 def fuzz_recording(data: bytes) -> None:
-    """Any recording as a vehicle: it plays, or says that there is none."""
+    """Any recording plays as a vehicle, or raises that there is none."""
     try:
         vehicle = RecordedVehicle(io.BytesIO(data))
     except InvalidArgument:
@@ -96,7 +96,7 @@ def fuzz_recording(data: bytes) -> None:
 
 
 def fuzz_address(data: bytes) -> None:
-    """Any text: an address that says the same when it is written again, or our error."""
+    """Any text is an address that formats to itself, or raises our error."""
     try:
         address = parse_address(data.decode(errors="surrogateescape"))
     except InvalidArgument:

@@ -29,9 +29,9 @@ from aerokit.sim import (
     SimulatorServer,
     simulated_link,
 )
-from aerokit.sim.journal import Journal
 from aerokit.testing import FaultModel, FaultyLink
-from aerokit.transport import Link, SeveralLinks, memory_link_pair
+from aerokit.testing.journal import Journal
+from aerokit.transport import Link, MultiLink, memory_link_pair
 
 __all__ = ["SCENES", "recorded"]
 
@@ -51,7 +51,7 @@ SCENES: dict[str, Scene] = {}
 
 
 def recorded(name: str) -> str:
-    """Play it, and write down what went over the wire under what it is about."""
+    """Play the scene and record its traffic under its title."""
     scene = SCENES[name]
     if name == "dronekit_script":
         return _text(scene, dronekit_script())
@@ -126,13 +126,13 @@ async def _connect(trace: Trace, simulated: SimulatedCopter | SimulatedPx4) -> N
 
 @scene(show=[RATES], max_alike=100)
 async def connect_ardupilot(trace: Trace) -> None:
-    """Connecting to ArduCopter until it is ready: what is asked for, at which rates, and what it says of itself."""
+    """Connecting to ArduCopter until it is ready: the requested messages and rates, and its answers."""
     await _connect(trace, copter())
 
 
 @scene(show=[RATES], max_alike=100)
 async def connect_px4(trace: Trace) -> None:
-    """Connecting to PX4 until it is ready: what is asked for, at which rates, and what it says of itself."""
+    """Connecting to PX4 until it is ready: the requested messages and rates, and its answers."""
     await _connect(trace, px4())
 
 
@@ -148,7 +148,7 @@ async def own_heartbeat(trace: Trace) -> None:
 
 @scene()
 async def arm_and_disarm(trace: Trace) -> None:
-    """Arming and disarming ArduCopter: an order is done when HEARTBEAT says so."""
+    """Arming and disarming ArduCopter: an order is done when HEARTBEAT reports it."""
     async with connected(trace, copter()) as vehicle:
         await vehicle.arm()
         await vehicle.disarm()
@@ -156,7 +156,7 @@ async def arm_and_disarm(trace: Trace) -> None:
 
 @scene(show=["STATUSTEXT", RATES])
 async def arm_refused(trace: Trace) -> None:
-    """ArduCopter refuses to arm: its pre-arm checks are run, to say why."""
+    """ArduCopter refuses to arm: its pre-arm checks are run for the reasons."""
     simulated = copter()
     async with connected(trace, simulated) as vehicle:
         simulated.faults.prearm_failures.append("Compass not healthy")
@@ -221,14 +221,14 @@ async def set_mode_px4(trace: Trace) -> None:
 
 @scene()
 async def set_mode_fallback(trace: Trace) -> None:
-    """Firmware that does not know MAV_CMD_DO_SET_MODE gets the older SET_MODE."""
+    """Firmware without MAV_CMD_DO_SET_MODE gets the older SET_MODE."""
     async with connected(trace, copter(unsupported_commands=[MavCmd.DO_SET_MODE])) as vehicle:
         await vehicle.set_mode("GUIDED")
 
 
 @scene()
 async def go_to_overtaken(trace: Trace) -> None:
-    """A newer `go_to` takes over from an older one: nothing of the older one is sent any more."""
+    """A newer `go_to` supersedes an older one: nothing more of the older one is sent."""
     async with connected(trace, copter(), airborne=True) as vehicle:
         near, far = north_of(vehicle, 10, 100)
         async with anyio.create_task_group() as tasks:
@@ -247,7 +247,7 @@ async def go_to_overtaken(trace: Trace) -> None:
 
 @scene()
 async def go_to_cancelled(trace: Trace) -> None:
-    """A `go_to` that the program gives up ends in holding."""
+    """A cancelled `go_to` ends in a hold."""
     async with connected(trace, copter(), airborne=True) as vehicle:
         with anyio.move_on_after(2.0):
             await vehicle.go_to(*north_of(vehicle, 100))
@@ -304,7 +304,7 @@ async def mission_upload(trace: Trace) -> None:
 
 @scene()
 async def mission_upload_px4(trace: Trace) -> None:
-    """Uploading a mission to PX4, which tells a checksum; its first request is lost."""
+    """Uploading a mission to PX4, which reports a checksum; its first request is lost."""
     simulated = px4()
     async with connected(trace, simulated) as vehicle:
         simulated.faults.lose(m.MissionRequestInt, times=1)
@@ -391,7 +391,7 @@ async def gimbal(trace: Trace) -> None:
 
 @scene()
 async def camera_photo(trace: Trace) -> None:
-    """Taking a picture: it is taken when CAMERA_IMAGE_CAPTURED says so."""
+    """Taking a picture: done when CAMERA_IMAGE_CAPTURED reports it."""
     async with connected(trace, copter(components=[SimulatedCamera()])) as vehicle:
         await vehicle.camera.wait_found()
         trace.begin()
@@ -414,9 +414,7 @@ async def log_download(trace: Trace) -> None:
 async def fleet_take_off(trace: Trace) -> None:
     """A fleet of three arms and takes off."""
     copters = [
-        SimulatedCopter(
-            system_id=number, boot_time_s=0.0, seed=number, home=(47.3977, 8.5456 + number * 2e-4, 488.0)
-        )
+        SimulatedCopter(system_id=number, boot_time_s=0.0, seed=number, home=(47.3977, 8.5456 + number * 2e-4, 488.0))
         for number in (1, 2, 3)
     ]
     async with (
@@ -436,7 +434,7 @@ async def two_links(trace: Trace) -> None:
     pairs = [memory_link_pair(), memory_link_pair()]
     radios = [FaultyLink(near, FaultModel(), seed=number) for number, (near, _) in enumerate(pairs)]
     links: list[Link] = [Tap(radio, trace, name) for radio, name in zip(radios, "AB", strict=True)]
-    together = SeveralLinks([lambda: links[0], lambda: links[1]])
+    together = MultiLink([lambda: links[0], lambda: links[1]])
     ports: list[Link] = [far for _, far in pairs]
     async with SimulatorServer(copter(), ports), aerokit.connect(together) as vehicle:
         await vehicle.wait_ready()

@@ -29,15 +29,15 @@ ANSWERS = frozenset(
         "PARAM_VALUE",
     )
 )
-"""Incoming messages that are shown although they name no target; HEARTBEAT is shown when it says something new."""
+"""Incoming messages that are shown although they name no target; HEARTBEAT is shown when its content changes."""
 ROUTINE = frozenset(("HEARTBEAT", "SYSTEM_TIME", "TIMESYNC"))
-"""Messages that are not shown unless a scene asks for them, because they go on whatever the program does."""
+"""Messages that are shown only if a scene asks for them, because they are sent whatever the program does."""
 RATES = "SET_MESSAGE_INTERVAL"
 """Commands that ask for a rate are shown where a scene asks for them; their acknowledgements never are."""
 CLOCKS = frozenset(("flight_custom_version", "initial_timestamp", "time_boot_ms", "time_usec", "time_utc"))
-"""Fields that say nothing about the exchange, or come from the wall clock."""
+"""Fields that are irrelevant to the exchange, or come from the wall clock."""
 TELLING_ZEROS = frozenset(("param_index", "result", "seq", "type"))
-"""Fields whose zero says something; other zeros, and empty texts, are left out."""
+"""Fields whose zero is significant; other zeros, and empty texts, are omitted."""
 PLACES = frozenset(("lat", "latitude", "lon", "longitude", "x", "y"))
 MIN_DEGREES_1E7 = 1_000_000
 """Smaller numbers in fields for places are no degrees."""
@@ -58,7 +58,7 @@ class Line:
 
 
 class Trace:
-    """What is recorded of one exchange.
+    """Recording of one exchange.
 
     Args:
         show: names of further messages, or commands, that are shown.
@@ -72,12 +72,12 @@ class Trace:
         self._states: dict[str, str] = {}
 
     def begin(self) -> None:
-        """Record from here on; what was before is forgotten."""
+        """Record from here on and discard earlier traffic."""
         self._lines.clear()
         self._began_at = asyncio.get_running_loop().time()
 
     def note(self, text: str) -> None:
-        """Say what the program, or the world around it, does now."""
+        """Add a line about an action of the program, or of its environment."""
         self._add("#", "", text)
 
     def record(self, frame: Frame, *, is_sent: bool, link: str = "") -> None:
@@ -158,7 +158,7 @@ def text_of(message: Message) -> str:
 
 
 def _texts_of_fields(message: Message) -> Iterator[str]:
-    """By name; zeros and empty texts are left out."""
+    """Return the fields by name; zeros and empty texts are omitted."""
     for field in message.FIELDS:
         value: Any = getattr(message, field.name)
         is_empty = not (any(value) if isinstance(value, (bytes, tuple)) else value)
@@ -235,7 +235,7 @@ def _plain(value: Any, name: str) -> str:
 
 
 def _folded(lines: list[Line], max_alike: int) -> Iterator[str]:
-    """Of long runs the first three lines, how many follow, at what interval, and the last."""
+    """Fold long runs: the first three lines, the number and interval of the others, and the last line."""
     start = 0
     while start < len(lines):
         end = start + 1

@@ -1,4 +1,4 @@
-"""Messages with random field values, for tests of whatever decodes them."""
+"""Hypothesis strategies for messages with random field values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLAUSIBLE = {
 
 
 def value_of(field: Field, dice: random.Random) -> Any:
-    """Anything that the field can hold, its "unknown" among it; what would make all else unknown is plausible."""
+    """Strategy for a field: any value, including "unknown", but plausible where that hides other fields."""
     if field.name in PLAUSIBLE and dice.random() < 0.7:
         return PLAUSIBLE[field.name]
     count = field.array_length or 1

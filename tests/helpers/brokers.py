@@ -1,4 +1,4 @@
-"""A broker of MQTT on this machine: nats-server, which is one, in a process of its own; and who listens."""
+"""An MQTT broker (nats-server) in its own process, and a subscriber."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ USER, PASSWORD = "alpha", "s3cret@/:"
 
 
 def needs_a_broker() -> None:
-    """Skip the tests of a module where the server, or a client, is not installed."""
+    """Skip a test module if the server or a client is not installed."""
     pytest.importorskip("paho.mqtt.client")
     if PROGRAM is None:
         pytest.skip("nats-server is not installed", allow_module_level=True)
@@ -54,7 +54,7 @@ class Broker:
         self.kill()
 
     async def start(self) -> None:
-        """Until it is ready."""
+        """Wait until the server is ready."""
         assert PROGRAM is not None
         assert self._process is None
         self._starts += 1
@@ -66,7 +66,7 @@ class Broker:
         self._process = subprocess.Popen([program, "-c", str(self._config), "-l", str(log)])
 
     def kill(self) -> None:
-        """At once, as if its machine had lost power."""
+        """Kill the server without shutdown, as a power failure does."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -74,7 +74,7 @@ class Broker:
 
     @asynccontextmanager
     async def heard(self, login: tuple[str, str] | None = None) -> AsyncIterator[list[Any]]:
-        """What arrives, as (topic, payload, whether it was retained)."""
+        """Yield (topic, payload, retained) of each message."""
         from paho.mqtt import client as mqtt
 
         heard: list[Any] = []

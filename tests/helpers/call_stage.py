@@ -1,4 +1,4 @@
-"""A simulated vehicle with files, logs and a mission, a program's vehicle object on it, and the places to call from."""
+"""A simulated vehicle with files, logs and a mission, a `Vehicle` connected to it, and the states to call from."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ DATA = bytes(range(256)) * 20
 
 @dataclass
 class Stage:
-    """Where a call is made."""
+    """The surroundings of a call."""
 
     simulated: SimulatedCopter | SimulatedPx4
     vehicle: aerokit.Vehicle
     wire: Wire
     folder: Path
-    """For files of this computer."""
+    """Directory for files of the program."""
     camera: SimulatedCamera
-    """The first of its cameras; another one can do nothing."""
+    """Id of the first camera; a second one supports nothing."""
     counter: int = field(default=0)
 
     @property
@@ -55,11 +55,11 @@ class Stage:
 
     @property
     def parameter(self) -> str:
-        """One that changes nothing in flight."""
+        """A mode that changes nothing in flight."""
         return "NAV_ACC_RAD" if self.is_px4 else "WP_YAW_BEHAVIOR"
 
     def other_value(self) -> float:
-        """Another one than it has."""
+        """A mode other than the current one."""
         self.counter += 1
         return float(self.counter % 2 + 1)
 
@@ -71,22 +71,16 @@ class Stage:
         return Position(home.latitude_deg, home.longitude_deg)
 
     def target(self) -> Position:
-        """Some way to go, never far from home."""
+        """A place at some distance from home."""
         here = self.vehicle.position.value.replace(altitude_amsl_m=None)
         is_far = self.vehicle.distance_to(self.home) > 60
-        return (
-            self.home.replace(altitude_relative_m=here.altitude_relative_m)
-            if is_far
-            else here.offset(north_m=25)
-        )
+        return self.home.replace(altitude_relative_m=here.altitude_relative_m) if is_far else here.offset(north_m=25)
 
     def mission(self) -> Mission:
-        """Places to the north; another one each time."""
+        """A new place to the north for each call."""
         self.counter += 1
         places = [self.home.offset(north_m=100.0 * n, east_m=self.counter % 7) for n in range(1, 6)]
-        return Mission(
-            [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
-        )
+        return Mission([waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places])
 
     def fence(self) -> Fence:
         self.counter += 1
@@ -109,28 +103,28 @@ class Stage:
         return f"{self.root}/there.bin"
 
     def new_name(self) -> str:
-        """A path on the vehicle that was not used before."""
+        """An unused path on the vehicle."""
         self.counter += 1
         return f"{self.root}/new{self.counter}"
 
     def put(self, path: str, data: bytes = DATA) -> str:
-        """Have a file on the vehicle."""
+        """Create a file on the vehicle."""
         file = self.simulated.ftp.files.open(path, writing=True, create=True)
         file.write(0, data)
         file.close()
         return path
 
     def put_logs(self) -> None:
-        """Have logs on the vehicle that were erased."""
+        """Restore the erased logs of the vehicle."""
         self.simulated.storage.logs.logs[:] = LOGS
 
     def local(self, name: str = "here.bin") -> Path:
-        """A file on this computer that is not there yet."""
+        """An unused path on this computer."""
         self.counter += 1
         return self.folder / f"{self.counter}-{name}"
 
     def local_file(self) -> Path:
-        """One that is there."""
+        """An existing file on this computer."""
         path = self.folder / "given.bin"
         path.write_bytes(DATA)
         return path
@@ -138,7 +132,7 @@ class Stage:
     # -------------------------------------------------------------------------------- answers
 
     async def answers(self) -> None:
-        """The vehicle object works, and the vehicle does what it says."""
+        """Check that the vehicle still works, and reports what it does."""
         await self.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
 
 
@@ -146,12 +140,12 @@ Place = Callable[[Stage], Awaitable[None]]
 
 
 async def anywhere(stage: Stage) -> None:
-    """As it is."""
+    """The initial state."""
     stage.simulated.battery.percent = 100.0
 
 
 async def grounded(stage: Stage) -> None:
-    """Disarmed on the ground, ready, in a mode in which it arms."""
+    """Disarmed and ready, on the ground, in a mode that can be armed."""
     vehicle = stage.vehicle
     await anywhere(stage)
     if vehicle.is_armed:
@@ -160,16 +154,14 @@ async def grounded(stage: Stage) -> None:
             while not stage.simulated.motion.is_on_ground:  # noqa: ASYNC110
                 await anyio.sleep(0.1)
             await vehicle.landed_state.wait_until(lambda state: state == 1)
-    with contextlib.suppress(
-        AerokitError
-    ):  # an order to reboot that was given up may be carried out just now
+    with contextlib.suppress(AerokitError):  # an abandoned reboot command may be executed just now
         await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
     await vehicle.wait_ready()
     await vehicle.set_mode("LOITER" if stage.is_px4 else "GUIDED")
 
 
 async def armed(stage: Stage) -> None:
-    """Armed on the ground, a moment ago: both autopilots disarm by themselves who does not take off."""
+    """Just armed, on the ground: both autopilots disarm after a while without take-off."""
     await grounded(stage)
     await stage.vehicle.arm()
 
@@ -200,11 +192,9 @@ def _altitude(stage: Stage) -> float:
 
 
 def stage_cameras() -> list[SimulatedCamera]:
-    """One that can do everything at any time, and one that can do nothing."""
+    """Two cameras: one supports everything at any time, the other one nothing."""
     both = CameraCapFlags.CAN_CAPTURE_IMAGE_IN_VIDEO_MODE | CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
-    able = SimulatedCamera(
-        capabilities=SimulatedCamera.ALL_CAPABILITIES | both, streams=["rtsp://127.0.0.1/a"]
-    )
+    able = SimulatedCamera(capabilities=SimulatedCamera.ALL_CAPABILITIES | both, streams=["rtsp://127.0.0.1/a"])
     able.files.put("/DCIM/GIVEN.JPG", DATA)
     return [able, SimulatedCamera(101, capabilities=CameraCapFlags.HAS_MTI)]
 

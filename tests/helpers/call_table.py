@@ -1,4 +1,4 @@
-"""How each public coroutine is called, and where: one row for each name of `public_surface.awaited`."""
+"""How and where to call each public coroutine: one row for each name in `public_surface.awaited`."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def _nothing(_: Stage) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """One order of docs/reliability.md. ``modes`` are those that it may bring about, on ArduCopter and on PX4.
+    """One order in docs/reliability.md.
 
-    ``steers``: it decides where the vehicle goes; given up, the vehicle is told to hold if ``holds``. ``command`` is
-    the one whose answers and copies get lost.
-    ``place`` is where the vehicle is when it is given. ``ends_later``: given up, its end is still seen to.
+    ``modes`` are those that it may lead to, on ArduCopter and on PX4. ``steers``: it determines where the vehicle goes;
+    when it is abandoned, the vehicle must hold if ``holds``. ``command`` is the one whose answers and copies are lost.
+    ``place`` is the state of the vehicle before it. ``ends_later``: it is completed even when it is abandoned.
     """
 
     name: str
@@ -64,11 +64,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Call:
-    """One call that ends well, and all that tests need to know of it.
+    """One successful call, with all that tests need.
 
-    ``before`` and ``after`` are for the simulated vehicle itself, around each call. ``command`` is the MAV_CMD that it
-    sends: refused, it raises CommandRejected, unanswered CommandTimeout. ``wrong`` has an argument that is not allowed.
-    ``order`` is its row in the table of orders (`order_table`).
+    ``before`` and ``after`` act on the simulated vehicle, around each call. ``command`` is the MAV_CMD that it sends:
+    if it is refused, the call raises CommandRejected; if it is not answered, CommandTimeout. ``wrong`` has an invalid
+    argument. ``order`` is its row in the table of orders (`order_table`).
     """
 
     do: Callable[[Stage], Awaitable[object]]
@@ -81,7 +81,7 @@ class Call:
     order: Row | None = None
 
     def provocations(self, name: str) -> Table:
-        """How the errors that most calls document are provoked."""
+        """How to provoke the errors that most calls document."""
         rows: Table = {}
         for error, trouble in (("CommandRejected", refused), ("CommandTimeout", ignored)):
             if self.command is not None:
@@ -104,7 +104,7 @@ def _action(
     on: tuple[str, ...] = BOTH,
     **order: Any,
 ) -> dict[str, Call]:
-    """An action of a vehicle that sends this command: one row for all tests of calls, and for the table of orders."""
+    """Create the row of an action that sends this command, for all tests of calls and for the table of orders."""
     call = Call(
         lambda stage: give(stage.vehicle),
         place,
@@ -117,7 +117,7 @@ def _action(
 
 
 def provocations() -> Table:
-    """Of all calls."""
+    """The rows of all calls."""
     return {key: row for name, call in CALLS.items() for key, row in call.provocations(name).items()}
 
 
@@ -165,7 +165,7 @@ async def _get(stage: Stage) -> None:
 async def _changes(stage: Stage) -> None:
     changes = stage.vehicle.mode.changes()
     await changes.__anext__()
-    with anyio.move_on_after(1.0):  # the next one does not come
+    with anyio.move_on_after(1.0):  # there is no next one
         await changes.__anext__()
 
 
@@ -191,7 +191,7 @@ async def _fly(stage: Stage) -> None:
 async def _post_arm(stage: Stage) -> None:
     with stage.vehicle.posted("arm", armed=True) as order:
         await order.command(MavCmd.COMPONENT_ARM_DISARM, 1)
-        await order.until_told(5)
+        await order.wait_confirmed(5)
 
 
 async def _post_mode(stage: Stage) -> None:
@@ -230,7 +230,7 @@ async def _mission_again(stage: Stage) -> None:
 
 
 async def _fly_mission(stage: Stage) -> None:
-    """One place, which is near."""
+    """A single nearby place."""
     vehicle = stage.vehicle
     await vehicle.mission.upload(aerokit_mission(stage))
     await vehicle.mission.start()
@@ -238,7 +238,7 @@ async def _fly_mission(stage: Stage) -> None:
 
 
 def aerokit_mission(stage: Stage) -> Any:
-    """Of one place that is near."""
+    """A mission to a single nearby place."""
     place = stage.vehicle.position.value.offset(north_m=6)
     from aerokit.missions import Mission, waypoint
 
@@ -246,14 +246,14 @@ def aerokit_mission(stage: Stage) -> Any:
 
 
 async def _twice(stage: Stage, name: str) -> None:
-    """Something, and then nothing."""
+    """One item, then an empty mission."""
     held = getattr(stage.vehicle, name)
     await held.upload(getattr(stage, name)())
     await held.clear()
 
 
 def _no_key(stage: Stage) -> None:
-    """The key that it may have taken is gone."""
+    """Remove a key that the vehicle may have accepted."""
     stage.simulated.signing.key = None
     stage.simulated.signing.load()
     stage.vehicle.connection.signing = None
@@ -348,13 +348,9 @@ CALLS: dict[str, Call] = {
     ),
     **_action("look_at", lambda v: v.look_at(north(v, 50.0)), MavCmd.DO_SET_ROI_LOCATION, steers=False),
     **_action("stop_looking", lambda v: v.stop_looking(), MavCmd.DO_SET_ROI_NONE, steers=False),
-    **_action(
-        "reboot", lambda v: v.reboot(timeout=20), MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, grounded, steers=False
-    ),
+    **_action("reboot", lambda v: v.reboot(timeout=20), MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, grounded, steers=False),
     "Vehicle.setup_signing": Call(_sign, grounded, after=_no_key),
-    "Vehicle.command": Call(
-        lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)
-    ),
+    "Vehicle.command": Call(lambda s: s.vehicle.command(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID)),
     "Vehicle.command_int": Call(
         lambda s: s.vehicle.command_int(MavCmd.REQUEST_MESSAGE, messages.AutopilotVersion.ID, frame=5)
     ),
@@ -389,7 +385,7 @@ CALLS: dict[str, Call] = {
     "PostedOrder.command": Call(_post_arm, grounded),
     "PostedOrder.command_int": Call(_post_place, airborne),
     "PostedOrder.set_mode": Call(_post_mode, grounded),
-    "PostedOrder.until_told": Call(_post_arm, grounded),
+    "PostedOrder.wait_confirmed": Call(_post_arm, grounded),
     # --------------------------------------------------------------------------------- Parameters
     "Parameters.download": Call(lambda s: s.vehicle.parameters.download(refresh=True)),
     "Parameters.diff": Call(lambda s: s.vehicle.parameters.diff({s.parameter: 1.0})),
@@ -444,9 +440,7 @@ CALLS: dict[str, Call] = {
     "Logs.erase": Call(lambda s: s.vehicle.logs.erase(), grounded, after=Stage.put_logs),
     # ---------------------------------------------------------------------------- cells and streams
     "StateCell.wait_until": Call(
-        lambda s: s.vehicle.position.wait_until(
-            lambda _: s.vehicle.position.age == 0, held_for=1.0, timeout=9
-        )
+        lambda s: s.vehicle.position.wait_until(lambda _: s.vehicle.position.age == 0, held_for=1.0, timeout=9)
     ),
     "StateCell.changes": Call(_changes),
     "StateCell.updates": Call(_updates),

@@ -1,4 +1,4 @@
-"""A simulated camera that is put beside a vehicle which flies already, when a call about cameras needs it."""
+"""Adds a simulated camera to a vehicle in flight, when a call about cameras needs it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["camera_of", "settings_of"]
 
 
 def camera_of(stage: Stage) -> SimulatedCamera:
-    """As new, but for the time it has been there."""
+    """Reset the camera, except for its uptime."""
     simulated: Any = stage.simulated
     camera = next((each for each in simulated.components if isinstance(each, SimulatedCamera)), None)
     if camera is None:
@@ -32,5 +32,5 @@ def camera_of(stage: Stage) -> SimulatedCamera:
 
 
 def settings_of(stage: Stage) -> Settings:
-    """Those of the camera, as the program has them."""
+    """The program's view of the cameras."""
     return stage.vehicle.component(100).settings

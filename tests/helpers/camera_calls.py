@@ -1,4 +1,4 @@
-"""Calls of cameras: how each is made, and how its errors are provoked."""
+"""Calls of cameras, and how to provoke their errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["AWAITED", "BLOCKING", "BLOCKS", "CAMERA", "camera_block"]
 
 Cmd, P = MavCmd, Provocation
 UNABLE, NOWHERE = 101, 103
-"""Numbers of a camera that can do nothing, and of one that is not there."""
+"""Ids of a camera that supports nothing, and of one that does not exist."""
 PICTURE = Capture(100, 0, True, 0.0, None, None, None, None, None, None, "mftp:///DCIM/GIVEN.JPG")
 
 ARGUMENTS: dict[str, tuple[Any, ...]] = {
@@ -46,7 +46,7 @@ ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "format_storage": (),
     "reset_settings": (),
 }
-"""Call → what it takes."""
+"""Arguments of each call."""
 BLOCKS: dict[str, tuple[Any, ...]] = {
     "photo_interval": (0.5, 2),
     "video": (),
@@ -71,7 +71,7 @@ COMMANDS: dict[str, int] = {
     "format_storage": Cmd.STORAGE_FORMAT,
     "reset_settings": Cmd.RESET_CAMERA_SETTINGS,
 }
-"""Call → the command that is refused, or not answered."""
+"""The command that is refused, or not answered, for each call."""
 IMPOSSIBLE: dict[str, tuple[Any, ...]] = {
     "start_streaming": (999,),
     "stop_streaming": (999,),
@@ -92,14 +92,12 @@ IMPOSSIBLE: dict[str, tuple[Any, ...]] = {
 
 
 def call(name: str, *args: Any, number: int = 100, **options: Any) -> Callable[[Any], Any]:
-    """Of the asynchronous camera or of its twin."""
-    return lambda stage: getattr(stage.vehicle.camera_at(number), name)(
-        *(args or ARGUMENTS.get(name, ())), **options
-    )
+    """Call a method of the asynchronous camera or of its twin."""
+    return lambda stage: getattr(stage.vehicle.camera_at(number), name)(*(args or ARGUMENTS.get(name, ())), **options)
 
 
 def camera_block(name: str) -> Callable[[Any], Awaitable[None]]:
-    """A block of a camera, entered and left."""
+    """Enter and leave an ``async with`` block of a camera."""
 
     async def do(stage: Any) -> None:
         async with getattr(stage.vehicle.camera_at(100), name)(*BLOCKS[name]) as inside:
@@ -120,7 +118,7 @@ def _blocking_block(name: str) -> Callable[[Any], None]:
 
 
 def _track_blocking(name: str) -> Callable[[Any], None]:
-    """What it tracks is asked for until the end of that."""
+    """A tracking target is requested until tracking ends."""
 
     def do(stage: Any) -> None:
         try:
@@ -221,4 +219,4 @@ CAMERA: Table = {
         call("read_picture", PICTURE.replace(file_url="mftp:///DCIM/NONE.JPG"))
     ),
 }  # fmt: skip
-"""Those that are promised count."""
+"""Only public errors count."""

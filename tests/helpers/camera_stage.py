@@ -1,4 +1,4 @@
-"""A vehicle with cameras on virtual time, and what tests of them ask."""
+"""A vehicle with cameras on virtual time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["commands_to", "on_board", "px4"]
 async def on_board(
     *cameras: SimulatedCamera, vehicle: SimulatedVehicle | None = None, settle_s: float = 1.5
 ) -> AsyncIterator[aerokit.Vehicle]:
-    """A copter, unless another vehicle is given, with these cameras, which have been heard."""
+    """A vehicle, by default a copter, with these cameras, which it has discovered."""
     simulated = SimulatedCopter(boot_time_s=0.0, components=cameras) if vehicle is None else vehicle
     async with simulated_link(simulated) as link, aerokit.connect(link) as connected:
         await anyio.sleep(settle_s)
@@ -31,7 +31,7 @@ def px4(*cameras: SimulatedCamera) -> SimulatedPx4:
 
 
 def commands_to(simulated: Any, *kinds: int) -> list[tuple[float, ...]]:
-    """What a simulated device was told by COMMAND_LONG from now on: command and parameters, in a list that grows."""
+    """Record COMMAND_LONG received by a simulated device, as (command, parameters), in a list that grows."""
     heard: list[tuple[float, ...]] = []
 
     def note(message: m.CommandLong, _: object) -> None:
@@ -42,5 +42,5 @@ def commands_to(simulated: Any, *kinds: int) -> list[tuple[float, ...]]:
     if isinstance(simulated, SimulatedCamera):
         simulated.on(m.CommandLong, note)
     else:
-        simulated.overhear(m.CommandLong, note)
+        simulated.observe(m.CommandLong, note)
     return heard

@@ -1,4 +1,4 @@
-"""Calls about components of a vehicle beside its autopilot: that end well, without async, and as they fail."""
+"""Calls about components beside the autopilot: successful, blocking, and failing ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from camera_beside import camera_of
 from provoked import Do, Provocation, Table
 
 from aerokit import messages as m
-from aerokit._internal.files import LARGEST_FILE
+from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import OperationRejected
 from aerokit.mavlink.enums import MavCmd
 from aerokit.parameters import parse_definition
@@ -44,7 +44,7 @@ async def _subscribed(stage: Stage) -> None:
 
 
 async def _refused(call: Awaitable[object]) -> None:
-    """The simulated camera has none of it."""
+    """The simulated camera does not support it."""
     with suppress(OperationRejected):
         await call
 
@@ -112,7 +112,7 @@ def _deaf_to_files(camera: SimulatedCamera) -> None:
 
 
 def _too_large(camera: SimulatedCamera) -> None:
-    camera.files.put(DEFINITION_PATH, bytes(LARGEST_FILE + 1))
+    camera.files.put(DEFINITION_PATH, bytes(MAX_FILE_SIZE + 1))
 
 
 def _call(name: str, *args: Any, **options: Any) -> Do:
@@ -146,9 +146,7 @@ COMPONENTS: Table = {
     ("Component.information", "CommandRejected"): P(_call("information"), before=_with()),
     ("Component.information", "OperationTimeout"): P(_call("information"), before=_with(_silent)),
     ("Component.request", "CommandRejected"): P(_call("request", m.FlightInformation), before=_with()),
-    ("Component.request", "OperationTimeout"): P(
-        _call("request", m.CameraInformation), before=_with(_silent)
-    ),
+    ("Component.request", "OperationTimeout"): P(_call("request", m.CameraInformation), before=_with(_silent)),
     ("Component.metadata", "NotSupported"): P(_call("metadata"), before=_with()),
     ("Component.metadata", "FileFormatError"): P(_metadata, **_px4(b"no JSON")),
     ("Component.metadata", "FileError"): P(_metadata, **_px4(None)),
@@ -156,8 +154,6 @@ COMPONENTS: Table = {
     ("Component.fetch", "InvalidArgument"): P(_call("fetch", "gopher://a"), before=_with()),
     ("Component.fetch", "FileFormatError"): P(_call("fetch", ADDRESS), before=_with(_too_large)),
     ("Component.fetch", "FileError"): P(_call("fetch", "mftp:///nowhere"), before=_with()),
-    ("Component.fetch", "FileTimeout"): P(
-        _call("fetch", ADDRESS, patience_s=1.0), before=_with(_deaf_to_files)
-    ),
+    ("Component.fetch", "FileTimeout"): P(_call("fetch", ADDRESS, idle_timeout_s=1.0), before=_with(_deaf_to_files)),
     ("Component.fetch", "OperationRejected"): P(_call("fetch", "http://127.0.0.1:1/a.xml"), before=_with()),
 }

@@ -1,4 +1,4 @@
-"""Ctrl-C, as the main thread of a program gets it."""
+"""Sends Ctrl-C to the main thread."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["interrupt_soon"]
 
 
 def interrupt_soon() -> threading.Timer:
-    """Interrupt the main thread a moment later."""
+    """Interrupt the main thread after a moment."""
     main = threading.main_thread().ident
     assert main is not None
     timer = threading.Timer(0.1, signal.pthread_kill, (main, signal.SIGINT))

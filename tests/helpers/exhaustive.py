@@ -1,6 +1,6 @@
-"""Long tables of rows: the default run takes a sample of them, `nox -s exhaustive` the others.
+"""Sampling of long tables: the default run takes some rows, `nox -s exhaustive` the others.
 
-The marker ``exhaustive`` is deselected by pyproject.toml; ``pytest -m ""`` runs everything.
+The marker ``exhaustive`` is deselected in pyproject.toml; ``pytest -m ""`` runs everything.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ __all__ = ["exhaustive", "sampled"]
 
 
 def exhaustive(row: Any) -> Any:
-    """A row for ``parametrize`` that the default run leaves out."""
+    """Create a row for ``parametrize`` that the default run skips."""
     values, marks, name = row if hasattr(row, "marks") else ((row,), (), None)
     return pytest.param(*values, marks=[*marks, pytest.mark.exhaustive], id=name)
 
 
 def sampled(rows: Iterable[Any], every: int) -> list[Any]:
-    """Rows for ``parametrize``: the default run takes the first of each ``every``."""
+    """Create rows for ``parametrize``, of which the default run takes every ``every``-th."""
     return [exhaustive(row) if place % every else row for place, row in enumerate(rows)]

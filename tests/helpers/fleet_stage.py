@@ -1,4 +1,4 @@
-"""A fleet of simulated copters on one or several networks, on virtual time, with a tap on what is sent to each."""
+"""A fleet of simulated copters on one or several networks, on virtual time, with recorders of what each receives."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOME = (47.3977, 8.5456, 488.0)
 
 @dataclass
 class Stage:
-    """Copters by the names of the members."""
+    """Simulated copters by member name."""
 
     fleet: Fleet
     copters: dict[str, SimulatedCopter]
@@ -37,7 +37,7 @@ class Stage:
         return {name: each.mode.name for name, each in self.copters.items()}
 
     def orders_to(self, name: str) -> list[tuple[float, m.CommandLong | m.CommandInt]]:
-        """Commands that change what the member does, and when they were sent."""
+        """Return the commands that change what the member does, with their times."""
         network, _, number = name.partition("/")
         return [
             (at, each)
@@ -49,9 +49,7 @@ class Stage:
 
     def modes_ordered(self, name: str) -> list[str]:
         return [
-            CopterMode(int(each.param2)).name
-            for _, each in self.orders_to(name)
-            if each.command == MavCmd.DO_SET_MODE
+            CopterMode(int(each.param2)).name for _, each in self.orders_to(name) if each.command == MavCmd.DO_SET_MODE
         ]
 
     def forget(self) -> None:
@@ -59,14 +57,14 @@ class Stage:
             wire.forget()
 
     def events(self, kind: type[FleetEvent] = FleetEvent) -> list[Any]:
-        """What was told until now."""
+        """Events until now."""
         found = []
         while (event := self.told.get_nowait()) is not None:
             found.append(event)
         return [each for each in found if isinstance(each, kind)]
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
-        """All of them are ready, armed and in the air; what was sent for it is forgotten."""
+        """Get all members ready, armed and airborne, and clear the recorders."""
         (await self.fleet.wait_ready()).raise_for_errors()
         (await self.fleet.arm()).raise_for_errors()
         (await self.fleet.take_off(altitude_m)).raise_for_errors()
@@ -74,7 +72,7 @@ class Stage:
         self.forget()
 
     def pilot_takes(self, name: str, mode: int = CopterMode.LOITER) -> None:
-        """The mode switch is turned; the throttle stick is in the middle."""
+        """Turn the mode switch of the remote control, with the throttle stick in the middle."""
         copter = self.copters[name]
         copter.rc[2] = 1500
         assert copter.set_mode(mode)
@@ -95,10 +93,10 @@ ORDERS = (
 async def open_stage(
     count: int = 3, *, networks: Sequence[str] = ("north",), spacing_m: float = 10.0, **options: Any
 ) -> AsyncIterator[Stage]:
-    """``count`` copters with ids 1, 2, 3 … on each network, side by side to the east."""
+    """Create ``count`` copters with ids 1, 2, 3 … on each network, side by side to the east."""
     copters: dict[str, SimulatedCopter] = {}
     wires: dict[str, Wire] = {}
-    metre = 1 / 75_300  # of longitude, there
+    metre = 1 / 75_300  # degrees of longitude at home
     async with AsyncExitStack() as stack:
         for row, network in enumerate(networks):
             own = [

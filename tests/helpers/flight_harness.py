@@ -1,4 +1,4 @@
-"""A simulated copter in memory, a vehicle object on it, and a tap on what the program wrote: on virtual time."""
+"""A simulated vehicle in memory, a `Vehicle` connected to it, and a recorder of what it sends, on virtual time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SETPOINTS = (m.SetPositionTargetLocalNed, m.SetPositionTargetGlobalInt, m.SetAtt
 
 
 class Wire(Link):
-    """The program's end of a link. ``sent`` is what the program wrote: (loop time, message)."""
+    """The program's end of a link. ``sent`` has the messages sent, as (loop time, message)."""
 
     def __init__(self, link: Link) -> None:
         self.address = link.address
@@ -54,13 +54,13 @@ class Wire(Link):
         await self._link.wait_closed()
 
     def lose(self) -> None:
-        """As when the cable is pulled out."""
+        """Lose the link, as when the cable is unplugged."""
         assert self._receiver is not None
         self._link.close()
         self._receiver.link_lost(LinkLost("the cable was pulled out"))
 
     def deliver(self, data: bytes) -> None:
-        """Let the program hear these bytes."""
+        """Deliver bytes to the program."""
         assert self._receiver is not None
         self._receiver.bytes_received(data, None)
 
@@ -84,10 +84,8 @@ class Wire(Link):
         ]
 
     def mode_orders(self) -> list[int]:
-        """The custom modes that were asked for by MAV_CMD_DO_SET_MODE (as ArduPilot wants it)."""
-        return [
-            int(each.param2) for each in self.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)
-        ]
+        """Custom modes requested by MAV_CMD_DO_SET_MODE, in ArduPilot's encoding."""
+        return [int(each.param2) for each in self.commands(MavCmd.DO_SET_MODE) if isinstance(each, m.CommandLong)]
 
     def setpoints(self) -> list[tuple[float, Message]]:
         return [(at, message) for at, message in self.sent if isinstance(message, SETPOINTS)]
@@ -95,14 +93,14 @@ class Wire(Link):
 
 @dataclass
 class Flight:
-    """One simulated copter and the vehicle object that a program has of it."""
+    """One simulated copter, and the program's `Vehicle`."""
 
     copter: SimulatedCopter
     vehicle: aerokit.Vehicle
     wire: Wire
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
-        """Ready, armed, in GUIDED, at this altitude; what was sent for it is forgotten."""
+        """Get the copter ready, armed, in GUIDED, at this altitude, and clear the recorder."""
         await self.vehicle.wait_ready()
         await self.vehicle.set_mode("GUIDED")
         await self.vehicle.arm()
@@ -111,7 +109,7 @@ class Flight:
         self.wire.forget()
 
     def pilot_takes_over(self, mode: int = CopterMode.LOITER) -> None:
-        """Somebody turns the mode switch; the throttle stick is in the middle."""
+        """Turn the mode switch of the remote control, with the throttle stick in the middle."""
         self.copter.rc[2] = 1500
         assert self.copter.set_mode(mode)
 
@@ -124,7 +122,7 @@ async def open_flight(
     others: Iterable[SimulatedVehicle] = (),
     **options: Any,
 ) -> AsyncIterator[Flight]:
-    """A copter that is ready when it is switched on, and a vehicle on it; ``options`` are those of `connect`."""
+    """A copter that is ready at power-on, and a vehicle connected to it; ``options`` are those of `connect`."""
     copter = SimulatedCopter(boot_time_s=0.0) if copter is None else copter
     options.setdefault("system_id", copter.system_id)
     async with simulated_link([copter, *others], latency_s=latency_s) as link:
@@ -146,7 +144,7 @@ def now() -> float:
 
 
 def block_loop(seconds: float) -> None:
-    """What a program does that calls time.sleep: the clock goes on, the loop does not."""
+    """Block the event loop, as a program that calls time.sleep: the clock advances, the loop does not."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualClockLoop)
     loop._now += seconds
@@ -158,33 +156,33 @@ def speed_of(copter: SimulatedCopter) -> float:
 
 
 def make_parts(vehicle: aerokit.Vehicle) -> None:
-    """Parts that listen are made when they are first used, and stay for as long as the vehicle: nothing was left."""
+    """Create the parts that subscribe on first use and live as long as the vehicle, so that leak checks ignore them."""
     for name in ("parameters", "gimbal", "mission"):
         getattr(vehicle, name)
 
 
 def attached_sinks(connection: Connection) -> int:
-    """How many callbacks hang on a connection: sinks of messages and events, and what ends with it."""
+    """Count the callbacks of a connection: for messages, for events, and for its end."""
     bus = connection.bus
     tables = (*bus._sinks.values(), *bus._event_sinks.values())
-    return sum(len(sinks) for sinks in tables) + len(connection._ending._enders)
+    return sum(len(sinks) for sinks in tables) + len(connection._end_signal._callbacks)
 
 
 def waiting_on_cells(vehicle: aerokit.Vehicle) -> int:
-    """How many waiters and observers hang on the state cells of a vehicle."""
+    """Count the waiters and observers of a vehicle's state cells."""
     return sum(len(cell._sinks) for cell in (*vehicle.telemetry.cells.values(), vehicle.link_quality))
 
 
 @dataclass
 class Px4Flight:
-    """One simulated PX4 and the vehicle object that a program has of it."""
+    """One simulated PX4, and the program's `Vehicle`."""
 
     px4: SimulatedPx4
     vehicle: aerokit.Vehicle
     wire: Wire
 
     async def take_off(self, altitude_m: float = 10.0) -> None:
-        """Ready, armed, at this altitude, in LOITER; what was sent for it is forgotten."""
+        """Get the vehicle ready, armed, at this altitude, in LOITER, and clear the recorder."""
         await self.vehicle.wait_ready()
         await self.vehicle.arm()
         await self.vehicle.take_off(altitude_m)
@@ -196,7 +194,7 @@ class Px4Flight:
 async def open_px4(
     px4: SimulatedPx4 | None = None, *, latency_s: float = 0.0, **options: Any
 ) -> AsyncIterator[Px4Flight]:
-    """A PX4 that is ready soon, and a vehicle on it; ``options`` are those of `connect`."""
+    """A PX4 that is ready soon, and a vehicle connected to it; ``options`` are those of `connect`."""
     px4 = SimulatedPx4(boot_time_s=1.0) if px4 is None else px4
     async with simulated_link(px4, latency_s=latency_s) as link:
         wire = Wire(link)

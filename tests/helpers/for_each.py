@@ -1,4 +1,4 @@
-"""`for_each`: one test that checks many rows, and names all that fail."""
+"""`for_each`: a single test that checks many rows and names all that fail."""
 
 from __future__ import annotations
 

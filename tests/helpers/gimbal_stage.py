@@ -1,4 +1,4 @@
-"""What tests of gimbals need: vehicles with gimbals, another ground station, and what went to whom."""
+"""Vehicles with gimbals, another ground station, and recorders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OTHER = (254, 190)
 
 
 def copter_with_mount(**options: Any) -> SimulatedCopter:
-    """Its autopilot manages a gimbal, number 1."""
+    """A vehicle whose autopilot manages gimbal 1."""
     copter = SimulatedCopter(boot_time_s=0.0, **options)
     copter.parameters["MNT1_TYPE"] = 1.0
     return copter
@@ -38,7 +38,7 @@ async def mounted() -> AsyncIterator[Flight]:
 
 @asynccontextmanager
 async def beside(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = None) -> AsyncIterator[Flight]:
-    """A copter on the ground with gimbals that have ids, and managers, of their own; they have been heard."""
+    """A copter on the ground with gimbals that have their own ids and managers, which it has discovered."""
     copter = copter or SimulatedCopter(boot_time_s=0.0, components=gimbals)
     async with open_flight(copter) as flight:
         await flight.vehicle.wait_ready()
@@ -48,20 +48,20 @@ async def beside(*gimbals: SimulatedGimbal, copter: SimulatedCopter | None = Non
 
 
 def other_station(flight: Flight, message: Message) -> None:
-    """It says something to the vehicle and its devices."""
+    """Send a message from the other station to the vehicle and its devices."""
     copter = flight.copter
     copter.receive(FrameEncoder(*OTHER).encode(message), copter.now)
 
 
 def takes_control(flight: Flight, component: int = 154, *, secondary: bool = False) -> None:
-    """The other station claims a gimbal."""
+    """Claim a gimbal for the other station."""
     pair, keep = (-2.0, -2.0), (-1.0, -1.0)
     params = (*keep, *pair) if secondary else (*pair, *keep)
     other_station(flight, m.CommandLong(1, component, CONFIGURE, 0, *params, 0, 0, 0))
 
 
 def configured(flight: Flight | Px4Flight) -> list[tuple[float, ...]]:
-    """Params 1 to 4 and 7 of each command about control that was sent."""
+    """Params 1 to 4 and 7 of each gimbal control command sent."""
     sent: list[Any] = flight.wire.commands(CONFIGURE)
     return [(each.param1, each.param2, each.param3, each.param4, each.param7) for each in sent]
 

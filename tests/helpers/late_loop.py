@@ -1,4 +1,4 @@
-"""The clock of tests on virtual time begins somewhere, as on a real computer: counting from zero is noticed."""
+"""A virtual clock that does not start at 0, as on a real computer, to reveal code that assumes it does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BEGINS_AT = 10_000.0
 
 
 class LateLoop(VirtualClockLoop):
-    """Virtual time from `BEGINS_AT` on."""
+    """Virtual time, starting at `BEGINS_AT`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -20,5 +20,5 @@ class LateLoop(VirtualClockLoop):
 
 
 def since_the_beginning() -> float:
-    """Seconds on the running loop's clock."""
+    """Return the time on the running loop's clock."""
     return asyncio.get_running_loop().time() - BEGINS_AT

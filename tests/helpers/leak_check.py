@@ -1,4 +1,4 @@
-"""Does something to a program at a certain turn of the event loop, and sees what is left of it afterwards."""
+"""Interferes with a program at a certain iteration of the event loop, and checks what is left of it afterwards."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Program = Callable[[], Awaitable[object]]
 
 
 class _Counting:
-    """Counts the turns of a loop, and calls something before one of them."""
+    """Counts the iterations of a loop, and calls a function before one of them."""
 
     turns = 0
     do_at = -1
@@ -29,8 +29,8 @@ class _Counting:
             self.action()
         super()._run_once()  # type: ignore[misc]
 
-    def do_in(self, turns: int, action: Callable[[], object]) -> None:
-        """Call ``action`` before the turn after next, for 1, and so on."""
+    def run_in(self, turns: int, action: Callable[[], object]) -> None:
+        """Call ``action`` before the iteration after the next one, for 1, and so on."""
         self.action = action
         self.do_at = self.turns + 1 + turns
 
@@ -45,7 +45,7 @@ class RealCountingLoop(_Counting, asyncio.SelectorEventLoop):
 
 @dataclass(frozen=True)
 class Left:
-    """What a program could leave behind."""
+    """Resources that a program could leak."""
 
     tasks: frozenset[Any] = frozenset()
     timers: tuple[str, ...] = ()
@@ -55,7 +55,7 @@ class Left:
 
 
 def look() -> Left:
-    """What is there now, beside the task that asks."""
+    """Collect the current resources, except for the calling task."""
     loop: Any = asyncio.get_running_loop()
     current = asyncio.current_task()
     return Left(
@@ -70,7 +70,7 @@ def look() -> Left:
 def _open_files() -> list[str]:
     try:
         return [f"{fd}: {os.readlink(f'/proc/self/fd/{fd}')}" for fd in _numbers()]
-    except OSError:  # no /proc here, or one of them is gone meanwhile
+    except OSError:  # there is no /proc, or an entry has disappeared meanwhile
         return []
 
 
@@ -88,21 +88,21 @@ def run_and_do(
     action: Callable[[asyncio.Task[object]], object],
     loop_class: type[Any] = CountingLoop,
 ) -> asyncio.Task[object]:
-    """Run a program to its end, doing something to it at one turn of the loop; nothing may be left of it.
+    """Run a program to its end, interfering at one iteration of the loop, and check that nothing is left of it.
 
-    Gives its finished task.
+    Return its finished task.
     """
     loop: Any = loop_class()
 
     async def main() -> asyncio.Task[object]:
         before = look()
         task = asyncio.ensure_future(_as_coroutine(program))
-        loop.do_in(turns, lambda: action(task))
+        loop.run_in(turns, lambda: action(task))
         await asyncio.wait([task])
         loop.do_at = -1
-        for _ in range(5):  # sockets close on a later turn
+        for _ in range(5):  # sockets close in a later iteration
             await asyncio.sleep(0)
-        patience = 300 if loop_class is RealCountingLoop else 0  # what was written may linger for a second
+        patience = 300 if loop_class is RealCountingLoop else 0  # written data may linger for a second
         while look() != before and patience:
             await asyncio.sleep(0.01)
             patience -= 1

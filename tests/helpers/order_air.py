@@ -1,4 +1,4 @@
-"""The air between a program and a vehicle: what it loses, delays and cuts, and everything that crossed it."""
+"""A disturbed link between a program and a vehicle: losses, delays and outages, with a record of all traffic."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from aerokit.transport.link import Link, Peer, Receiver
 
 
 @dataclass
-class Weather:
-    """What goes wrong, in seconds since the order was given.
+class Disturbances:
+    """Disturbances, in seconds since the order was given.
 
-    The first ``lost_acks`` answers to ``command`` are lost, the first ``lost_commands`` times that it is sent, too. In
-    ``outage`` (from, until) nothing crosses; what is written in ``stall`` arrives at its end, in order.
+    The first ``lost_acks`` answers to ``command`` are lost, and its first ``lost_commands`` sendings. During ``outage``
+    (from, until) everything is lost; what is sent during ``stall`` arrives at its end, in order.
     """
 
     command: int = 0
@@ -36,90 +36,90 @@ class Weather:
 
 
 @dataclass
-class Crossing:
-    """One message that the program wrote or read, or would have; ``number`` counts both, in their order."""
+class TrafficEntry:
+    """One message sent or received by the program, even if it was lost; ``number`` counts both, in order."""
 
     number: int
     at: float
     message: Message
     is_lost: bool = False
     is_believed: bool = True
-    """Whether the program took it: over a link that is not in use it does not."""
+    """True if the program accepted it; over a link that is not selected it does not."""
     raw: bytes = b""
-    """The frame that it was."""
+    """The frame of the message."""
     arrives_at: float = 0.0
-    """When it comes to the other end, if it is not lost."""
+    """Time of arrival at the other end, unless it is lost."""
 
 
 class Seen(Protocol):
-    """What crossed, as the judge sees it: from the program's end."""
+    """The traffic, as seen from the program's end, for the judge."""
 
     @property
-    def sent(self) -> list[Crossing]:
-        """What the program has written."""
+    def sent(self) -> list[TrafficEntry]:
+        """Messages sent by the program."""
         ...
 
     @property
-    def heartbeats(self) -> list[Crossing]:
-        """What the program has heard the vehicle tell of itself."""
+    def heartbeats(self) -> list[TrafficEntry]:
+        """State messages of the vehicle that the program received."""
         ...
 
 
 class Sky(Seen, Protocol):
-    """All that is between a program and a vehicle."""
+    """Everything between a program and a vehicle."""
 
     @property
-    def weather(self) -> Weather:
-        """What goes wrong."""
+    def disturbances(self) -> Disturbances:
+        """The disturbances."""
         ...
 
-    @weather.setter
-    def weather(self, weather: Weather) -> None: ...
+    @disturbances.setter
+    def disturbances(self, disturbances: Disturbances) -> None: ...
 
     def begin(self) -> None:
-        """The order is given now."""
+        """Start the disturbances, as the order is given."""
 
 
 @dataclass(frozen=True)
 class Silence:
-    """One of two links falls silent, in seconds since the order was given: in both directions, or answers only."""
+    """One of two links fails, in seconds since the order was given: in both directions, or for answers only."""
 
     begin_s: float
     end_s: float = float("inf")
     is_one_way: bool = False
 
 
-class Diary:
-    """Everything that crossed, over whichever link."""
+class TrafficLog:
+    """All traffic, over any link."""
 
     def __init__(self) -> None:
-        self.sent: list[Crossing] = []
-        self.heard: list[Crossing] = []
+        self.sent: list[TrafficEntry] = []
+        self.heard: list[TrafficEntry] = []
         self._numbers = itertools.count()
 
-    def cross(self, into: list[Crossing], message: Message, is_lost: bool = False) -> Crossing:
-        """It crosses now."""
-        into.append(Crossing(next(self._numbers), _now(), message, is_lost))
+    def cross(self, into: list[TrafficEntry], message: Message, is_lost: bool = False) -> TrafficEntry:
+        """Record a message."""
+        into.append(TrafficEntry(next(self._numbers), _now(), message, is_lost))
         return into[-1]
 
     def begin(self) -> None:
-        """Forget all but the last HEARTBEAT."""
+        """Drop all but the last HEARTBEAT."""
         self.sent.clear()
         self.heard[:] = self.heartbeats[-1:]
 
     @property
-    def heartbeats(self) -> list[Crossing]:
-        """What the program has heard the vehicle tell of itself."""
+    def heartbeats(self) -> list[TrafficEntry]:
+        """State messages of the vehicle that the program received."""
         return [each for each in self.heard if _is_autopilots(each.message) and each.is_believed]
 
 
 @dataclass
 class Air(Link):
-    """The program's end of a link through :class:`Weather`, which begins at :meth:`begin`."""
+    """The program's end of a link with :class:`Disturbances`, which starts with :meth:`begin`."""
 
     link: Link
-    weather: Weather = field(default_factory=Weather)
-    diary: Diary = field(default_factory=Diary)
+    disturbances: Disturbances = field(default_factory=Disturbances)
+    traffic_log: TrafficLog = field(default_factory=TrafficLog)
     silence: Silence | None = None
 
     def __post_init__(self) -> None:
@@ -131,19 +131,19 @@ class Air(Link):
         self._receiver: Receiver | None = None
 
     def begin(self) -> None:
-        """The order is given now."""
+        """Start the disturbances, as the order is given."""
         self.began_at = _now()
-        self.diary.begin()
+        self.traffic_log.begin()
 
     @property
-    def sent(self) -> list[Crossing]:
-        """What the program has written."""
-        return self.diary.sent
+    def sent(self) -> list[TrafficEntry]:
+        """Messages sent by the program."""
+        return self.traffic_log.sent
 
     @property
-    def heartbeats(self) -> list[Crossing]:
-        """See `Diary.heartbeats`."""
-        return self.diary.heartbeats
+    def heartbeats(self) -> list[TrafficEntry]:
+        """See `TrafficLog.heartbeats`."""
+        return self.traffic_log.heartbeats
 
     # ------------------------------------------------------------------------------------ link
 
@@ -155,7 +155,7 @@ class Air(Link):
         for frame in self._up.receive(data, _now()):
             message = STANDARD.decode(frame)
             is_lost = self._is_out(is_up=True) or self._loses(message)
-            self._note_sent(frame, self.diary.cross(self.sent, message, is_lost))
+            self._note_sent(frame, self.traffic_log.cross(self.sent, message, is_lost))
             if not is_lost:
                 self._later(self._ups, self._delay(), functools.partial(self.link.write, frame.raw))
 
@@ -174,7 +174,7 @@ class Air(Link):
             if is_lost or self._receiver is None:
                 continue
             arrive = functools.partial(self._arrive, frame.raw, message)
-            self._later(self._downs, self.weather.latency_s, arrive)
+            self._later(self._downs, self.disturbances.latency_s, arrive)
 
     def link_lost(self, error: Exception) -> None:
         if self._receiver is not None:
@@ -186,43 +186,43 @@ class Air(Link):
     def link_drained(self) -> None:
         """It always does."""
 
-    def _note_sent(self, frame: Frame, crossing: Crossing) -> None:
+    def _note_sent(self, frame: Frame, crossing: TrafficEntry) -> None:
         crossing.raw, crossing.arrives_at = frame.raw, crossing.at + self._delay()
 
     def _arrive(self, raw: bytes, message: Message) -> None:
-        self.diary.cross(self.diary.heard, message).raw = raw
+        self.traffic_log.cross(self.traffic_log.heard, message).raw = raw
         if self._receiver is not None:
             self._receiver.bytes_received(raw, None)
 
     @staticmethod
     def _later(queue: deque[Callable[[], object]], delay_s: float, act: Callable[[], object]) -> None:
-        """In their order: the loop does not keep that of timers for the same instant."""
+        """Deliver in order, because the loop does not keep the order of timers for the same time."""
         queue.append(act)
         asyncio.get_running_loop().call_later(delay_s, lambda: queue.popleft()())
 
     def _is_out(self, *, is_up: bool) -> bool:
-        since, outage, silence = _now() - self.began_at, self.weather.outage, self.silence
+        since, outage, silence = _now() - self.began_at, self.disturbances.outage, self.silence
         if silence is not None and silence.begin_s <= since < silence.end_s:
             return not (is_up and silence.is_one_way)
         return outage is not None and outage[0] <= since < outage[1]
 
     def _loses(self, message: Message) -> bool:
-        weather = self.weather
-        if _now() < self.began_at or getattr(message, "command", None) != weather.command:
+        disturbances = self.disturbances
+        if _now() < self.began_at or getattr(message, "command", None) != disturbances.command:
             return False
-        if isinstance(message, CommandAck) and weather.lost_acks:
-            weather.lost_acks -= 1
+        if isinstance(message, CommandAck) and disturbances.lost_acks:
+            disturbances.lost_acks -= 1
             return True
-        if isinstance(message, (CommandLong, CommandInt)) and weather.lost_commands:
-            weather.lost_commands -= 1
+        if isinstance(message, (CommandLong, CommandInt)) and disturbances.lost_commands:
+            disturbances.lost_commands -= 1
             return True
         return False
 
     def _delay(self) -> float:
-        since, stall = _now() - self.began_at, self.weather.stall
+        since, stall = _now() - self.began_at, self.disturbances.stall
         if stall is not None and stall[0] <= since < stall[1]:
-            return stall[1] - since + self.weather.latency_s
-        return self.weather.latency_s
+            return stall[1] - since + self.disturbances.latency_s
+        return self.disturbances.latency_s
 
 
 def _is_autopilots(message: Message) -> bool:

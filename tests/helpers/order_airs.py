@@ -1,4 +1,4 @@
-"""Two links between a program and a vehicle, of which the one in use falls silent when an order was given."""
+"""Two links between a program and a vehicle, of which the selected one fails after an order."""
 
 from __future__ import annotations
 
@@ -7,43 +7,43 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 
-from order_air import Air, Crossing, Diary, Silence, Weather
+from order_air import Air, Disturbances, Silence, TrafficEntry, TrafficLog
 from stream_splitter import Splitter
 
 import aerokit
 from aerokit.connection.opening import open_connection
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.sim import SimulatedVehicle, SimulatorServer
-from aerokit.transport import Link, SeveralLinks, memory_link_pair
+from aerokit.transport import Link, MultiLink, memory_link_pair
 
 
 @dataclass(frozen=True)
 class TwoLinks:
-    """What becomes of the link in use; ``is_copied``: both carry one stream, so that answers come over both."""
+    """The failure of the selected link. ``is_copied``: both carry the same stream, so answers arrive over both."""
 
     silence: Silence
     is_copied: bool = False
 
 
 class Airs:
-    """As :class:`order_air.Air`, of two links; the weather is that of both."""
+    """Like :class:`order_air.Air` for two links with the same disturbances."""
 
     def __init__(self, airs: list[Air], two: TwoLinks) -> None:
         self.airs, self._two = airs, two
-        self._diary = airs[0].diary
+        self._diary = airs[0].traffic_log
         self.connection: aerokit.Connection | None = None
 
     @property
-    def weather(self) -> Weather:
-        return self.airs[0].weather
+    def disturbances(self) -> Disturbances:
+        return self.airs[0].disturbances
 
-    @weather.setter
-    def weather(self, weather: Weather) -> None:
+    @disturbances.setter
+    def disturbances(self, disturbances: Disturbances) -> None:
         for air in self.airs:
-            air.weather = weather
+            air.disturbances = disturbances
 
     def begin(self) -> None:
-        """The order is given now, and the link in use falls silent."""
+        """Start the disturbances, as the order is given and the selected link fails."""
         assert self.connection is not None
         assert self.connection.links is not None
         (used,) = [index for index, each in enumerate(self.connection.links.value) if each.used_for]
@@ -52,32 +52,30 @@ class Airs:
             air.begin()
 
     @property
-    def sent(self) -> list[Crossing]:
+    def sent(self) -> list[TrafficEntry]:
         return self._diary.sent
 
     @property
-    def heartbeats(self) -> list[Crossing]:
+    def heartbeats(self) -> list[TrafficEntry]:
         return self._diary.heartbeats
 
     def believe(self, heartbeat: Heartbeat) -> None:
-        """The program takes what has just come."""
+        """Record that the program accepted the last message."""
         self._diary.heard[-1].is_believed = True
 
 
-class _Unbelieved(Diary):
-    """Of two links it is not said which is taken: the connection says so."""
+class _SelectedLinkLog(TrafficLog):
+    """The connection reports which of the links it selects."""
 
-    def cross(self, into: list[Crossing], *about: object, **more: object) -> Crossing:
+    def cross(self, into: list[TrafficEntry], *about: object, **more: object) -> TrafficEntry:
         crossing = super().cross(into, *about, **more)  # type: ignore[arg-type]
         crossing.is_believed = into is not self.heard
         return crossing
 
 
 @asynccontextmanager
-async def over_two(
-    vehicle: SimulatedVehicle, two: TwoLinks
-) -> AsyncIterator[tuple[Airs, aerokit.Connection]]:
-    """A connection over two links, to be flown with, and what crosses them."""
+async def over_two(vehicle: SimulatedVehicle, two: TwoLinks) -> AsyncIterator[tuple[Airs, aerokit.Connection]]:
+    """A connection over two links, and a record of their traffic."""
     pairs = [memory_link_pair() for _ in range(2)]
     airs = unused_airs([near for near, _ in pairs], two)
     async with AsyncExitStack() as stack:
@@ -92,8 +90,8 @@ async def over_two(
 
 @asynccontextmanager
 async def joined(airs: Airs) -> AsyncIterator[aerokit.Connection]:
-    """A connection over both."""
-    together = SeveralLinks([partial(_itself, air) for air in airs.airs])
+    """Open a connection over both links."""
+    together = MultiLink([partial(_itself, air) for air in airs.airs])
     async with open_connection(together) as connection:
         airs.connection = connection
         connection.bus.attach(Heartbeat, airs.believe)
@@ -101,9 +99,9 @@ async def joined(airs: Airs) -> AsyncIterator[aerokit.Connection]:
 
 
 def unused_airs(near: Sequence[Link], two: TwoLinks) -> Airs:
-    """Through the air over these links; nothing is open yet."""
-    diary = _Unbelieved()
-    return Airs([Air(each, diary=diary) for each in near], two)
+    """Create the disturbed links, not opened."""
+    traffic_log = _SelectedLinkLog()
+    return Airs([Air(each, traffic_log=traffic_log) for each in near], two)
 
 
 def _itself(link: Link) -> Link:

@@ -1,4 +1,4 @@
-"""A hub between a program and a vehicle, with the bad air on either side of it."""
+"""A hub between a program and a vehicle, with disturbances on either side."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
-from order_air import Air, Crossing, Diary, Silence, Weather
+from order_air import Air, Disturbances, Silence, TrafficEntry, TrafficLog
 from order_airs import Airs, TwoLinks, joined, unused_airs
 from stream_splitter import Splitter
 
 import aerokit
-from aerokit.connection.routes import MOVES_AFTER_S
+from aerokit.connection.routes import ROUTE_TIMEOUT_S
 from aerokit.errors import LinkLost
 from aerokit.hub import Endpoint, Hub
 from aerokit.hub.attachment import Attachment
@@ -24,7 +24,7 @@ from aerokit.transport import Link, memory_link_pair
 Side = Literal["vehicle", "program"]
 Ways = Literal["one", "vehicle twice", "program twice", "program copied"]
 FULL = 1 << 20
-"""More than any link of a hub may have before what follows has to wait."""
+"""More bytes than any link of a hub may queue."""
 
 
 NEVER = Silence(0.0, 0.0)
@@ -32,11 +32,11 @@ NEVER = Silence(0.0, 0.0)
 
 @dataclass(frozen=True)
 class ThroughHub:
-    """Where the hub's trouble is; times are (from, until), in seconds since the order was given.
+    """Disturbances of the hub; times are (from, until), in seconds since the order was given.
 
-    The weather is that on the bad ``side``. There the hub's endpoint takes nothing during ``jam``, and has gone during
-    ``away``. ``ways``: the vehicle is heard at two endpoints, of which the first falls into ``silence``; or the program
-    has two links to the hub, of which the one in use does; or a router copies what it sends to two endpoints.
+    The bad ``side`` has the disturbances. Its endpoint accepts nothing during ``jam`` and is closed during ``away``.
+    ``ways``: the vehicle is reachable over two endpoints, of which the first fails during ``silence``; or the program
+    has two links to the hub, of which the selected one fails; or a router copies its traffic to two endpoints.
     """
 
     side: Side
@@ -47,9 +47,9 @@ class ThroughHub:
 
     @property
     def quiet_until(self) -> float:
-        """When the vehicle is heard, and told something, again."""
+        """Time at which the vehicle can be received, and reached, again."""
         ends = [each[1] for each in (self.jam, self.away) if each is not None]
-        dumb = min(self.silence.end_s, self.silence.begin_s + MOVES_AFTER_S + 1.0)
+        dumb = min(self.silence.end_s, self.silence.begin_s + ROUTE_TIMEOUT_S + 1.0)
         return max([0.0, *ends, dumb if "twice" in self.ways else 0.0])
 
 
@@ -59,7 +59,7 @@ class HubsEnd(Air):
 
     jam: tuple[float, float] | None = None
     away: tuple[float, float] | None = None
-    weather: Weather = field(default_factory=lambda: Weather(latency_s=0.0))
+    disturbances: Disturbances = field(default_factory=lambda: Disturbances(latency_s=0.0))
 
     def begin(self) -> None:
         super().begin()
@@ -90,32 +90,33 @@ class HubsEnd(Air):
 
 
 class HubSky:
-    """As :class:`order_air.Sky`: what the program has sent and heard. ``at_vehicle``: what the hub has sent to the
-    vehicle, by whichever endpoint, and heard of it.
+    """Like :class:`order_air.Sky`, for what the program sends and receives.
+
+    ``at_vehicle`` is the traffic between hub and vehicle, over any endpoint.
     """
 
     def __init__(self, near: Air | Airs, through: ThroughHub) -> None:
         self.near, self._through = near, through
-        self.at_vehicle = Diary()
+        self.at_vehicle = TrafficLog()
         self.vehicles_ends: list[HubsEnd] = []
         self.programs_ends: list[HubsEnd] = []
-        self._weather = Weather()
+        self._weather = Disturbances()
 
     @property
-    def weather(self) -> Weather:
+    def disturbances(self) -> Disturbances:
         return self._weather
 
-    @weather.setter
-    def weather(self, weather: Weather) -> None:
-        self._weather = weather
+    @disturbances.setter
+    def disturbances(self, disturbances: Disturbances) -> None:
+        self._weather = disturbances
         if self._through.side == "program":
-            self.near.weather = weather
+            self.near.disturbances = disturbances
             return
         for each in self.vehicles_ends:
-            each.weather = weather
+            each.disturbances = disturbances
 
     def begin(self) -> None:
-        """The order is given now."""
+        """Start the disturbances, as the order is given."""
         ends = self.vehicles_ends if self._through.side == "vehicle" else self.programs_ends
         ends[0].jam, ends[0].away = self._through.jam, self._through.away
         if self._through.ways == "vehicle twice":
@@ -124,17 +125,17 @@ class HubSky:
             each.begin()
 
     def end(self) -> None:
-        """What of the program's has not come to the vehicle is lost."""
+        """Messages of the program that never reached the vehicle."""
         arrived = {each.raw for each in self.at_vehicle.sent if not each.is_lost}
         for each in self.sent:
             each.is_lost |= each.raw not in arrived
 
     @property
-    def sent(self) -> list[Crossing]:
+    def sent(self) -> list[TrafficEntry]:
         return self.near.sent
 
     @property
-    def heartbeats(self) -> list[Crossing]:
+    def heartbeats(self) -> list[TrafficEntry]:
         return self.near.heartbeats
 
 
@@ -142,7 +143,7 @@ class HubSky:
 async def through_hub(
     vehicle: SimulatedVehicle, through: ThroughHub
 ) -> AsyncIterator[tuple[HubSky, Link | aerokit.Connection]]:
-    """What a vehicle is connected to by, and what crosses it."""
+    """The links of a vehicle, and a record of their traffic."""
     async with AsyncExitStack() as stack:
         near, fars = await _programs_side(stack, through)
         sky = HubSky(near, through)
@@ -160,7 +161,7 @@ async def through_hub(
 
 
 async def _programs_side(stack: AsyncExitStack, through: ThroughHub) -> tuple[Air | Airs, list[Link]]:
-    """The program's end, and the hub's."""
+    """The ends of the program and the hub."""
     pairs = [memory_link_pair() for _ in range(1 if through.ways in ("one", "vehicle twice") else 2)]
     fars: list[Link] = [far for _, far in pairs]
     if through.ways == "program copied":
@@ -173,7 +174,7 @@ async def _programs_side(stack: AsyncExitStack, through: ThroughHub) -> tuple[Ai
 
 
 async def _vehicles_side(
-    stack: AsyncExitStack, vehicle: SimulatedVehicle, through: ThroughHub, diary: Diary
+    stack: AsyncExitStack, vehicle: SimulatedVehicle, through: ThroughHub, traffic_log: TrafficLog
 ) -> list[HubsEnd]:
     """The hub's ends."""
     pairs = [memory_link_pair() for _ in range(2 if through.ways == "vehicle twice" else 1)]
@@ -183,4 +184,4 @@ async def _vehicles_side(
         await splitter.open(stack)
         ports = [splitter.port]
     await stack.enter_async_context(SimulatorServer(vehicle, ports))
-    return [HubsEnd(near, diary=diary) for near, _ in pairs]
+    return [HubsEnd(near, traffic_log=traffic_log) for near, _ in pairs]

@@ -1,15 +1,15 @@
-"""Runs the Python of the documentation: every block of README.md and docs/, as somebody who copies it would.
+"""Runs the Python blocks of README.md and docs/ as a reader who copies them would.
 
-A block shows all its imports and is run in a namespace of its own; ``await`` and ``async with`` may stand at its top
-level, as in a notebook. What the fence says behind ``python``:
+A block shows all its imports and runs in a namespace of its own. ``await`` and ``async with`` may be at the top level,
+as in a notebook. The fence may have a title after ``python``:
 
-- ``title="continued"``: goes on in the namespace of the block before it;
-- ``title="test_x.py"``: a file for pytest, run by it;
-- ``title="x.py"``: run, and kept as a file for what follows on the page.
+- ``title="continued"``: the block continues in the namespace of the previous block;
+- ``title="test_x.py"``: pytest runs the file;
+- ``title="x.py"``: the block runs, and later blocks of the page can import the file.
 
-``vehicle`` is given, connected, to blocks that do not make it, on pages that link to `THE_RULE`. `ADDRESS` leads to a
-simulated copter: in memory and on virtual time, or on a socket for blocking programs. Blocks that import something of
-`NOT_HERE` are compiled only.
+On pages that link to `VEHICLE_RULE`, a connected ``vehicle`` is provided to blocks that do not create one. `ADDRESS`
+leads to a simulated copter: in memory on virtual time, or on a socket for blocking programs. Blocks that import one of
+`UNAVAILABLE_PACKAGES` are only compiled.
 """
 
 from __future__ import annotations
@@ -43,27 +43,25 @@ from aerokit.transport import Link, create, create_link, memory_link_pair
 from aerokit.transport.address import LinkAddress
 
 ROOT = Path(__file__).parents[2]
-THE_RULE = "docs/how-to/index.md#how-to-read-the-code"
-"""Where it is said that ``vehicle`` is connected."""
+VEHICLE_RULE = "docs/how-to/index.md#how-to-read-the-code"
+"""The section that says that ``vehicle`` is connected."""
 ADDRESS = "udpin:0.0.0.0:14550"
 NETWORK = "zenoh://"
-"""What begins so leads there, too."""
-NOT_HERE = frozenset({
+"""Addresses with this prefix lead to the simulated copter, too."""
+UNAVAILABLE_PACKAGES = frozenset({
     "dronekit", "fastapi", "mavros_msgs", "mavsdk", "geographic_msgs", "geometry_msgs", "rclpy", "rospy",
     "sensor_msgs", "std_msgs", "std_srvs",
 })  # fmt: skip
-"""Packages that the tests do not have, for code side by side and for host programs."""
+"""Packages of other libraries and host programs, which the tests do not install."""
 FILES = {"flight.tlog": ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"}
-"""What is in the folder where the blocks run."""
+"""Files in the working directory of the blocks."""
 PASSPHRASE = "a long passphrase"
-"""Of the vehicle's key, where a block connects with ``signing=``."""
+"""Passphrase of the vehicle's key, if a block connects with ``signing=``."""
 VIDEO = "video.mp4"
-"""What the simulated camera streams."""
+"""URI of the simulated camera's stream."""
 SPEEDUP = 40.0
 
-FENCE = re.compile(
-    r"^(?P<indent> *)```(?P<info>[^`\n]*)\n(?P<body>.*?)^(?P=indent)```$", re.DOTALL | re.MULTILINE
-)
+FENCE = re.compile(r"^(?P<indent> *)```(?P<info>[^`\n]*)\n(?P<body>.*?)^(?P=indent)```$", re.DOTALL | re.MULTILINE)
 TITLE = re.compile(r'title="([^"]*)"')
 
 
@@ -73,7 +71,7 @@ class Block:
 
     page: Path
     line: int
-    """Of the fence, from 1."""
+    """Line of the opening fence, from 1."""
     language: str
     title: str
     body: str
@@ -83,7 +81,7 @@ class Block:
         return self.title.startswith("test_") and self.title.endswith(".py")
 
     def compiled(self) -> Any:
-        """Its code; tracebacks have the line of the page."""
+        """Compile the block; tracebacks have the line numbers of the page."""
         source = "\n" * self.line + self.body
         flags = ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
         return compile(source, str(self.page), "exec", flags=flags, dont_inherit=True)
@@ -94,7 +92,7 @@ class Block:
 
 
 Chain = Sequence[Block]
-"""A block and those that continue it."""
+"""A block and the blocks that continue it."""
 
 
 def pages() -> list[Path]:
@@ -134,11 +132,11 @@ def chains(page: Path) -> list[list[Block]]:
     return found
 
 
-# ------------------------------------------------------------------------------------ what a block says
+# ------------------------------------------------------------------------------------ analysing blocks
 
 
 def imported(chain: Chain) -> set[str]:
-    """The modules that a chain imports, with their packages: ``aerokit.sync`` is ``aerokit``, too."""
+    """Return the modules that a chain imports, and their parent packages."""
     names: set[str] = set()
     for node in (node for block in chain for node in ast.walk(block.tree)):
         if isinstance(node, ast.Import):
@@ -149,96 +147,96 @@ def imported(chain: Chain) -> set[str]:
 
 
 def free_names(chain: Chain) -> set[str]:
-    """The names that a chain reads and nowhere makes."""
+    """Return the names that a chain reads and never binds."""
     read: set[str] = set()
-    made = {"__name__", "__file__", *dir(builtins)}
+    bound = {"__name__", "__file__", *dir(builtins)}
     for node in (node for block in chain for node in ast.walk(block.tree)):
         if isinstance(node, ast.Name):
-            (read if isinstance(node.ctx, ast.Load) else made).add(node.id)
+            (read if isinstance(node.ctx, ast.Load) else bound).add(node.id)
         elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-            made.add(node.name)
+            bound.add(node.name)
         elif isinstance(node, ast.arg):
-            made.add(node.arg)
+            bound.add(node.arg)
         elif isinstance(node, (ast.Import, ast.ImportFrom)):
-            made |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
+            bound |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
         elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name:
-            made.add(node.name)
-    return read - made
+            bound.add(node.name)
+    return read - bound
 
 
-def wants_given_vehicle(chain: Chain) -> bool:
+def needs_vehicle(chain: Chain) -> bool:
     return "vehicle" in free_names(chain)
 
 
-def is_here(chain: Chain) -> bool:
-    return not imported(chain) & NOT_HERE
+def is_runnable(chain: Chain) -> bool:
+    return not imported(chain) & UNAVAILABLE_PACKAGES
 
 
-def tells_the_rule(page: Path) -> bool:
-    """Whether the page links to `THE_RULE`, or has it."""
+def has_vehicle_rule(page: Path) -> bool:
+    """Return True if the page links to `VEHICLE_RULE` or contains it."""
     targets = re.findall(r"\]\(([^)\s]*#[^)\s]*)\)", page.read_text(encoding="utf-8"))
-    there = {normpath(page.parent / target) if target[0] != "#" else f"{page}{target}" for target in targets}
-    return str(ROOT / THE_RULE) in there or page == ROOT / THE_RULE.partition("#")[0]
+    linked = {normpath(page.parent / target) if target[0] != "#" else f"{page}{target}" for target in targets}
+    return str(ROOT / VEHICLE_RULE) in linked or page == ROOT / VEHICLE_RULE.partition("#")[0]
 
 
 # ------------------------------------------------------------------------------------ running
 
 
 def run(chain: Chain, folder: Path) -> None:
-    """Run a chain in a folder that is empty but for `FILES`; raises what it raises."""
+    """Run a chain in a folder that contains only `FILES`; its exceptions propagate."""
     for name, source in FILES.items():
         shutil.copyfile(source, folder / name)
     if "aerokit.video" in imported(chain):
         _make_video(folder / VIDEO)
     code = [block.compiled() for block in chain]
-    if not is_here(chain):
+    if not is_runnable(chain):
         return
     if chain[0].is_for_pytest:
         _run_pytest(chain[0], folder)
     elif imported(chain) & {"aerokit.sync", "aerokit.dronekit"}:
-        with served_copter(speedup=SPEEDUP) as address, _address_is(lambda: create_link(address)):
+        with served_copter(speedup=SPEEDUP) as address, _address_opens(lambda: create_link(address)):
             _run_plain(code)
-    elif any(each.co_flags & inspect.CO_COROUTINE for each in code) or wants_given_vehicle(chain):
-        run_virtual(_run_in_a_loop(code, chain))
+    elif any(block.co_flags & inspect.CO_COROUTINE for block in code) or needs_vehicle(chain):
+        run_virtual(_run_async(code, chain))
     else:
-        with patch.object(asyncio, "run", lambda main: run_virtual(_on_stage(main, chain))):
+        with patch.object(asyncio, "run", lambda main: run_virtual(_with_simulation(main, chain))):
             _run_plain(code)
 
 
 def _run_plain(code: Sequence[Any]) -> None:
     names = {"__name__": "__main__"}
-    for each in code:
-        exec(each, names)
+    for block in code:
+        exec(block, names)
 
 
-async def _run_in_a_loop(code: Sequence[Any], chain: Chain) -> None:
+async def _run_async(code: Sequence[Any], chain: Chain) -> None:
     names: dict[str, Any] = {"__name__": "__main__"}
 
     async def main() -> None:
         async with AsyncExitStack() as stack:
-            if wants_given_vehicle(chain):
+            if needs_vehicle(chain):
                 names["vehicle"] = await stack.enter_async_context(aerokit.connect(ADDRESS))
-            for each in code:
-                awaited = eval(each, names)
+            for block in code:
+                awaited = eval(block, names)
                 if inspect.iscoroutine(awaited):
                     await awaited
 
-    await _on_stage(main(), chain)
+    await _with_simulation(main(), chain)
 
 
-async def _on_stage(main: Coroutine[Any, Any, Any], chain: Chain) -> Any:
-    """Await what `ADDRESS` leads to simulated vehicles for; each time it is opened to a link of its own."""
+async def _with_simulation(main: Coroutine[Any, Any, Any], chain: Chain) -> Any:
+    """Await ``main`` while `ADDRESS` opens links to simulated vehicles, a new link each time."""
     text = "\n".join(block.body for block in chain)
-    named = text.count(ADDRESS) + text.count(f'"{NETWORK}')
-    ends = [memory_link_pair() for _ in range(max(named, 1) + wants_given_vehicle(chain))]
-    nears = iter([near for near, _ in ends])
-    async with SimulatorServer(_vehicles_for(text), [far for _, far in ends]):
-        with _address_is(lambda: next(nears)), _served_to_nobody():
+    openings = text.count(ADDRESS) + text.count(f'"{NETWORK}')
+    pairs = [memory_link_pair() for _ in range(max(openings, 1) + needs_vehicle(chain))]
+    nears = iter([near for near, _ in pairs])
+    async with SimulatorServer(_simulated_vehicles(text), [far for _, far in pairs]):
+        with _address_opens(lambda: next(nears)), _web_server_stops():
             return await main
 
 
-def _vehicles_for(text: str) -> list[SimulatedCopter]:
-    """What a text needs: a second vehicle, a camera, a gimbal."""
+def _simulated_vehicles(text: str) -> list[SimulatedCopter]:
+    """Return the vehicles that a text uses, with camera and gimbal if it names them."""
     components: list[SimulatedComponent] = []
     if "camera" in text or "component(100)" in text:
         components.append(SimulatedCamera(streams=[VIDEO], capabilities=SimulatedCamera.ALL_CAPABILITIES))
@@ -253,12 +251,12 @@ def _vehicles_for(text: str) -> list[SimulatedCopter]:
 
 
 @contextmanager
-def _address_is(make: Any) -> Iterator[None]:
-    opened = create._udp
+def _address_opens(make: Any) -> Iterator[None]:
+    original = create._udp
 
     def udp(where: LinkAddress, peers: Any) -> Link:
-        is_ours = f"{where.kind}:{where.host}:{where.port}" == ADDRESS
-        link: Link = make() if is_ours else opened(where, peers)
+        is_address = f"{where.kind}:{where.host}:{where.port}" == ADDRESS
+        link: Link = make() if is_address else original(where, peers)
         return link
 
     with patch.object(create, "_udp", udp), patch.object(create, "_zenoh", lambda _: make()):
@@ -266,8 +264,8 @@ def _address_is(make: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _served_to_nobody() -> Iterator[None]:
-    """A web server would serve for ever."""
+def _web_server_stops() -> Iterator[None]:
+    """Stop a web server after a second."""
 
     async def serve(self: uvicorn.Server) -> None:
         await asyncio.sleep(1)
@@ -277,24 +275,24 @@ def _served_to_nobody() -> Iterator[None]:
 
 
 def _run_pytest(block: Block, folder: Path) -> None:
-    """In this process, as the imports of another one take a second; what is imported stays imported."""
+    """Run pytest in this process, because importing everything in another one takes a second."""
     files = {before.title for before in blocks(block.page) if before.title.endswith(".py")}
     modules = [name.removesuffix(".py") for name in files]
-    for before in blocks(block.page):  # the files of the page that stand before it
+    for before in blocks(block.page):  # earlier files of the page
         if before.line <= block.line and before.title in files:
             (folder / before.title).write_text(before.body, encoding="utf-8")
-    left_out = ("aerokit", "xdist", "cacheprovider", "asyncio", "faulthandler", "timeout")
-    options = [*(f"no:{name}" for name in left_out), "aerokit.testing.plugin"]
-    words = [word for option in options for word in ("-p", option)]
-    ours = {name: sys.modules.pop(name) for name in modules if name in sys.modules}  # tests of the same name
+    disabled = ("aerokit", "xdist", "cacheprovider", "asyncio", "faulthandler", "timeout")
+    options = [*(f"no:{name}" for name in disabled), "aerokit.testing.plugin"]
+    arguments = [word for option in options for word in ("-p", option)]
+    shadowed = {name: sys.modules.pop(name) for name in modules if name in sys.modules}
     with patch.object(sys, "path", [*sys.path]):
         code = pytest.main(
-            [*words, f"--rootdir={folder}", "--assert=plain", "-W", "error", "-q", "-s", block.title]
+            [*arguments, f"--rootdir={folder}", "--assert=plain", "-W", "error", "-q", "-s", block.title]
         )
     for name in modules:
         sys.modules.pop(name, None)
-    sys.modules.update(ours)
-    assert code == 0, f"{block.page.name}, line {block.line}: pytest ends with {code}"
+    sys.modules.update(shadowed)
+    assert code == 0, f"{block.page.name}, line {block.line}: pytest exits with {code}"
 
 
 def _make_video(path: Path) -> None:

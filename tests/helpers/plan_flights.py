@@ -1,4 +1,4 @@
-"""Missions near a simulated vehicle, and what was sent for them."""
+"""Missions near a simulated vehicle, and recorders of their transfers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def long_mission(count: int) -> Mission:
 
 
 def short_mission(flight: Flight | Px4Flight, *ends: MissionItem) -> Mission:
-    """Up, two places to the north, the end."""
+    """Take-off, two places to the north, landing."""
     home = flight.vehicle.home.value.position
     items = [take_off(*near_home(0, home=home), altitude_relative_m=4)]
     items += [waypoint(*near_home(6 * i, home=home), altitude_relative_m=4) for i in (1, 2)]
@@ -43,7 +43,7 @@ def short_mission(flight: Flight | Px4Flight, *ends: MissionItem) -> Mission:
 
 
 def changed(mission: Mission, *indices: int) -> Mission:
-    """With another altitude there."""
+    """The same place at another altitude."""
     items = [item.replace(z=33.0) if i in indices else item for i, item in enumerate(mission)]
     return Mission(items)
 

@@ -1,4 +1,4 @@
-"""How an error is provoked: where, what is done to the vehicle before, and the call that must raise it."""
+"""How to provoke an error: the state of the vehicle, the preparation, and the call that must raise it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Trouble = Callable[[Stage], object]
 
 @dataclass(frozen=True)
 class Provocation:
-    """``before`` is done once the vehicle is in its place. ``alone``: the vehicle is of no use afterwards."""
+    """``before`` runs when the vehicle is in its state. ``alone``: the vehicle cannot be used afterwards."""
 
     do: Do
     place: Place = anywhere
@@ -46,39 +46,37 @@ class Provocation:
 
 
 Table = dict[tuple[str, str], Provocation]
-"""(call, error) → how it is provoked."""
+"""(call, error) → how to provoke it."""
 
 
 def refused(command: int, result: int = MavResult.FAILED) -> Trouble:
-    """The vehicle refuses this command."""
+    """The vehicle refuses the command."""
     return lambda stage: stage.simulated.faults.refuse(command, result)
 
 
 def ignored(command: int) -> Trouble:
-    """The vehicle neither does this command nor answers."""
+    """The vehicle neither executes nor answers the command."""
     return lambda stage: stage.simulated.faults.ignore(command)
 
 
 def falls_silent(stage: Stage) -> None:
-    """Nothing comes through."""
+    """The link loses everything."""
     stage.simulated.faults.silent = True
 
 
 def lost(stage: Stage) -> None:
-    """The cable is pulled out."""
+    """The link is lost, as when the cable is unplugged."""
     stage.wire.lose()
 
 
 def pilot(stage: Stage) -> None:
-    """The mode switch is turned."""
+    """The pilot turns the mode switch."""
     stage.simulated.rc[2] = 1500  # type: ignore[union-attr]
     assert stage.simulated.set_mode(2)  # type: ignore[union-attr]
 
 
-def later(
-    do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborne, **options: Any
-) -> Provocation:
-    """The trouble comes while the call is under way."""
+def later(do: Do, trouble: Trouble, after_s: float = 1.0, place: Place = airborne, **options: Any) -> Provocation:
+    """The disturbance happens during the call."""
 
     async def disturbed(stage: Stage) -> object:
         asyncio.get_running_loop().call_later(after_s, trouble, stage)
@@ -88,19 +86,19 @@ def later(
 
 
 def no_modes(stage: Stage) -> None:
-    """A kind of vehicle that has no modes for anything."""
+    """A vehicle type without modes for any purpose."""
     autopilot: Any = stage.vehicle.autopilot
     autopilot.mode_for = lambda purpose, **_: None
     autopilot.take_off = lambda *_, **__: None
 
 
 def accepted(command: int) -> Trouble:
-    """The vehicle answers ACCEPTED, and does nothing."""
+    """The vehicle answers ACCEPTED without doing anything."""
     return refused(command, MavResult.ACCEPTED)
 
 
 def file_server(answers: dict[int, bytes | int]) -> Trouble:
-    """A file server that answers all requests with an ACK, with these data; a number is the code of a NAK."""
+    """A file server that answers all requests with an ACK and these data; a number is the code of a NAK."""
 
     def trouble(stage: Stage) -> None:
         def handle(message: m.FileTransferProtocol, channel: Any) -> None:
@@ -128,7 +126,7 @@ def _reply(request: FtpMessage, data: bytes | int) -> FtpMessage:
 
 Op = MavFtpOpcode
 REFUSING = file_server({-1: int(MavFtpErr.FILENOTFOUND)})
-"""It has no file at all."""
+"""A server without files."""
 NONSENSE = file_server(
     {
         Op.OPENFILERO: (10_000).to_bytes(4, "little"),
@@ -138,6 +136,6 @@ NONSENSE = file_server(
         Op.LISTDIRECTORY: b"Fsame\t1\0",
     }
 )
-"""Files end before they are whole, a CRC-32 has one byte, a list does not end."""
+"""A server whose files end early, whose CRC-32 has one byte, and whose lists never end."""
 FORGETTING = file_server({Op.CALCFILECRC: bytes(4)})
-"""It says that it has written all, and something else is there."""
+"""A server that confirms writing, but stores something else."""

@@ -1,4 +1,4 @@
-"""A vehicle with two radios, on virtual time: links that can be cut, delayed and stalled, and copies of one stream."""
+"""A vehicle with two radios, on virtual time: links that can be cut, delayed and stalled, and copied streams."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedVehicle, SimulatorServer
 from aerokit.testing import FaultModel, FaultyLink
-from aerokit.transport import Link, MemoryLink, Peer, SeveralLinks, memory_link_pair
+from aerokit.transport import Link, MemoryLink, MultiLink, Peer, memory_link_pair
 
 DEAD = FaultModel(loss=1.0)
 GOOD = FaultModel()
 
 
 class Radios:
-    """Several faulty links to the same vehicles, each with a port of the autopilot of its own."""
+    """Several faulty links to the same vehicles, each to a separate port of the autopilot."""
 
     def __init__(self, count: int, *, models: Sequence[FaultModel] = (), seed: int = 0) -> None:
         pairs = [memory_link_pair() for _ in range(count)]
@@ -33,16 +33,16 @@ class Radios:
             for index, (near, _) in enumerate(pairs)
         ]
 
-    def together(self, **options: Any) -> SeveralLinks:
-        """As one link."""
-        return SeveralLinks([partial(_itself, link) for link in self.links], **options)
+    def together(self, **options: Any) -> MultiLink:
+        """Open them as one link."""
+        return MultiLink([partial(_itself, link) for link in self.links], **options)
 
     def cut(self, index: int) -> None:
-        """Nothing comes through any more, in either direction, and nobody is told."""
+        """Lose everything in both directions, without an error."""
         self.links[index].incoming.model = self.links[index].outgoing.model = DEAD
 
     def mend(self, index: int) -> None:
-        """It is as new."""
+        """Repair the link."""
         self.links[index].incoming.model = self.links[index].outgoing.model = GOOD
 
 
@@ -50,8 +50,8 @@ def _itself(link: Link) -> Link:
     return link
 
 
-class Told:
-    """What the vehicle's side was sent, over which radio, in the order in which it was written."""
+class ReceivedMessages:
+    """Messages received on the vehicle's side, and by which radio, in the order of sending."""
 
     def __init__(self, radios: Radios) -> None:
         self.messages: list[tuple[int, float, Message]] = []
@@ -66,7 +66,7 @@ class Told:
         write(data, peer)
 
     def of(self, *types: type[Message]) -> list[tuple[int, Message]]:
-        """Those of these types, with the radio that each arrived by."""
+        """Messages of these types, with the radio over which each arrived."""
         return [(index, message) for index, _, message in self.messages if isinstance(message, types)]
 
 
@@ -92,19 +92,19 @@ async def over(
         yield await stack.enter_async_context(open_connection(together, **options))
 
 
-class News:
-    """The events of a connection, as they come."""
+class EventLog:
+    """Collect the events of a connection."""
 
     def __init__(self, connection: Connection, *types: type[events.Event]) -> None:
         self.all: list[events.Event] = []
-        for each in types or (events.LinkChosen,):
+        for each in types or (events.LinkSelected,):
             connection.bus.attach_event(each, self.all.append)
 
     @property
     def chosen(self) -> list[tuple[str, str]]:
-        """(link, reason) of each change, without the first choice."""
+        """Return (link, reason) of each change, without the first selection."""
         return [
             (each.link, each.reason)
             for each in self.all
-            if isinstance(each, events.LinkChosen) and each.before is not None
+            if isinstance(each, events.LinkSelected) and each.before is not None
         ]

@@ -1,4 +1,4 @@
-"""A router on board that copies one stream of the autopilot onto several radios."""
+"""An onboard router that copies one stream of the autopilot to several radios."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aerokit.transport import MemoryLink, Peer, memory_link_pair
 
 
 class Splitter:
-    """One stream of the autopilot copied onto several radios, as a router on board does it."""
+    """One stream of the autopilot, copied to several radios as by an onboard router."""
 
     def __init__(self, far: Sequence[MemoryLink]) -> None:
         self.port, self._inside = memory_link_pair()
@@ -18,7 +18,7 @@ class Splitter:
         self.keeps_peers = False
 
     async def open(self, stack: AsyncExitStack) -> None:
-        """Begin to copy; everything is closed with the stack."""
+        """Start copying. The exit stack closes everything."""
         splitter = self
 
         class FromRadio:

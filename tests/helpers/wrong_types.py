@@ -1,6 +1,6 @@
-"""Every public method of an object, and for each of its parameters values of wrong types, from the type hints.
+"""Wrong arguments for every public method of an object: for each parameter, values of other types than its annotation.
 
-A type hint that is not listed here is an error, so that what is added to the library later is covered.
+An annotation that is not listed here is an error, so that new ones in the library are covered.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["Misuse", "misuses", "misuses_of", "refusal_of"]
 
 
 class _Anything:
-    """Of no type that anybody knows."""
+    """A value of an unknown type."""
 
     def __repr__(self) -> str:
         raise RuntimeError("not even that")
@@ -72,13 +72,11 @@ WRONG: dict[str, tuple[object, ...]] = {
     "OwnHeartbeat | None": (*STRANGE, *TEXT, *NUMBER),
     "bool | None": (*STRANGE, "no", 2),
     "tuple[Mode, ...]": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *TEXT, *NUMBER),
-    "Peers | None": (*STRANGE, 1.5, b"10.0.0.7"),
+    "PeerFilter | None": (*STRANGE, 1.5, b"10.0.0.7"),
     "Dialect": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
     "LogEntry | int": (*NOTHING, *STRANGE, *TEXT, 1.5),
     "ParameterSource": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *NUMBER),
-    **dict.fromkeys(
-        ("PlanT", "Mission", "Fence", "RallyPoints"), (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
-    ),
+    **dict.fromkeys(("PlanT", "Mission", "Fence", "RallyPoints"), (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)),
     "SetpointT": (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE),
     "Iterable[str | Endpoint | Link]": (*NOTHING, _Anything(), [PLACE], (47.0, 8.0), 1j, *TEXT, *NUMBER),
     "str | Endpoint | Link": (*NOTHING, *STRANGE, *TEXT, *NUMBER),
@@ -94,7 +92,7 @@ WRONG: dict[str, tuple[object, ...]] = {
     ),
     "str | Link | Connection": (*NOTHING, *STRANGE, *NUMBER, b"udpin:0.0.0.0:14550"),
 }
-"""Type hint → values that it does not allow."""
+"""Annotation → values that it does not allow."""
 WRONG["type[ItemT]"] = WRONG["type[MessageT]"] = WRONG["type[Message]"]
 for _setpoint in ("Velocity", "BodyVelocity", "Acceleration", "LocalPosition", "Position", "Attitude"):
     WRONG[f"{_setpoint}Setpoint"] = (*NOTHING, *STRANGE, *TEXT, *NUMBER, PLACE)
@@ -149,11 +147,11 @@ RIGHT: dict[str, object] = {
     "LocalPositionSetpoint": LocalPositionSetpoint(0, 0, -5),
     "AttitudeSetpoint": AttitudeSetpoint(0, 0, 0, thrust=0.5),
 }
-"""Type hint → a value for a parameter that must be given while another one is wrong."""
+"""Annotation → a value for a required parameter while another one is wrong."""
 
 
 class Misuse(NamedTuple):
-    """A method, one of its parameters, and the call with a wrong value there."""
+    """A method, one of its parameters, and the call with a wrong value for it."""
 
     method: str
     parameter: str
@@ -165,19 +163,17 @@ class Misuse(NamedTuple):
 
 
 def misuses(owner: object, *, leave_out: frozenset[str] = frozenset()) -> Iterator[Misuse]:
-    """Each public method of an object with each parameter wrong in each way."""
+    """Yield each public method of an object with each parameter wrong in each way."""
     for name, _ in inspect.getmembers(type(owner), inspect.isfunction):
         if not name.startswith("_") and name not in leave_out:
             yield from misuses_of(getattr(owner, name), f"{type(owner).__name__}.{name}")
 
 
 def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
-    """One function with each parameter wrong in each way."""
+    """Yield one function with each parameter wrong in each way."""
     parameters = inspect.signature(function).parameters
     needed = [
-        each
-        for each in parameters.values()
-        if each.default is each.empty and each.kind is not each.VAR_POSITIONAL
+        each for each in parameters.values() if each.default is each.empty and each.kind is not each.VAR_POSITIONAL
     ]
     for parameter in parameters.values():
         others = [each for each in needed if each is not parameter]
@@ -187,19 +183,17 @@ def misuses_of(function: Callable[..., Any], name: str) -> Iterator[Misuse]:
 
 
 def _impossible(method: str, parameter: inspect.Parameter) -> tuple[object, ...]:
-    """Of the right type, but no time that can be waited. Cells and subscriptions may be asked without waiting."""
+    """Values of the right type that are no valid time to wait. Cells and subscriptions allow not to wait."""
     name = parameter.name
     is_time = name == "timeout" or (name.endswith("_s") and not name.endswith(("m_s", "deg_s")))
     is_for_vehicles = not method.startswith(("StateCell.", "Subscription."))
-    return (
-        (math.nan, -1.0, 0.0) if is_time and is_for_vehicles and "float" in str(parameter.annotation) else ()
-    )
+    return (math.nan, -1.0, 0.0) if is_time and is_for_vehicles and "float" in str(parameter.annotation) else ()
 
 
 def _arguments(
     wrong: inspect.Parameter, value: object, others: list[inspect.Parameter]
 ) -> tuple[list[object], dict[str, object]]:
-    """By name; only what has no name goes by its place, and what stands before it as well."""
+    """Pass by name; positional-only parameters, and those before them, by position."""
     if wrong.kind is wrong.VAR_POSITIONAL:
         first = [RIGHT[str(each.annotation)] for each in others if each.kind is each.POSITIONAL_OR_KEYWORD]
         rest = {each.name: RIGHT[str(each.annotation)] for each in others if each.kind is each.KEYWORD_ONLY}
@@ -208,7 +202,7 @@ def _arguments(
 
 
 def refusal_of(misuse: Misuse, error: BaseException | None) -> str | None:
-    """What is wrong with how it was refused; None when nothing is."""
+    """Describe what is wrong with the error; None if nothing is."""
     if not isinstance(error, InvalidArgument):
         return f"{misuse!r}: {error!r}"
     return None if misuse.parameter in str(error) else f"{misuse!r} is not named: {error}"

@@ -1,4 +1,4 @@
-"""A zenoh network on this machine: explicit endpoints on 127.0.0.1, no scouting, other processes, a line that holds."""
+"""A zenoh network on this machine: explicit endpoints on 127.0.0.1, no scouting, other processes, a pausable relay."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ asyncio.run(main())
 
 
 async def eventually(condition: Callable[[], bool]) -> None:
-    """Until it holds: threads of others and other processes are waited for; 100 s are for hung tests only."""
+    """Wait until a condition holds. Threads and other processes are involved; only hung tests take 100 s."""
     with anyio.fail_after(100):
         while not condition():  # noqa: ASYNC110
             await asyncio.sleep(0.005)
 
 
 def free_port() -> int:
-    """One that nobody listens on now."""
+    """Return a port on which nothing listens."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         port: int = sock.getsockname()[1]
@@ -61,7 +61,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def process(program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Another process, from when it says that it is up."""
+    """Start another process, and wait until it reports that it is running."""
     with subprocess.Popen(
         [sys.executable, "-c", program, *arguments],
         stdin=subprocess.PIPE,
@@ -77,12 +77,12 @@ def process(program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def router(port: int, config: str = "") -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
-    """A zenoh router, with a configuration file or without."""
+    """Start a zenoh router, with or without a configuration file."""
     return process(ROUTER, f"tcp/127.0.0.1:{port}", *filter(None, [config]))
 
 
 class HoldingProxy:
-    """A line to a port that can keep back what is on it, and let it go later."""
+    """A relay to a port that can delay its traffic."""
 
     def __init__(self, port: int) -> None:
         self.port = free_port()
@@ -109,11 +109,11 @@ class HoldingProxy:
         await asyncio.gather(*(writer.wait_closed() for writer in self._writers), return_exceptions=True)
 
     def hold(self) -> None:
-        """From now on nothing arrives."""
+        """Hold everything back from now on."""
         self._flows.clear()
 
     def release(self) -> None:
-        """All that was kept back arrives."""
+        """Deliver everything that was held back."""
         self._flows.set()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,4 +1,4 @@
-"""What the tests of the hub share: programs at the far ends of links in memory, who say and hear frames."""
+"""Helpers of the hub tests: programs that send and receive at the far ends of memory links."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STATION = Heartbeat(6, 8, 0, 0, 4, 3)
 
 
 class Program(AbstractAsyncContextManager["Program"]):
-    """One component behind a link: what it says, and what it hears."""
+    """One component behind a link, with what it sends and receives."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class Program(AbstractAsyncContextManager["Program"]):
 
     @property
     def heard(self) -> list[str]:
-        """Names of what was heard, in order."""
+        """Names of the received messages, in order."""
         return [STANDARD[frame.message_id].NAME for frame in self.frames]
 
     async def __aenter__(self) -> Program:
@@ -84,7 +84,7 @@ class Program(AbstractAsyncContextManager["Program"]):
 
 
 class SlowLink(Link):
-    """A link whose far end takes bytes when a test says so."""
+    """A link whose far end accepts bytes when a test allows it."""
 
     def __init__(self, address: str = "slow:1") -> None:
         self.address = address
@@ -109,13 +109,13 @@ class SlowLink(Link):
         pass
 
     def names(self) -> list[str]:
-        """What was written."""
+        """Written data."""
         frames = Framer().receive(b"".join(self.written))
         return [STANDARD[frame.message_id].NAME for frame in frames]
 
 
 async def settle() -> None:
-    """Let what is under way arrive; on virtual time this takes none."""
+    """Deliver frames in transit; on virtual time this takes no time."""
     for _ in range(20):
         await anyio.lowlevel.checkpoint()
 

@@ -1,4 +1,4 @@
-"""A hub on real sockets of this machine: several clients of one endpoint, who come, say nothing, stall and go."""
+"""A hub on real sockets of this machine, with several clients of one endpoint."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def to(statistics: EndpointStatistics, scheme: str) -> Any:
     return create_link(f"{scheme}:{statistics.address.partition(':')[2]}")
 
 
-async def test_each_client_of_a_server_is_a_place_of_its_own() -> None:
+async def test_clients_of_a_server_are_routed_separately() -> None:
     async with Hub([Endpoint("tcpin:127.0.0.1:0", name="tcp")]) as hub:
         links = [to(of(hub, "tcp"), "tcp") for _ in range(3)]
         async with Program(1, 1, links[0]) as copter, Program(255, 190, links[1]) as station:
@@ -42,9 +42,7 @@ async def test_each_client_of_a_server_is_a_place_of_its_own() -> None:
                 station.say(STATION, ORDER)
                 await until(lambda: len(copter.heard) == 2)
                 await until(lambda: len(silent.heard) == 2)
-                assert silent.heard == ["HEARTBEAT", "HEARTBEAT"], (
-                    "who says nothing hears what is for everybody"
-                )
+                assert silent.heard == ["HEARTBEAT", "HEARTBEAT"], "who says nothing hears what is for everybody"
                 assert copter.heard == ["HEARTBEAT", "COMMAND_LONG"]
             await until(lambda: of(hub, "tcp").peers == 2)
             assert of(hub, "tcp").systems == ((1, 1), (255, 190))
@@ -53,7 +51,7 @@ async def test_each_client_of_a_server_is_a_place_of_its_own() -> None:
         assert of(hub, "tcp").frames_in == 3
 
 
-async def test_who_connects_and_who_goes_is_told() -> None:
+async def test_connecting_and_disconnecting_clients_are_reported() -> None:
     async with Hub([Endpoint("tcpin:127.0.0.1:0", name="tcp"), Endpoint("udpin:127.0.0.1:0")]) as hub:
         told: list[HubEvent] = []
         hub.on_event(told.append)
@@ -64,14 +62,14 @@ async def test_who_connects_and_who_goes_is_told() -> None:
             assert joined.text.startswith("client 127.0.0.1:")
         await until(lambda: len(told) == 2)
         assert told[1].kind == "client_left"
-        assert told[1].text == joined.text.replace("has connected", "has gone")
+        assert told[1].text == joined.text.replace("has connected", "has disconnected")
         async with Program(1, 1, to(hub.endpoints[1], "udpout")) as sender:
             sender.say(COPTER)
             await until(lambda: hub.endpoints[1].peers == 1)
     assert [each.kind for each in told] == ["client_joined", "client_left"]
 
 
-async def test_senders_of_datagrams_are_told_apart_and_noise_is_nobody() -> None:
+async def test_udp_senders_are_separate_and_noise_is_ignored() -> None:
     async with Hub([Endpoint("udpin:127.0.0.1:0", name="udp")]) as hub:
         links = [to(of(hub, "udp"), "udpout") for _ in range(3)]
         async with (
@@ -92,17 +90,15 @@ async def test_senders_of_datagrams_are_told_apart_and_noise_is_nobody() -> None
             assert of(hub, "udp").bad_bytes >= 18
 
 
-async def test_only_those_peers_that_are_allowed() -> None:
+async def test_only_allowed_peers_are_accepted() -> None:
     async with Hub([Endpoint("tcpin:127.0.0.1:0", name="tcp", peers=["10.9.9.9"])]) as hub:
         async with Program(1, 1, to(of(hub, "tcp"), "tcp")) as copter:
             await until(lambda: copter.is_lost)
         assert of(hub, "tcp").frames_in == 0
 
 
-async def test_a_client_that_does_not_read_harms_nobody() -> None:
-    async with Hub(
-        [Endpoint("tcpin:127.0.0.1:0", name="tcp"), Endpoint("udpin:127.0.0.1:0", name="udp")]
-    ) as hub:
+async def test_client_that_does_not_read_affects_no_other() -> None:
+    async with Hub([Endpoint("tcpin:127.0.0.1:0", name="tcp"), Endpoint("udpin:127.0.0.1:0", name="udp")]) as hub:
         host, _, port = of(hub, "tcp").address.partition(":")[2].rpartition(":")
         with socket.socket() as stalled:
             stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -122,7 +118,7 @@ async def test_a_client_that_does_not_read_harms_nobody() -> None:
                 assert stalled.recv(10)
 
 
-async def test_two_hubs_in_a_circle_pass_everything_on_once() -> None:
+async def test_two_hubs_in_a_circle_forward_frames_once() -> None:
     async with (
         Hub([Endpoint("udpin:127.0.0.1:0", name="one"), Endpoint("tcpin:127.0.0.1:0", name="two")]) as first,
         Hub([to(of(first, "one"), "udpout"), to(of(first, "two"), "tcp")]) as second,
@@ -146,23 +142,19 @@ async def test_two_hubs_in_a_circle_pass_everything_on_once() -> None:
             assert len(station.frames) == len(copter.frames) == 51
 
 
-async def test_a_program_shares_its_link_by_one_argument() -> None:
+async def test_program_shares_its_link_by_one_argument() -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     async with (
         open_simulator(SimulatedCopter(boot_time_s=0.0), "tcpin:127.0.0.1:0") as server,
-        aerokit.connect(
-            f"tcp:{server.addresses[0].partition(':')[2]}", share=[f"tcpin:127.0.0.1:{port}"]
-        ) as program,
+        aerokit.connect(f"tcp:{server.addresses[0].partition(':')[2]}", share=[f"tcpin:127.0.0.1:{port}"]) as program,
         aerokit.connect(f"tcp:127.0.0.1:{port}", source_system=250, rates={}) as station,
     ):
         assert len(await station.parameters.download()) == len(await program.parameters.download())
 
 
-async def test_a_reader_hears_whole_frames() -> None:
-    async with Hub(
-        [Endpoint("udpin:127.0.0.1:0", name="in"), Endpoint("tcpin:127.0.0.1:0", name="out")]
-    ) as hub:
+async def test_reader_gets_complete_frames() -> None:
+    async with Hub([Endpoint("udpin:127.0.0.1:0", name="in"), Endpoint("tcpin:127.0.0.1:0", name="out")]) as hub:
         host, _, port = of(hub, "out").address.partition(":")[2].rpartition(":")
         reader, writer = await asyncio.open_connection(host, int(port))
         await until(lambda: of(hub, "out").peers == 1)

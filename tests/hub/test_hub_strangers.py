@@ -1,4 +1,4 @@
-"""Strangers at a hub: who speaks as the vehicle, who fills the places, who makes up senders. Real sockets, or none."""
+"""Unknown senders at a hub: impostors, full tables and forged ids."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from test_hub import virtual
 from test_hub_sockets import ORDER, of, to
 from test_routing import Stage, order
 
-from aerokit.connection.frame_receiver import MOST_PEERS, MOST_STRANGERS
-from aerokit.connection.routes import LIVE_FOR_S, MOST_ROUTES, MOVES_AFTER_S
+from aerokit.connection.frame_receiver import MAX_PEERS, MAX_UNVERIFIED_PEERS
+from aerokit.connection.routes import MAX_ROUTES, PEER_TTL_S, ROUTE_TIMEOUT_S
 from aerokit.hub import Endpoint, Hub, HubEvent
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.framer import Framer
@@ -40,7 +40,7 @@ def anyio_backend() -> str:
 
 @asynccontextmanager
 async def udp_hub() -> AsyncIterator[tuple[Hub, list[HubEvent], Program, Program]]:
-    """A hub on UDP and TCP, a copter on UDP that is heard, a station on TCP."""
+    """A hub on UDP and TCP, with a live copter on UDP and a station on TCP."""
     told: list[HubEvent] = []
     async with Hub(
         [Endpoint("udpin:127.0.0.1:0", name="radio"), Endpoint("tcpin:127.0.0.1:0", name="stations")]
@@ -58,12 +58,10 @@ async def udp_hub() -> AsyncIterator[tuple[Hub, list[HubEvent], Program, Program
 
 
 @pytest.mark.anyio
-async def test_udp_strangers_in_the_vehicles_name_get_no_order() -> None:
+async def test_udp_impostors_get_no_orders() -> None:
     """Three hundred ports, as many as the hub has places and more; the vehicle keeps its own."""
     async with udp_hub() as (hub, told, copter, station), AsyncExitStack() as stack:
-        strangers = [
-            await stack.enter_async_context(Program(1, 1, to(of(hub, "radio"), "udpout"))) for _ in range(300)
-        ]
+        strangers = [await stack.enter_async_context(Program(1, 1, to(of(hub, "radio"), "udpout"))) for _ in range(300)]
         for count in range(2):
             for number, stranger in enumerate(strangers, 1):
                 stranger.say(COPTER)
@@ -74,16 +72,16 @@ async def test_udp_strangers_in_the_vehicles_name_get_no_order() -> None:
             station.say(ORDER)
             await until(lambda: copter.heard.count("COMMAND_LONG") == count + 1)  # noqa: B023
         assert not any("COMMAND_LONG" in stranger.heard for stranger in strangers)
-        assert [each.kind for each in told if each.kind == "heard_twice"] == ["heard_twice"], (
+        assert [each.kind for each in told if each.kind == "duplicate_sender"] == ["duplicate_sender"], (
             "told once, not 300 times"
         )
         assert of(hub, "radio").dropped["foreign"] == 600
-        assert of(hub, "radio").peers <= MOST_PEERS
+        assert of(hub, "radio").peers <= MAX_PEERS
         assert station.heard.count("HEARTBEAT") <= 1, "and what they say goes nowhere"
 
 
 @pytest.mark.anyio
-async def test_tcp_clients_that_say_nothing_push_out_nobody_who_has_spoken() -> None:
+async def test_silent_tcp_clients_evict_no_active_peer() -> None:
     async with udp_hub() as (hub, told, copter, station):
         port = int(of(hub, "stations").address.rpartition(":")[2])
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MAX_CLIENTS + 5)]
@@ -100,7 +98,7 @@ async def test_tcp_clients_that_say_nothing_push_out_nobody_who_has_spoken() -> 
 
 
 @pytest.mark.anyio
-async def test_clients_that_connect_and_go_leave_nothing() -> None:
+async def test_disconnected_clients_leave_nothing() -> None:
     async with udp_hub() as (hub, told, copter, station):
         router, port = hub._switch.router, int(of(hub, "stations").address.rpartition(":")[2])  # type: ignore[union-attr]
         for number in range(200):
@@ -116,7 +114,7 @@ async def test_clients_that_connect_and_go_leave_nothing() -> None:
 
 
 @virtual
-async def test_what_a_stranger_says_comes_back_to_nobody_and_goes_out_once() -> None:
+async def test_duplicate_sender_gets_nothing_and_passes_once() -> None:
     """No amplification: a frame goes to each other place at most once, and the hub answers nothing."""
     link, station = PeersLink(), Program(255, 190)
     async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]):
@@ -152,7 +150,7 @@ class PeersLink(SlowLink):
 
 
 async def ordered(link: PeersLink, station: Program) -> list[Peer]:
-    """Which peers an order to 1/1 goes to."""
+    """Peers that get an order to 1/1."""
     link.sent.clear()
     station.say(ORDER)
     await settle()
@@ -160,7 +158,7 @@ async def ordered(link: PeersLink, station: Program) -> list[Peer]:
 
 
 @virtual
-async def test_a_vehicle_that_was_silent_is_followed_to_its_new_port() -> None:
+async def test_silent_vehicle_is_followed_to_its_new_port() -> None:
     link, station, told = PeersLink(), Program(255, 190), list[HubEvent]()
     async with station, Hub([Endpoint(link, name="udp"), station.endpoint("station")]) as hub:
         hub.on_event(told.append)
@@ -169,49 +167,49 @@ async def test_a_vehicle_that_was_silent_is_followed_to_its_new_port() -> None:
         link.say("2@drone", second, COPTER, ATTITUDE)
         assert await ordered(link, station) == ["1@drone"]
         assert station.heard == ["HEARTBEAT"], "nothing of the second one's"
-        await asyncio.sleep(MOVES_AFTER_S + 0.1)
+        await asyncio.sleep(ROUTE_TIMEOUT_S + 0.1)
         link.say("2@drone", second, COPTER)
         assert await ordered(link, station) == ["2@drone"]
-        assert [each.kind for each in told] == ["heard_twice", "moved"]
+        assert [each.kind for each in told] == ["duplicate_sender", "route_changed"]
         assert "1/1" in told[1].text
         link.say("1@drone", first, COPTER)
-        assert [each.kind for each in told] == ["heard_twice", "moved", "heard_twice"]
+        assert [each.kind for each in told] == ["duplicate_sender", "route_changed", "duplicate_sender"]
         assert await ordered(link, station) == ["2@drone"]
 
 
 @virtual
-async def test_places_taken_by_the_living_are_kept_and_a_newcomer_is_turned_away() -> None:
+async def test_full_endpoint_rejects_new_peer() -> None:
     link, told = PeersLink(), list[HubEvent]()
     async with Hub([Endpoint(link, name="udp")]) as hub:
         hub.on_event(told.append)
-        for number in range(MOST_PEERS):
+        for number in range(MAX_PEERS):
             link.say(f"{number}@host", FrameEncoder(255, 190), STATION)
         newcomer = FrameEncoder(1, 1)
         for _ in range(3):
             link.say("1@drone", newcomer, COPTER)
-        assert [each.kind for each in told] == ["turned_away"], "told once"
-        assert of(hub, "udp").peers == MOST_PEERS
+        assert [each.kind for each in told] == ["peer_rejected"], "told once"
+        assert of(hub, "udp").peers == MAX_PEERS
         assert (1, 1) not in of(hub, "udp").systems
-        await asyncio.sleep(LIVE_FOR_S + 1)
+        await asyncio.sleep(PEER_TTL_S + 1)
         link.say("1@drone", newcomer, COPTER)
         assert (1, 1) in of(hub, "udp").systems
-        assert of(hub, "udp").peers == MOST_PEERS
+        assert of(hub, "udp").peers == MAX_PEERS
 
 
 @virtual
-async def test_who_sends_noise_has_no_place() -> None:
+async def test_noise_sender_is_not_remembered() -> None:
     link = PeersLink()
     async with Hub([Endpoint(link, name="udp")]) as hub:
         link.say("1@drone", FrameEncoder(1, 1), COPTER)
-        for number in range(MOST_PEERS + 10):
+        for number in range(MAX_PEERS + 10):
             link.receiver.bytes_received(b"\xfd\x00 noise", f"{number}@stranger")
         assert of(hub, "udp").peers == 1
         assert of(hub, "udp").systems == ((1, 1),)
-        assert len(list(hub._attachments["udp"]._peers)) == 1 + MOST_STRANGERS
+        assert len(list(hub._attachments["udp"]._peers)) == 1 + MAX_UNVERIFIED_PEERS
 
 
 @virtual
-async def test_stations_that_share_ids_and_a_port_are_both_heard() -> None:
+async def test_stations_with_shared_ids_both_pass() -> None:
     """Only an autopilot's place is kept for one peer: a hub passes on what two stations of the same ids say."""
     link, copter = PeersLink(), Program(1, 1)
     async with copter, Hub([Endpoint(link, name="udp"), copter.endpoint("copter")]):
@@ -229,27 +227,27 @@ async def test_stations_that_share_ids_and_a_port_are_both_heard() -> None:
 
 
 @pytest.mark.parametrize("message", [COPTER, STATION, ATTITUDE], ids=lambda message: type(message).__name__)
-def test_a_flood_of_senders_leaves_vehicle_and_station_their_routes(message: Message) -> None:
+def test_flood_of_senders_keeps_routes_of_known_ones(message: Message) -> None:
     """Three thousand names in the second between two heartbeats."""
     stage = Stage()
     for _ in range(3):
         stage.hear("a", COPTER)
         stage.hear("c", STATION, 255, 190)
-        for number in range(3 * MOST_ROUTES):
-            stage.now += 1 / (3 * MOST_ROUTES)
+        for number in range(3 * MAX_ROUTES):
+            stage.now += 1 / (3 * MAX_ROUTES)
             stage.hear("b", message, 2 + number % 250, 1 + number // 250)
         assert stage.hear("c", order(1), 255, 190) == {"a"}
         assert stage.hear("a", order(255, 190)) == {"c"}
-    assert len(stage.router._senders) == MOST_ROUTES
+    assert len(stage.router._senders) == MAX_ROUTES
 
 
-def test_a_sender_that_was_silent_makes_room_in_a_full_table() -> None:
+def test_silent_sender_makes_room_in_a_full_table() -> None:
     stage = Stage()
-    for number in range(MOST_ROUTES):
+    for number in range(MAX_ROUTES):
         stage.hear("b", COPTER, 2 + number % 250, 1 + number // 250)
     assert stage.hear("a", COPTER) == set("bcd"), "passed on, but not remembered"
     assert stage.hear("c", order(1), 255, 190) == set()
-    stage.now += LIVE_FOR_S + 1
+    stage.now += PEER_TTL_S + 1
     stage.hear("a", COPTER)
     assert stage.hear("c", order(1), 255, 190) == {"a"}
 
@@ -259,7 +257,7 @@ def test_a_sender_that_was_silent_makes_room_in_a_full_table() -> None:
 
 @pytest.mark.parametrize("seed", sampled(range(6), 6))
 @virtual
-async def test_whatever_strangers_do_orders_reach_the_vehicle_and_no_stranger(seed: int) -> None:
+async def test_orders_reach_vehicle_despite_random_impostors(seed: int) -> None:
     """Noise, made-up senders, the vehicle's own name, numbers that go on where it is, from any port and host."""
     rng, link, station = random.Random(seed), PeersLink(), Program(255, 190)
     copter, others = FrameEncoder(1, 1), dict[str, FrameEncoder]()

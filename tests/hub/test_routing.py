@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerokit.connection.routes import MOST_ROUTES, MOVES_AFTER_S
-from aerokit.hub.routing import MOST_PLANS, Node, Router
-from aerokit.hub.senders import DUPLICATE_WINDOW_S, MOST_RECENT
-from aerokit.hub.targets import Targets
+from aerokit.connection.routes import MAX_ROUTES, ROUTE_TIMEOUT_S
+from aerokit.hub.message_rules import TargetFields
+from aerokit.hub.routing import MAX_PLANS, Router, RouterPort
+from aerokit.hub.senders import DUPLICATE_WINDOW_S, MAX_RECENT_FRAMES
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -28,7 +28,7 @@ from aerokit.mavlink.messages import (
     Statustext,
 )
 
-TARGETS = Targets(STANDARD)
+TARGETS = TargetFields(STANDARD)
 COPTER = Heartbeat(2, 3, 81, 0, 3)
 CAMERA = Heartbeat(30, 8, 0, 0, 3)
 STATION = Heartbeat(6, 8, 0, 0, 4)
@@ -40,24 +40,24 @@ def order(system: int, component: int = 1) -> CommandLong:
 
 
 class Stage:
-    """A router with ports a, b, c, d that want everything, and senders with counters of their own."""
+    """A router with ports a, b, c, d without filters, and senders with their own counters."""
 
     def __init__(self) -> None:
         self.wishes: dict[tuple[str, int], float | None] = {}
         self.router: Router[str] = Router(TARGETS, lambda port, number: self.wishes.get((port, number), 0.0))
-        self.nodes: dict[str, Node[str]] = {name: self.router.add(name) for name in "abcd"}
+        self.nodes: dict[str, RouterPort[str]] = {name: self.router.add(name) for name in "abcd"}
         self.encoders: dict[tuple[str, int, int], FrameEncoder] = {}
         self.now = 100.0
 
     def hear(self, port: str, message: Message, system: int = 1, component: int = 1) -> set[str]:
-        """Where it goes."""
+        """Ports that get the frame."""
         key = port, system, component
         encoder = self.encoders.setdefault(key, FrameEncoder(system, component))
         return self.pass_on(port, encoder.encode(message))
 
     def pass_on(self, port: str, raw: bytes, *, is_late: bool = False) -> set[str]:
         plan = self.router.route(self.nodes[port], Frame.parse(raw), self.now, is_late)
-        self.reason, self.thinned = plan.reason, plan.thinned
+        self.reason, self.rate_limited = plan.reason, plan.rate_limited
         assert len(set(plan.outs)) == len(plan.outs)
         return set(plan.outs)
 
@@ -67,13 +67,13 @@ def stage() -> Stage:
     return Stage()
 
 
-def test_what_is_for_everybody_goes_to_all_others(stage: Stage) -> None:
+def test_broadcast_goes_to_all_other_ports(stage: Stage) -> None:
     assert stage.hear("a", COPTER) == set("bcd")
     assert stage.hear("a", ParamRequestList(0, 0)) == set("bcd")
     assert stage.hear("a", ParamRequestList(0, 1)) == set("bcd")
 
 
-def test_what_is_for_one_goes_where_it_was_heard(stage: Stage) -> None:
+def test_targeted_message_goes_to_its_port(stage: Stage) -> None:
     stage.hear("a", COPTER)
     stage.hear("b", STATION, 255, 190)
     assert stage.hear("b", order(1), 255, 190) == {"a"}
@@ -81,12 +81,12 @@ def test_what_is_for_one_goes_where_it_was_heard(stage: Stage) -> None:
     assert stage.hear("a", order(255, 190)) == {"b"}
 
 
-def test_what_is_for_somebody_unknown_goes_nowhere(stage: Stage) -> None:
+def test_message_for_unknown_target_is_dropped(stage: Stage) -> None:
     assert stage.hear("a", order(7)) == set()
     assert stage.reason == "no_route"
 
 
-def test_what_is_for_an_unknown_component_goes_where_its_system_is(stage: Stage) -> None:
+def test_unknown_component_is_reached_by_its_system(stage: Stage) -> None:
     stage.hear("a", COPTER)
     stage.hear("b", CAMERA, 1, 100)
     assert stage.hear("c", order(1, 154), 255, 190) == {"a", "b"}
@@ -96,24 +96,24 @@ def test_what_is_for_an_unknown_component_goes_where_its_system_is(stage: Stage)
     assert stage.hear("b", order(1, 1), 1, 100) == {"a"}
 
 
-def test_nothing_goes_back_to_where_it_came_from(stage: Stage) -> None:
+def test_frame_never_goes_back(stage: Stage) -> None:
     stage.hear("a", COPTER)
     assert stage.hear("a", order(1), 255, 190) == set()
     assert stage.reason == ""
 
 
-def test_ground_stations_that_share_their_ids_all_get_it(stage: Stage) -> None:
+def test_ground_stations_with_shared_ids_all_receive(stage: Stage) -> None:
     stage.hear("b", STATION, 255, 190)
     stage.hear("c", STATION.__class__(6, 8, 0, 1, 4), 255, 190)
     assert stage.hear("a", order(255, 190)) == {"b", "c"}
 
 
-def test_a_vehicle_on_two_links_is_given_an_order_once(stage: Stage) -> None:
+def test_vehicle_on_two_links_gets_an_order_once(stage: Stage) -> None:
     stage.hear("a", COPTER)
     stage.hear("b", Heartbeat(2, 3, 81, 5, 3))
     assert stage.hear("c", order(1), 255, 190) == {"a"}
     assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
-    stage.now += MOVES_AFTER_S + 0.1
+    stage.now += ROUTE_TIMEOUT_S + 0.1
     stage.hear("b", Heartbeat(2, 3, 81, 6, 3))
     assert stage.hear("c", order(1), 255, 190) == {"b"}
     stage.hear("a", Heartbeat(2, 3, 81, 7, 3))  # it is back; there is no need to change again
@@ -122,17 +122,17 @@ def test_a_vehicle_on_two_links_is_given_an_order_once(stage: Stage) -> None:
     assert stage.hear("c", order(1), 255, 190) == {"a"}
 
 
-def test_a_copy_by_another_way_ends_here_and_teaches_nothing(stage: Stage) -> None:
+def test_copy_at_other_port_is_dropped_without_effect(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     assert stage.pass_on("a", raw) == set("bcd")
     for port in "bcd":
         assert stage.pass_on(port, raw) == set()
         assert stage.reason == "duplicate"
     assert stage.hear("c", order(1), 255, 190) == {"a"}
-    assert stage.router.heard_at(stage.nodes["b"]) == []
+    assert stage.router.senders_at(stage.nodes["b"]) == []
 
 
-def test_a_frame_that_comes_again_is_passed_on_once(stage: Stage) -> None:
+def test_repeated_frame_is_forwarded_once(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     assert stage.pass_on("a", raw) == set("bcd")
     assert stage.pass_on("a", raw, is_late=True) == set()
@@ -140,14 +140,14 @@ def test_a_frame_that_comes_again_is_passed_on_once(stage: Stage) -> None:
     assert stage.pass_on("a", raw) == set("bcd")
 
 
-def test_what_looks_the_same_later_is_another_frame(stage: Stage) -> None:
+def test_equal_frame_later_is_another_frame(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     stage.pass_on("a", raw)
     stage.now += 2 * DUPLICATE_WINDOW_S + 0.1
     assert stage.pass_on("b", raw) == set("acd")
 
 
-def test_the_window_is_at_least_as_long_as_it_says(stage: Stage) -> None:
+def test_duplicate_window_has_at_least_its_length(stage: Stage) -> None:
     encoder = FrameEncoder(1, 1)
     for _ in range(50):
         raw = encoder.encode(COPTER)
@@ -156,7 +156,7 @@ def test_the_window_is_at_least_as_long_as_it_says(stage: Stage) -> None:
         assert stage.pass_on("b", raw) == set()
 
 
-def test_a_port_that_has_gone_is_forgotten(stage: Stage) -> None:
+def test_removed_port_is_forgotten(stage: Stage) -> None:
     stage.hear("a", COPTER)
     stage.hear("b", STATION, 255, 190)
     assert stage.hear("b", order(1), 255, 190) == {"a"}
@@ -166,26 +166,26 @@ def test_a_port_that_has_gone_is_forgotten(stage: Stage) -> None:
     assert stage.hear("b", STATION, 255, 190) == {"c", "d"}
 
 
-def test_a_port_that_comes_gets_what_is_for_everybody(stage: Stage) -> None:
+def test_added_port_gets_broadcasts(stage: Stage) -> None:
     stage.hear("a", COPTER)
     stage.router.add("e")
     assert stage.hear("a", COPTER) == set("bcde")
 
 
-def test_keys_go_nowhere(stage: Stage) -> None:
+def test_keys_are_dropped(stage: Stage) -> None:
     stage.hear("a", COPTER)
     assert stage.hear("b", SetupSigning(1, 1, bytes(32), 0), 255, 190) == set()
     assert stage.reason == "secret"
 
 
-def test_the_word_of_a_radio_does_not_go_to_vehicles(stage: Stage) -> None:
+def test_radio_status_does_not_go_to_vehicles(stage: Stage) -> None:
     stage.hear("a", COPTER)
     stage.hear("b", STATION, 255, 190)
     stage.hear("d", Heartbeat(2, 12, 0, 0, 3), 2, 1)
     assert stage.hear("a", RadioStatus(0, 0, 0, 0, 0, 0, 0), 51, 68) == {"b", "c"}
 
 
-def test_unknown_messages_are_passed_on_for_those_who_are_known(stage: Stage) -> None:
+def test_unknown_messages_of_known_senders_are_forwarded(stage: Stage) -> None:
     assert stage.pass_on("a", UNKNOWN) == set()
     assert stage.reason == "unknown"
     stage.hear("a", COPTER)
@@ -193,18 +193,18 @@ def test_unknown_messages_are_passed_on_for_those_who_are_known(stage: Stage) ->
     assert stage.pass_on("b", UNKNOWN) == set()
 
 
-def test_ports_say_what_they_want(stage: Stage) -> None:
+def test_ports_filter_messages(stage: Stage) -> None:
     stage.wishes = {("b", Attitude.ID): None, ("c", Attitude.ID): 0.5, ("c", CommandLong.ID): 0.5}
     assert stage.hear("a", Attitude(0, 0, 0, 0, 0, 0, 0)) == {"d"}
-    assert stage.thinned == (("c", 0.5),)
+    assert stage.rate_limited == (("c", 0.5),)
     stage.hear("c", COPTER, 3)
-    assert stage.hear("a", order(3)) == {"c"}  # what is for one is not thinned
+    assert stage.hear("a", order(3)) == {"c"}  # targeted messages are not rate-limited
     stage.wishes[("c", CommandLong.ID)] = None
     stage.router.forget_plans()
     assert stage.hear("a", order(3)) == set()
 
 
-def test_a_vehicle_is_told_once_for_each_port(stage: Stage) -> None:
+def test_vehicle_is_reported_once_per_port(stage: Stage) -> None:
     told: list[str] = []
     stage.router.on_vehicle = told.append
     for _ in range(3):
@@ -214,27 +214,27 @@ def test_a_vehicle_is_told_once_for_each_port(stage: Stage) -> None:
     assert told == ["a"]
 
 
-def test_who_floods_the_tables_harms_nobody(stage: Stage) -> None:
+def test_flooded_tables_affect_no_known_sender(stage: Stage) -> None:
     stage.hear("a", COPTER)
-    for number in range(3 * MOST_ROUTES):
+    for number in range(3 * MAX_ROUTES):
         stage.now += 0.001
         stage.hear("b", Statustext(6, "x"), 2 + number % 250, number // 250)
         if number % 100 == 0:
             stage.hear("a", COPTER)
-    assert len(stage.router._senders) <= MOST_ROUTES
+    assert len(stage.router._senders) <= MAX_ROUTES
     assert stage.hear("c", order(1), 255, 190) == {"a"}
     for target in range(1, 256):
         for component in range(40):
             stage.hear("b", order(target, component), 255, 190)
-    assert len(stage.nodes["b"].plans) <= MOST_PLANS
+    assert len(stage.nodes["b"].plans) <= MAX_PLANS
 
 
-def test_what_was_heard_is_not_remembered_without_bounds(stage: Stage) -> None:
+def test_recent_frames_are_bounded(stage: Stage) -> None:
     encoder = FrameEncoder(1, 1)
-    for number in range(2 * MOST_RECENT + 100):
+    for number in range(2 * MAX_RECENT_FRAMES + 100):
         stage.pass_on("a", encoder.encode(Statustext(6, str(number))))
     recent = stage.router._recent
-    assert len(recent.newer) + len(recent.older) <= 2 * MOST_RECENT
+    assert len(recent.newer) + len(recent.older) <= 2 * MAX_RECENT_FRAMES
 
 
 # ------------------------------------------------------------------------------- random networks
@@ -250,10 +250,8 @@ class Network:
         self.heap: list[tuple[float, int, int, tuple[int, int], bytes]] = []
         self.count = self.hops = 0
         self.got: dict[int, Counter[bytes]] = defaultdict(Counter)
-        self.routers: list[Router[tuple[int, int]]] = [
-            Router(TARGETS, lambda port, number: 0.0) for _ in range(hubs)
-        ]
-        self.nodes: list[dict[tuple[int, int], Node[tuple[int, int]]]] = [{} for _ in range(hubs)]
+        self.routers: list[Router[tuple[int, int]]] = [Router(TARGETS, lambda port, number: 0.0) for _ in range(hubs)]
+        self.nodes: list[dict[tuple[int, int], RouterPort[tuple[int, int]]]] = [{} for _ in range(hubs)]
         self.far: dict[tuple[int, tuple[int, int]], tuple[int, tuple[int, int]]] = {}
         for hub in range(hubs):
             self._port(hub, (-1, 0))
@@ -274,9 +272,7 @@ class Network:
 
     def _post(self, hub: int, port: tuple[int, int], raw: bytes) -> None:
         self.count += 1
-        heapq.heappush(
-            self.heap, (self.now + self.random.uniform(0.001, self.slowest_s), self.count, hub, port, raw)
-        )
+        heapq.heappush(self.heap, (self.now + self.random.uniform(0.001, self.slowest_s), self.count, hub, port, raw))
 
     def run(self) -> None:
         while self.heap:
@@ -294,17 +290,13 @@ class Network:
 def networks(draw: st.DrawFn, slowest_s: float = 0.2) -> Network:
     hubs = draw(st.integers(2, 6))
     tree = [(draw(st.integers(0, hub - 1)), hub) for hub in range(1, hubs)]
-    pairs = st.tuples(st.integers(0, hubs - 1), st.integers(0, hubs - 1)).filter(
-        lambda pair: pair[0] != pair[1]
-    )
+    pairs = st.tuples(st.integers(0, hubs - 1), st.integers(0, hubs - 1)).filter(lambda pair: pair[0] != pair[1])
     return Network(hubs, tree + draw(st.lists(pairs, max_size=6)), draw(st.integers(0, 2**32)), slowest_s)
 
 
 @settings(max_examples=150, deadline=None)
 @given(networks(), st.booleans(), st.data())
-def test_on_any_network_everybody_gets_what_is_for_him_once(
-    network: Network, vehicles: bool, data: st.DataObject
-) -> None:
+def test_each_target_receives_once_on_any_network(network: Network, vehicles: bool, data: st.DataObject) -> None:
     hubs = range(len(network.routers))
     hello = COPTER if vehicles else STATION
     for _ in range(2):

@@ -1,12 +1,12 @@
-"""Vehicles at several ports: what is for them goes by one of them, whoever else of the system is where."""
+"""Vehicles at several ports: their messages take one of them, whatever other components are received there."""
 
 from __future__ import annotations
 
 import pytest
 from test_routing import CAMERA, COPTER, STATION, Stage, order
 
-from aerokit.connection.routes import MOST_ROUTES, MOVES_AFTER_S
-from aerokit.hub.senders import REPEATED_WITHIN_S
+from aerokit.connection.routes import MAX_ROUTES, ROUTE_TIMEOUT_S
+from aerokit.hub.senders import REPEAT_WINDOW_S
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
 
@@ -23,7 +23,7 @@ def a_camera_of_another_age() -> Stage:
     return stage
 
 
-def test_what_is_for_all_of_a_system_goes_to_its_autopilot_once() -> None:
+def test_system_message_goes_to_its_autopilot_once() -> None:
     stage = a_camera_of_another_age()
     assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
     assert stage.hear("c", order(1, 1), 255, 190) == {"a"}
@@ -31,7 +31,7 @@ def test_what_is_for_all_of_a_system_goes_to_its_autopilot_once() -> None:
     assert len(stage.hear("c", order(1, 77), 255, 190)) == 1, "of a component that is not known"
 
 
-def test_it_is_so_after_the_autopilot_has_moved() -> None:
+def test_system_message_follows_a_moved_autopilot() -> None:
     stage = Stage()
     for port in "ab":
         stage.hear(port, COPTER)
@@ -39,14 +39,14 @@ def test_it_is_so_after_the_autopilot_has_moved() -> None:
     stage.hear("c", STATION, 255, 190)
     stage.now += 1.0
     stage.hear("a", CAMERA, 1, 100)
-    stage.now += MOVES_AFTER_S - 0.5
+    stage.now += ROUTE_TIMEOUT_S - 0.5
     stage.hear("b", COPTER)
     stage.hear("b", CAMERA, 1, 100)
     assert stage.hear("c", order(1, 1), 255, 190) == {"b"}
     assert stage.hear("c", order(1, 0), 255, 190) == {"b"}
 
 
-def test_a_camera_at_a_port_of_its_own_hears_what_is_for_all() -> None:
+def test_camera_at_own_port_gets_system_messages() -> None:
     stage = Stage()
     stage.hear("a", COPTER)
     stage.hear("b", CAMERA, 1, 100)
@@ -54,14 +54,14 @@ def test_a_camera_at_a_port_of_its_own_hears_what_is_for_all() -> None:
     assert stage.hear("c", order(1, 0), 255, 190) == {"a", "b"}
 
 
-def test_a_port_that_comes_back_is_noticed() -> None:
+def test_returning_port_is_used_again() -> None:
     """The vehicle was heard there long ago: until it is heard there again, the camera is reached there."""
     stage = Stage()
     stage.hear("b", COPTER)
     stage.hear("a", COPTER)
-    stage.now += MOVES_AFTER_S + 1
+    stage.now += ROUTE_TIMEOUT_S + 1
     stage.hear("a", COPTER)
-    stage.now += MOVES_AFTER_S + 1
+    stage.now += ROUTE_TIMEOUT_S + 1
     stage.hear("a", COPTER)
     stage.hear("b", CAMERA, 1, 100)
     stage.hear("c", STATION, 255, 190)
@@ -70,31 +70,31 @@ def test_a_port_that_comes_back_is_noticed() -> None:
     assert stage.hear("c", order(1, 0), 255, 190) == {"a"}
 
 
-def test_an_order_for_everybody_reaches_a_vehicle_once() -> None:
+def test_broadcast_order_reaches_a_vehicle_once() -> None:
     stage = a_camera_of_another_age()
     assert stage.hear("c", order(0, 0), 255, 190) == {"a", "d"}
     assert stage.hear("c", ParamRequestList(0, 0), 255, 190) == {"a", "b", "d"}, "it orders nothing"
     assert stage.hear("c", STATION, 255, 190) == {"a", "b", "d"}
-    stage.now += MOVES_AFTER_S + 1
+    stage.now += ROUTE_TIMEOUT_S + 1
     stage.hear("b", COPTER)
     assert stage.hear("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"
 
 
-def test_names_that_are_made_up_do_not_push_out_a_gimbal() -> None:
+def test_forged_senders_do_not_evict_a_gimbal() -> None:
     stage = Stage()
     stage.hear("a", Heartbeat(26, 8, 0, 0, 3), 77, 154)
     stage.hear("c", STATION, 255, 190)
     stage.now += 0.1
-    for number in range(MOST_ROUTES + 100):
+    for number in range(MAX_ROUTES + 100):
         stage.hear("b", Attitude(0, 0, 0, 0, 0, 0, 0), 2 + number % 240, 1 + number // 240)
     assert stage.hear("c", order(77, 154), 255, 190) == {"a"}
 
 
 FIRST_ORDER = FrameEncoder(255, 190).encode(order(1))
-"""Of a program whose numbers begin at 0, as those of the one before did."""
+"""Of a program whose numbers start at 0, as those of an earlier program did."""
 
 
-def test_the_first_order_of_a_program_at_a_new_port_is_no_copy() -> None:
+def test_first_order_at_a_new_port_is_no_copy() -> None:
     """Scripts one after the other, that order the same: the vehicle must hear the last of them, too."""
     stage = Stage()
     stage.hear("a", COPTER)
@@ -105,7 +105,7 @@ def test_the_first_order_of_a_program_at_a_new_port_is_no_copy() -> None:
         assert stage.pass_on(name, FIRST_ORDER) == {"a"}
 
 
-def test_nor_is_it_where_the_other_program_has_gone() -> None:
+def test_first_order_after_port_removal_is_no_copy() -> None:
     stage = Stage()
     stage.hear("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
@@ -115,18 +115,18 @@ def test_nor_is_it_where_the_other_program_has_gone() -> None:
     assert stage.pass_on("d", FIRST_ORDER) == {"a"}
 
 
-def test_nor_is_it_at_the_same_port_after_a_while() -> None:
+def test_first_order_at_same_port_later_is_no_copy() -> None:
     stage = Stage()
     stage.hear("a", COPTER)
     assert stage.pass_on("c", FIRST_ORDER) == {"a"}
-    stage.now += REPEATED_WITHIN_S / 2
+    stage.now += REPEAT_WINDOW_S / 2
     assert stage.pass_on("c", FIRST_ORDER, is_late=True) == set(), "doubled on its way"
-    stage.now += REPEATED_WITHIN_S
+    stage.now += REPEAT_WINDOW_S
     assert stage.pass_on("c", FIRST_ORDER, is_late=True) == {"a"}
 
 
 @pytest.mark.parametrize("component", [0, 1])
-def test_a_vehicle_on_two_links_does_not_get_its_own_order_by_the_other(component: int) -> None:
+def test_vehicle_on_two_links_does_not_get_own_order(component: int) -> None:
     """PX4 says its failsafes as orders to all of its own system; a camera at a port of its own hears them."""
     stage = Stage()
     stage.hear("a", COPTER)

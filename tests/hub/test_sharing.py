@@ -27,9 +27,7 @@ from aerokit.transport import Link, memory_link_pair
 
 KEY = SigningKey.from_passphrase("border")
 DATA = random.Random(7).randbytes(6_000)
-MISSION = Mission(
-    [waypoint(-35.3632, 149.1652 + number * 1e-4, altitude_relative_m=20) for number in range(40)]
-)
+MISSION = Mission([waypoint(-35.3632, 149.1652 + number * 1e-4, altitude_relative_m=20) for number in range(40)])
 ORDER = CommandLong(1, 1, 400, 0, 0, 0, 0, 0, 0, 0, 0)
 
 
@@ -64,9 +62,7 @@ async def transfer_at_once(one: Vehicle, other: Vehicle, path: str, new: str) ->
 
 
 @asynccontextmanager
-async def through_a_hub(
-    vehicle: SimulatedVehicle, change: Any = None
-) -> AsyncIterator[tuple[Vehicle, Vehicle]]:
+async def through_a_hub(vehicle: SimulatedVehicle, change: Any = None) -> AsyncIterator[tuple[Vehicle, Vehicle]]:
     (one, far), (other, far_other) = memory_link_pair(latency_s=0.005), memory_link_pair(latency_s=0.005)
     async with (
         simulated_link(vehicle, latency_s=0.01) as link,
@@ -84,9 +80,7 @@ async def through_a_hub(
 
 
 @asynccontextmanager
-async def through_a_program(
-    vehicle: SimulatedVehicle, change: Any = None
-) -> AsyncIterator[tuple[Vehicle, Vehicle]]:
+async def through_a_program(vehicle: SimulatedVehicle, change: Any = None) -> AsyncIterator[tuple[Vehicle, Vehicle]]:
     near, far = memory_link_pair(latency_s=0.005)
     async with (
         simulated_link(vehicle, latency_s=0.01) as link,
@@ -113,7 +107,7 @@ def test_transfers_pass_in_both_directions_at_once(way: Any, kind: str) -> None:
 
 
 @pytest.mark.parametrize("way", [through_a_hub, through_a_program], ids=["hub", "share"])
-def test_transfers_pass_over_a_link_that_loses_frames(way: Any) -> None:
+def test_transfers_pass_over_a_lossy_link(way: Any) -> None:
     vehicle, path = make("px4")
 
     async def run() -> None:
@@ -125,15 +119,13 @@ def test_transfers_pass_over_a_link_that_loses_frames(way: Any) -> None:
     run_virtual(run())
 
 
-def test_a_station_flies_and_the_program_sees_it() -> None:
+def test_station_flies_and_the_program_sees_it() -> None:
     async def run() -> None:
         async with through_a_program(SimulatedCopter(boot_time_s=0.0)) as (program, station):
             await station.wait_ready()
             await station.arm()
             await station.take_off(5)
-            await program.position.wait_until(
-                lambda position: (position.altitude_relative_m or 0) > 4, timeout=5
-            )
+            await program.position.wait_until(lambda position: (position.altitude_relative_m or 0) > 4, timeout=5)
             await program.land()
             await station.armed.wait_until(lambda armed: not armed, timeout=60)
 
@@ -144,7 +136,7 @@ def test_a_station_flies_and_the_program_sees_it() -> None:
 
 
 class Stage:
-    """A program with a vehicle made of frames, and a station on its link."""
+    """A program with a vehicle simulated by frames, and a station on its link."""
 
     def __init__(self, vehicle: Program, station: Program, connection: aerokit.Connection, hub: Hub) -> None:
         self.vehicle, self.station, self.connection, self.hub = vehicle, station, connection, hub
@@ -173,21 +165,19 @@ def on_stage(play: Any, **options: Any) -> None:
     run_virtual(run())
 
 
-def test_a_station_hears_the_vehicle_and_the_program() -> None:
+def test_station_receives_vehicle_and_program() -> None:
     async def play(on: Stage) -> None:
         on.connection.send(ORDER)
         on.connection.send(ParamRequestList(0, 0))
         await settle()
-        assert [(each.system_id, each.message_id) for each in on.station.frames if each.system_id == 1] == [
-            (1, 0)
-        ]
+        assert [(each.system_id, each.message_id) for each in on.station.frames if each.system_id == 1] == [(1, 0)]
         assert [each.message_id for each in on.station.frames if each.system_id == 255] == [0, 21]
         assert on.vehicle.heard == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
 
     on_stage(play)
 
 
-def test_the_vehicle_hears_the_station_once_and_not_what_is_for_others() -> None:
+def test_vehicle_receives_station_frames_once() -> None:
     async def play(on: Stage) -> None:
         on.vehicle.frames.clear()
         on.station.frames.clear()
@@ -201,7 +191,7 @@ def test_the_vehicle_hears_the_station_once_and_not_what_is_for_others() -> None
     on_stage(play)
 
 
-def test_answers_go_to_whom_they_are_for() -> None:
+def test_answers_go_to_their_target() -> None:
     async def play(on: Stage) -> None:
         on.station.say(STATION)
         await settle()
@@ -213,7 +203,7 @@ def test_answers_go_to_whom_they_are_for() -> None:
     on_stage(play)
 
 
-def test_a_program_that_signs_signs_for_its_stations() -> None:
+def test_signing_program_signs_for_its_stations() -> None:
     async def play(on: Stage) -> None:
         on.station.say(STATION, ORDER)
         on.vehicle.say(Attitude(0, 0, 0, 0, 0, 0, 0))
@@ -230,7 +220,7 @@ def test_a_program_that_signs_signs_for_its_stations() -> None:
     on_stage(play, signing=Signing(KEY), vehicle=Program(1, 1, signing=Signing(KEY)))
 
 
-def test_it_ends_with_the_connection_and_the_connection_not_with_it() -> None:
+def test_sharing_ends_with_connection_but_not_vice_versa() -> None:
     async def run() -> None:
         vehicle, station = Program(1, 1), Program(250, 190)
         assert vehicle.near is not None
@@ -256,7 +246,7 @@ def test_it_ends_with_the_connection_and_the_connection_not_with_it() -> None:
     run_virtual(run())
 
 
-def test_the_blocking_twin_shares_too() -> None:
+def test_blocking_twin_shares() -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     with (
@@ -268,13 +258,13 @@ def test_the_blocking_twin_shares_too() -> None:
         assert station.parameters.read("RTL_ALT").value > 0
 
 
-def test_what_is_sent_is_told_to_taps_and_a_mistake_there_harms_nobody(
+def test_sent_frame_observer_exception_does_not_affect_sharing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def play(on: Stage) -> None:
         told: list[bytes] = []
-        on.connection.tap_sent(lambda raw: 1 / 0)
-        detach = on.connection.tap_sent(told.append)
+        on.connection.observe_sent_frames(lambda raw: 1 / 0)
+        detach = on.connection.observe_sent_frames(told.append)
         on.connection.send(ORDER)
         on.connection.write_raw(on.station.encoder.encode(STATION))
         detach()
@@ -288,7 +278,7 @@ def test_what_is_sent_is_told_to_taps_and_a_mistake_there_harms_nobody(
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_what_cannot_be_shared_is_said_at_once() -> None:
+def test_invalid_sharing_is_refused_at_once() -> None:
     async def run() -> None:
         async with simulated_link(SimulatedCopter()) as link:
             with pytest.raises(InvalidArgument):

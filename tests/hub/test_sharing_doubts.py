@@ -1,4 +1,4 @@
-"""A station that has the ids of the program whose link it shares: told, for answers cannot be told apart."""
+"""A station with the ids of the program whose link it shares is reported, because answers cannot be separated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from aerokit.transport import memory_link_pair
 
 
 @pytest.mark.parametrize("component", [190, 191])
-def test_a_station_with_our_ids_is_told_of_once(component: int) -> None:
+def test_station_with_our_ids_is_reported_once(component: int) -> None:
     near, far = memory_link_pair()
 
     async def run() -> None:
@@ -28,7 +28,7 @@ def test_a_station_with_our_ids_is_told_of_once(component: int) -> None:
             shared(connection, [station.endpoint("station")]),
         ):
             told: list[events.Event] = []
-            connection.bus.attach_event(events.HeardTwice, told.append)
+            connection.bus.attach_event(events.DuplicateSender, told.append)
             for _ in range(3):
                 station.say(Heartbeat(6, 8, 1, 0, 4))
                 await anyio.sleep(1)
@@ -49,5 +49,5 @@ def test_a_station_with_our_ids_is_told_of_once(component: int) -> None:
         ("shared:udpin:0.0.0.0:14550", 16384),
     ],
 )
-def test_as_much_waits_behind_a_shared_link_as_behind_the_link_itself(address: str, most: int) -> None:
+def test_shared_link_has_the_queue_limit_of_its_link(address: str, most: int) -> None:
     assert _hold_above(address) == most

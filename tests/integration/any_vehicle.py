@@ -16,20 +16,20 @@ from vehicle_kinds import KINDS, Kind
 
 from aerokit import Vehicle, connect
 from aerokit.sim import SimulatedVehicle, SimulatorServer, open_simulator, simulated_link
-from aerokit.sim.kinds import simulated, wait_longer
+from aerokit.sim.kinds import scale_timeouts, simulated
 from aerokit.transport import Link, create_link, memory_link_pair
 
 __all__ = ["Choice", "connected", "ready", "served", "served_on_two"]
 
 SPEEDUP_BINARY = 5.0
 LATENCY_S = 0.005
+# Instance number of a binary; ArduPilot derives its ports from it.
 INSTANCE = int(os.environ.get("AEROKIT_TEST_INSTANCE", "95"))
-"""Of a binary; ArduPilot reckons its ports from it."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What the options say; ``speedup`` is how much faster than real time it is, 1 in virtual time."""
+    """The vehicle selected by the options; ``speedup`` is its speed relative to real time, 1 in virtual time."""
 
     vehicle: str
     kind: Kind
@@ -38,7 +38,7 @@ class Choice:
 
     @classmethod
     def from_options(cls, config: pytest.Config) -> list[Choice]:
-        """Raises UsageError for an address without ``--i-know-it-flies``."""
+        """Read the options; raises UsageError for an address without ``--i-know-it-flies``."""
         vehicle, name = str(config.getoption("--vehicle")), config.getoption("--vehicle-kind")
         speedup = config.getoption("--vehicle-speedup")
         if vehicle == "sim":
@@ -55,11 +55,11 @@ class Choice:
 
     @property
     def is_binary(self) -> bool:
-        """Whether a firmware is started for each test."""
+        """True if a firmware is started for each test."""
         return Path(self.vehicle).is_file()
 
     def seconds(self, simulated_s: float) -> float:
-        """As a deadline by our clock, with room for a busy machine."""
+        """Convert seconds to a timeout by our clock, with a margin for a busy machine."""
         return simulated_s / self.speedup + (0.0 if self.is_virtual else 20.0)
 
 
@@ -120,7 +120,7 @@ async def _simulated(choice: Choice) -> AsyncIterator[str | Link]:
 def _patient(choice: Choice) -> SimulatedVehicle:
     latitude, longitude, altitude, heading = choice.kind.home
     vehicle = simulated(choice.kind.name, home=(latitude, longitude, altitude), heading_deg=heading)
-    wait_longer([vehicle], choice.speedup)
+    scale_timeouts([vehicle], choice.speedup)
     return vehicle
 
 
@@ -156,13 +156,13 @@ def _ardupilot(choice: Choice, port: int, folder: Path) -> tuple[list[str], dict
 
 def _longer(choice: Choice) -> dict[str, float]:
     usual, patient = (simulated(choice.kind.name) for _ in range(2))
-    wait_longer([patient], choice.speedup)
+    scale_timeouts([patient], choice.speedup)
     before, after = usual.parameters, patient.parameters  # type: ignore[attr-defined]
     return {name: after[name] for name in after if after[name] != before[name]}
 
 
 def _px4(choice: Choice) -> tuple[list[str], dict[str, str]]:
-    """It speaks to 127.0.0.1:14540 and following; its data is beside the folder of the binary."""
+    """Start PX4, which uses 127.0.0.1:14540 and following; its data is beside the folder of the binary."""
     binary = Path(choice.vehicle).resolve()
     environment = {"PX4_SIM_MODEL": choice.kind.model, "PATH": "/usr/bin:/bin"}
     if choice.speedup != 1.0:

@@ -1,4 +1,4 @@
-"""Real time and real sockets, on stock asyncio and on uvloop; options that say which vehicle the flights fly."""
+"""Real time and real sockets, on stock asyncio and on uvloop; options that select the vehicle."""
 
 from __future__ import annotations
 
@@ -48,9 +48,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         choices = Choice.from_options(metafunc.config)
         rows = [pytest.param(choice, id=choice.kind.name) for choice in choices]
         few = len(rows) == 1
-        metafunc.parametrize(
-            "choice", [row if few or row.id in DEFAULT_KINDS else exhaustive(row) for row in rows]
-        )
+        metafunc.parametrize("choice", [row if few or row.id in DEFAULT_KINDS else exhaustive(row) for row in rows])
 
 
 @pytest.fixture(params=LOOPS)

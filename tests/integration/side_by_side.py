@@ -1,7 +1,7 @@
-"""Seeded programs of random calls, and what a vehicle made of each: so that two vehicles can be compared.
+"""Seeded programs of random calls, and their effects on a vehicle, for comparing two vehicles.
 
-``python tests/integration/side_by_side.py --vehicle path/to/arducopter --seeds 0-30`` runs them on a binary and on the
-simulated vehicle, and lists the differences. `test_any_side_by_side` runs a few on simulated vehicles.
+``python tests/integration/side_by_side.py --vehicle path/to/arducopter --seeds 0-30`` runs them on a binary and on
+the simulated vehicle, and lists the differences. `test_any_side_by_side` runs a few on simulated vehicles.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from aerokit.errors import AerokitError, CommandRejected
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavResult
 from aerokit.missions import Mission, land, take_off, waypoint
 from aerokit.sim import simulated_link
-from aerokit.sim.kinds import simulated, wait_longer
+from aerokit.sim.kinds import scale_timeouts, simulated
 from aerokit.testing import run_virtual
 
 __all__ = ["Call", "Step", "differences", "program", "run_choice", "run_simulated"]
@@ -72,8 +72,8 @@ RAW: tuple[tuple[float, ...], ...] = (
     (C.CAN_FORWARD, 0), (C.DO_INVERTED_FLIGHT, 1),
 )  # fmt: skip
 """Commands with their params; those that are absent are 0."""
+# Frames of ArduPilot; most builds of PX4 ignore the frame, and the simulated one accepts GLOBAL_INT only.
 FRAMES = (0, 1, 3, 5, 6, 10, 11, 99)
-"""Of ArduPilot; most builds of PX4 look at none, and the simulated one takes GLOBAL_INT alone."""
 WITH_A_PLACE = (
     C.DO_REPOSITION,
     C.DO_SET_ROI_LOCATION,
@@ -81,16 +81,17 @@ WITH_A_PLACE = (
     C.COMPONENT_ARM_DISARM,
     31999,
 )
+# Parameters of ArduPilot, and of PX4.
 PARAMETERS = {
     True: (("RTL_ALT", 2000.0), ("WPNAV_SPEED", 500.0), ("FENCE_ALT_MAX", 90.0), ("NO_SUCH_NAME", 1.0),
            ("SIM_GPS1_ENABLE", 0.0), ("SIM_GPS1_ENABLE", 1.0), ("FS_OPTIONS", 0.0), ("RTL_ALT", 1500.0)),
     False: (("MIS_TAKEOFF_ALT", 5.0), ("COM_DISARM_LAND", 3.0), ("RTL_RETURN_ALT", 20.0), ("NO_SUCH_NAME", 1.0)),
 }  # fmt: skip
-"""Of ArduPilot, and of PX4."""
+# Modes in which a copter with its throttle stick at the lower end falls, or does things that are not
+# simulated; not used in the air.
 NEEDS_STICKS = frozenset(
     ("STABILIZE", "ACRO", "DRIFT", "SPORT", "FLIP", "THROW", "TURTLE", "ZIGZAG", "SYSTEMID", "AUTOTUNE", "GUIDED_NOGPS")
 )  # fmt: skip
-"""Where a copter whose throttle stick rests at its lower end falls, or does what is not simulated: not in the air."""
 COPTER_MODES = tuple(each.name for each in CopterMode)
 PX4_MODES = (
     "MANUAL",
@@ -129,7 +130,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Step:
-    """What became of a call; the state is that in which the vehicle came to rest."""
+    """Result of a call; the state is that of the vehicle at rest afterwards."""
 
     call: str
     result: str
@@ -154,9 +155,7 @@ def program(kind: str, seed: int, calls: int = CALLS) -> list[Call]:
             frame = rng.choice(FRAMES) if is_ardupilot else MavFrame.GLOBAL_INT
             return Call("command_int", (rng.choice(WITH_A_PLACE), int(frame), *place))
         if draw < 0.41:
-            return Call(
-                "command_to", (rng.choice((0, 99, 154)), rng.choice((C.DO_SEND_BANNER, 31999, C.DO_SET_HOME)))
-            )
+            return Call("command_to", (rng.choice((0, 99, 154)), rng.choice((C.DO_SEND_BANNER, 31999, C.DO_SET_HOME))))
         if draw < 0.53:
             return Call("set_mode", (rng.choice(modes),))
         if draw < 0.60:
@@ -183,7 +182,7 @@ def program(kind: str, seed: int, calls: int = CALLS) -> list[Call]:
 
 
 class _Runner:
-    """Does the calls on a vehicle; ``speedup``: how much faster than ours its time goes."""
+    """Runs the calls on a vehicle; ``speedup`` is the speed of its time relative to ours."""
 
     def __init__(self, vehicle: Vehicle, speedup: float) -> None:
         self.vehicle, self._scale = vehicle, 1.0 / speedup
@@ -203,11 +202,11 @@ class _Runner:
         }  # fmt: skip
 
     def seconds(self, theirs: float) -> float:
-        """Of ours, with room for a slow machine."""
+        """Convert to seconds of our time, with a margin for a slow machine."""
         return theirs * self._scale + 5.0
 
     async def step(self, call: Call) -> Step:
-        """Do it, wait until the vehicle is at rest, and say what became of it."""
+        """Run one call, wait until the vehicle is at rest, and return the result."""
         self._texts.clear()
         result = "cancelled"
         with anyio.move_on_after(self.seconds(300)):
@@ -246,11 +245,7 @@ class _Runner:
         await wait(QUIET_S * self._scale)
 
     def _said(self) -> tuple[str, ...]:
-        texts = (
-            re.sub(r"-?\d+(\.\d+)?", "#", each.strip())
-            for each in self._texts
-            if not NOT_COMPARED.match(each)
-        )
+        texts = (re.sub(r"-?\d+(\.\d+)?", "#", each.strip()) for each in self._texts if not NOT_COMPARED.match(each))
         return tuple(sorted(set(texts)))
 
     # ------------------------------------------------------------------------------------- calls
@@ -259,9 +254,7 @@ class _Runner:
         await self.vehicle.command(int(command), *params, retries=0, attempt_timeout=ANSWER_S)
 
     async def _command_to(self, component_id: int, command: int) -> None:
-        await self.vehicle.command(
-            int(command), 1, component_id=component_id, retries=0, attempt_timeout=ANSWER_S
-        )
+        await self.vehicle.command(int(command), 1, component_id=component_id, retries=0, attempt_timeout=ANSWER_S)
 
     async def _command_int(self, command: int, frame: int, north: float, east: float, z: float) -> None:
         there = self._here.offset(north_m=north, east_m=east)
@@ -298,7 +291,7 @@ class _Runner:
 
 
 async def run(vehicle: Vehicle, calls: list[Call], speedup: float) -> list[Step]:
-    """Do the calls one after the other. A PX4 hears a station more often than in its 2.5 s, however fast it is."""
+    """Run the calls one after another. PX4 receives heartbeats more often than its 2.5 s limit at any speed."""
     idle = ("DISARM_DELAY", 0.0) if vehicle.autopilot.runs_prearm_checks else ("COM_DISARM_PRFLT", -1.0)
     await vehicle.parameters.set(*idle)  # off: a real vehicle takes longer to come to rest
     steps: list[Step] = []
@@ -322,7 +315,7 @@ def run_simulated(kind: str, seed: int, speedup: float = 1.0, calls: int = CALLS
     async def main() -> list[Step]:
         latitude, longitude, altitude, heading = KINDS[kind].home
         there = simulated(kind, home=(latitude, longitude, altitude), heading_deg=heading)
-        wait_longer([there], speedup)
+        scale_timeouts([there], speedup)
         async with simulated_link(there, speedup=speedup, latency_s=0.005) as link, connect(link) as vehicle:
             await vehicle.wait_ready(timeout=120)
             return await run(vehicle, program(kind, seed, calls), speedup)
@@ -331,7 +324,7 @@ def run_simulated(kind: str, seed: int, speedup: float = 1.0, calls: int = CALLS
 
 
 async def run_choice(choice: Choice, seed: int, calls: int = CALLS) -> list[Step]:
-    """On what the options say: a binary, or an address."""
+    """Run on the vehicle of the options: a binary, or an address."""
     async with served(choice) as address, connect(address, timeout=60) as vehicle:
         await vehicle.wait_ready(timeout=choice.seconds(120))
         return await run(vehicle, program(choice.kind.name, seed, calls), choice.speedup)

@@ -1,4 +1,4 @@
-"""What every vehicle does under way: by orders, by velocities, by a mission. See `test_any_vehicle`."""
+"""Flights of every kind of vehicle: by orders, by velocities, by a mission. See `test_any_vehicle`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def down(vehicle: Vehicle, choice: Choice) -> None:
     await vehicle.armed.wait_until(lambda is_armed: not is_armed, timeout=choice.seconds(60))
 
 
-async def test_by_orders(choice: Choice) -> None:
+async def test_flight_by_orders(choice: Choice) -> None:
     """It goes there at that speed, does not disarm in the air, turns, holds, returns, comes down."""
     kind = choice.kind
     async with ready(choice) as vehicle:
@@ -53,9 +53,7 @@ async def test_by_orders(choice: Choice) -> None:
                 await vehicle.disarm()
         assert vehicle.is_armed
         there = Position(*place(here, kind.travel_m, 0.0), altitude_relative_m=kind.altitude_m)
-        await vehicle.go_to(
-            there, speed_m_s=kind.speed_m_s, tolerance_m=kind.near_m, timeout=choice.seconds(240)
-        )
+        await vehicle.go_to(there, speed_m_s=kind.speed_m_s, tolerance_m=kind.near_m, timeout=choice.seconds(240))
         assert vehicle.distance_to(Position(*place(here, kind.travel_m, 0.0))) < kind.near_m
         if kind.turns:
             await vehicle.set_heading(90, timeout=choice.seconds(60))
@@ -69,8 +67,8 @@ async def test_by_orders(choice: Choice) -> None:
         await vehicle.armed.wait_until(lambda is_armed: not is_armed, timeout=choice.seconds(60))
 
 
-async def test_by_velocities(choice: Choice) -> None:
-    """As far as the speed and the time make, and it stops afterwards; planes do not take them."""
+async def test_flight_by_velocities(choice: Choice) -> None:
+    """It moves as far as speed and time give, and stops afterwards; planes do not take velocities."""
     async with ready(choice) as vehicle:
         if choice.kind.takes_velocities:
             await up(vehicle, choice)
@@ -96,7 +94,7 @@ async def fly_north(vehicle: Vehicle, choice: Choice) -> None:
     assert vehicle.mode.value.custom_mode == vehicle.autopilot.mode_for("hold").custom_mode  # type: ignore[union-attr]
 
 
-async def test_by_a_mission(choice: Choice) -> None:
+async def test_flight_by_mission(choice: Choice) -> None:
     async with ready(choice) as vehicle:
         here = vehicle.position.value
         await vehicle.mission.upload(around(here, choice))

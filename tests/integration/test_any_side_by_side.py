@@ -13,14 +13,14 @@ SPEEDUP = 5.0
 
 @pytest.mark.parametrize("seed", sampled(range(4), 4))
 @pytest.mark.parametrize("kind", ["copter", exhaustive("px4")])
-def test_program_of_a_seed_is_done_twice_in_the_same_way(kind: str, seed: int) -> None:
+def test_program_of_one_seed_is_reproducible(kind: str, seed: int) -> None:
     first, second = (run_simulated(kind, seed, SPEEDUP) for _ in range(2))
     assert first == second
     assert len(first) == len(program(kind, seed))
     assert all(step.result != "cancelled" for step in first)
 
 
-def test_programs_of_other_seeds_are_others_and_use_every_call() -> None:
+def test_programs_of_different_seeds_differ_and_use_every_call() -> None:
     programs = [program("copter", seed) for seed in range(60)]
     assert program("copter", 1) == programs[1] != programs[2]
     assert len({call.name for calls in programs for call in calls}) == 16

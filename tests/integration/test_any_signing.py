@@ -31,7 +31,7 @@ def _not_on_somebodys_vehicle(choice: Choice) -> None:
         pytest.skip("a test that ends too soon would leave its key there")
 
 
-async def test_a_key(choice: Choice) -> None:
+async def test_signing_key_is_installed(choice: Choice) -> None:
     """PX4 on a computer has no USB port, where alone it takes one."""
     async with ready(choice) as vehicle:
         signing = Signing(KEY)

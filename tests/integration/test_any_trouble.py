@@ -1,6 +1,6 @@
-"""What copters do on a bad day: lost answers, an outage with a failsafe, another station, a reboot in flight.
+"""Copters in trouble: lost acks, an outage with a failsafe, another station, a reboot in flight.
 
-The same as `tests/vehicle/commanding/orders` holds simulated vehicles to, on any vehicle; see `test_any_vehicle`.
+The same rules as in `tests/vehicle/commanding/orders`, on any vehicle; see `test_any_vehicle`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import anyio
 import pytest
 from any_vehicle import Choice, served
-from order_air import Air, Weather
+from order_air import Air, Disturbances
 
 from aerokit import Vehicle, connect, fleet
 from aerokit import messages as m
@@ -30,7 +30,7 @@ from aerokit.transport import Link, create_link
 
 pytestmark = pytest.mark.anyio
 
-FAR_M = 400.0
+DISTANCE_M = 400.0
 ANOTHER_STATION = 254
 REBOOT_BY_FORCE = 20190226
 LANDED_ON_GROUND = 1
@@ -50,7 +50,7 @@ def _is_a_copter(choice: Choice) -> None:
 
 @asynccontextmanager
 async def flying(choice: Choice, *, through_air: bool = True) -> AsyncIterator[tuple[Vehicle, Air]]:
-    """Some metres up, where it takes orders; the weather is good so far, if there is any."""
+    """Some metres up, where it takes orders; the disturbances is good so far, if there is any."""
     async with served(choice) as served_at:
         link = served_at if isinstance(served_at, Link) else create_link(served_at)
         air = Air(link)
@@ -71,7 +71,7 @@ async def flying(choice: Choice, *, through_air: bool = True) -> AsyncIterator[t
 
 
 def far(vehicle: Vehicle) -> Any:
-    return vehicle.position.value.offset(north_m=FAR_M)
+    return vehicle.position.value.offset(north_m=DISTANCE_M)
 
 
 def sent(air: Air, command: int) -> int:
@@ -96,17 +96,17 @@ class AnotherStation:
         self.command(MavCmd.DO_SET_MODE, *self._vehicle.autopilot.mode_order(mode).params)
 
 
-async def test_lost_answers_send_nothing_twice(choice: Choice) -> None:
+async def test_lost_acks_send_nothing_twice(choice: Choice) -> None:
     async with flying(choice) as (vehicle, air):
-        air.weather = Weather(command=MavCmd.DO_SET_MODE, lost_acks=9)
+        air.disturbances = Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=9)
         air.begin()
         await vehicle.return_to_launch(timeout=choice.seconds(400))
         assert sent(air, MavCmd.DO_SET_MODE) == 1
 
 
-async def test_another_station_that_took_over_during_a_lost_answer_keeps_the_vehicle(choice: Choice) -> None:
+async def test_takeover_by_other_station_during_lost_ack_keeps_vehicle(choice: Choice) -> None:
     async with flying(choice) as (vehicle, air):
-        air.weather = Weather(command=MavCmd.DO_REPOSITION, lost_acks=9)
+        air.disturbances = Disturbances(command=MavCmd.DO_REPOSITION, lost_acks=9)
         air.begin()
         async with anyio.create_task_group() as tasks:
 
@@ -123,11 +123,11 @@ async def test_another_station_that_took_over_during_a_lost_answer_keeps_the_veh
         assert vehicle.mode_name == "RTL"
 
 
-async def test_a_failsafe_during_an_outage_keeps_the_vehicle(choice: Choice) -> None:
+async def test_failsafe_during_real_outage_keeps_vehicle(choice: Choice) -> None:
     """Twelve seconds, with the failsafe for a lost ground station."""
     async with flying(choice) as (vehicle, air):
         air.begin()
-        air.weather = Weather(outage=(3.0, 15.0))
+        air.disturbances = Disturbances(outage=(3.0, 15.0))
         with pytest.raises((HeartbeatTimeout, OperationRejected)):
             await vehicle.go_to(far(vehicle))
         await vehicle.armed.wait_until(lambda _: vehicle.heartbeat_age < 1.0, timeout=20)
@@ -136,22 +136,18 @@ async def test_a_failsafe_during_an_outage_keeps_the_vehicle(choice: Choice) -> 
         assert sent(air, MavCmd.DO_SET_MODE) == 0
         if choice.kind.is_ardupilot:
             assert vehicle.mode_name == "RTL"
-        else:  # it goes back to its mode when it hears us again; told that, it is told to hold
-            orders = [
-                each.at for each in air.sent if getattr(each.message, "command", 0) == MavCmd.DO_REPOSITION
-            ]
+        else:  # It returns to its mode when it receives us again, and is then told to hold.
+            orders = [each.at for each in air.sent if getattr(each.message, "command", 0) == MavCmd.DO_REPOSITION]
             assert not [at for at in orders[1:] if at < back_at]
 
 
 async def test_blocked_program_leaves_the_failsafe_alone(choice: Choice) -> None:
-    """For 14 s, of which the vehicle's HEARTBEATs wait in the socket; the call is cancelled when it goes on."""
+    """Blocked for 14 s, while HEARTBEATs wait in the socket; the call is cancelled when the program continues."""
     if not choice.is_binary:
-        pytest.skip(
-            "a simulated vehicle would be blocked, too: tests/vehicle/commanding/orders/test_paused_program.py"
-        )
+        pytest.skip("a simulated vehicle would be blocked, too: tests/vehicle/commanding/orders/test_paused_program.py")
     async with flying(choice, through_air=False) as (vehicle, _):
         orders: list[int] = []
-        vehicle.connection.tap_sent(lambda raw: orders.append(command_in(raw)))
+        vehicle.connection.observe_sent_frames(lambda raw: orders.append(command_in(raw)))
         asyncio.get_running_loop().call_later(3.0, time.sleep, 14.0)
         with anyio.move_on_after(6.0), pytest.raises((HeartbeatTimeout, OperationRejected)):
             await vehicle.go_to(far(vehicle))
@@ -166,12 +162,12 @@ def command_in(raw: bytes) -> int:
     return int(getattr(STANDARD.decode(frame), "command", 0))
 
 
-async def test_fleet_member_of_another_station_is_left_alone(choice: Choice) -> None:
+async def test_fleet_member_taken_by_other_station_is_left_alone(choice: Choice) -> None:
     """It is flown from before the fleet was opened; another member does not do its part."""
     silent = SimulatedCopter(system_id=77, boot_time_s=0.0)
     async with flying(choice) as (vehicle, air), simulated_link(silent) as link:
         connection = vehicle.connection
-        connection.attached.discard(vehicle.system_id)  # as another program that hears the same vehicle
+        connection.attached.discard(vehicle.system_id)  # Like another program that receives the same vehicle.
         async with fleet({"real": connection, "other": link}, count=2) as both:
             air.begin()
             before = vehicle.mode_name
@@ -185,7 +181,7 @@ async def test_fleet_member_of_another_station_is_left_alone(choice: Choice) -> 
             assert vehicle.mode_name == before
 
 
-async def test_a_reboot_in_flight_ends_what_was_ordered(choice: Choice) -> None:
+async def test_reboot_in_flight_ends_orders(choice: Choice) -> None:
     """ArduCopter obeys, by force, and falls; PX4 denies it and flies on."""
     async with flying(choice) as (vehicle, air):
         station = AnotherStation(vehicle, air)

@@ -1,6 +1,6 @@
-"""A copter with two links, one of which is cut in flight, the other one later, as the first is back.
+"""A copter with two links: one is cut in flight, the other one later, when the first is back.
 
-See `test_any_vehicle` for what it is flown on.
+See `test_any_vehicle` for the vehicles.
 """
 
 from __future__ import annotations
@@ -40,16 +40,14 @@ async def test_one_of_two_links_is_cut_in_flight(choice: Choice) -> None:
             radio.incoming.model = radio.outgoing.model = model
 
         async with connect(radios, timeout=30) as vehicle:
-            chosen: list[events.LinkChosen] = []
+            chosen: list[events.LinkSelected] = []
             silent: list[events.Event] = []
             bus, status = vehicle.connection.bus, vehicle.connection.links
             assert status is not None
-            bus.attach_event(events.LinkChosen, chosen.append)
+            bus.attach_event(events.LinkSelected, chosen.append)
             bus.attach_event(events.VehicleSilent, silent.append)
             await vehicle.wait_ready(timeout=choice.seconds(120))
-            await status.wait_until(
-                lambda each: all(vehicle.system_id in link.systems for link in each), timeout=30
-            )
+            await status.wait_until(lambda each: all(vehicle.system_id in link.systems for link in each), timeout=30)
             await anyio.sleep(3)  # the second one has to show that it leads to the same vehicle
             if choice.kind.guided is not None:
                 await vehicle.set_mode(choice.kind.guided)

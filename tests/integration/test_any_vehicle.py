@@ -1,7 +1,7 @@
-"""What every vehicle does on the ground: simulated (all kinds, the default), at an address, or a binary of the user's.
+"""Every kind of vehicle on the ground: simulated (all kinds, the default), at an address, or a given binary.
 
-``pytest -n 0 tests/integration -k any_ --vehicle path/to/arducopter`` starts it and tries it. All that is asserted
-here is what the simulated and the real vehicle have in common. `test_any_flight` is about flying.
+``pytest -n 0 tests/integration -k any_ --vehicle path/to/arducopter`` starts the binary and tests it. All assertions
+hold for simulated and real vehicles. `test_any_flight` is about flying.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def anyio_backend(choice: Choice) -> Any:
     return VIRTUAL_BACKEND if choice.is_virtual else "asyncio"
 
 
-async def test_it_boots_until_it_is_ready(choice: Choice) -> None:
-    """While it boots it is not armed; then it says where it is and where home is, and is still."""
+async def test_boot_until_ready(choice: Choice) -> None:
+    """It is not armed while it boots; then it reports its position and home, and does not move."""
     async with connected(choice) as vehicle:
         if choice.kind.is_ardupilot and choice.vehicle == "sim":
             with pytest.raises(CommandRejected):
@@ -47,9 +47,7 @@ async def test_it_boots_until_it_is_ready(choice: Choice) -> None:
         assert here.distance_to(Position(home.latitude_deg, home.longitude_deg)) < 5
         if choice.kind.takes_off:  # a real Rover's home is at sea level, wherever it stands
             assert abs(here.altitude_relative_m or 0.0) < 3
-        assert (
-            await vehicle.version.wait_until(lambda _: True)
-        ).capabilities & 0x02  # MISSION_INT or PARAM_FLOAT
+        assert (await vehicle.version.wait_until(lambda _: True)).capabilities & 0x02  # MISSION_INT or PARAM_FLOAT
         assert await vehicle.why_not_armable() == []
         assert not vehicle.is_armed
 
@@ -66,18 +64,14 @@ async def test_parameters(choice: Choice) -> None:
             await vehicle.parameters.read("NO_SUCH_NAME")
 
 
-async def test_plans_go_up_and_come_down(choice: Choice) -> None:
+async def test_plans_upload_and_download(choice: Choice) -> None:
     async with ready(choice) as vehicle:
         mission = around(vehicle, choice)
         await vehicle.mission.upload(mission)
         assert [item.command for item in await vehicle.mission.download()] == [i.command for i in mission]
         here = vehicle.position.value
         fence = Fence(
-            (
-                FencePolygon(
-                    tuple(here.offset(north_m=n, east_m=e) for n, e in ((-500, -500), (500, -500), (0, 500)))
-                ),
-            ),
+            (FencePolygon(tuple(here.offset(north_m=n, east_m=e) for n, e in ((-500, -500), (500, -500), (0, 500)))),),
             (FenceCircle(here, 900.0),),
         )
         await vehicle.fence.upload(fence)
@@ -105,7 +99,7 @@ async def test_modes(choice: Choice) -> None:
         assert vehicle.mode_name == choice.kind.modes[-1]
 
 
-async def test_what_it_does_not_know_is_refused(choice: Choice) -> None:
+async def test_unsupported_commands_are_refused(choice: Choice) -> None:
     async with ready(choice) as vehicle:
         for command in (UNKNOWN_COMMAND, REQUEST_MESSAGE, SET_MESSAGE_INTERVAL):
             with pytest.raises(CommandRejected):
@@ -118,7 +112,7 @@ async def test_what_it_does_not_know_is_refused(choice: Choice) -> None:
         assert not vehicle.is_armed
 
 
-async def test_messages_come_as_often_as_they_are_asked_for(choice: Choice) -> None:
+async def test_messages_arrive_at_requested_rate(choice: Choice) -> None:
     async with ready(choice) as vehicle:
         with vehicle.subscribe(m.Attitude, rate_hz=20, capacity=1000) as attitudes:
             await attitudes.get(timeout=10)
@@ -154,7 +148,7 @@ async def test_armed_and_disarmed(choice: Choice) -> None:
 
 
 async def test_reboot(choice: Choice) -> None:
-    """It is back, and what was wanted of it comes again; PX4's own simulation refuses."""
+    """It is back, and its streams are requested again; PX4's own simulation refuses."""
     async with ready(choice) as vehicle:
         if choice.vehicle != "sim" and not choice.kind.is_ardupilot:
             with pytest.raises(CommandRejected):
@@ -169,6 +163,4 @@ def around(vehicle: Vehicle, choice: Choice) -> Mission:
     """Two corners."""
     here, far, up = vehicle.position.value, choice.kind.travel_m, choice.kind.altitude_m
     corners = [here.offset(north_m=far), here.offset(north_m=far, east_m=far)]
-    return Mission(
-        [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=up) for each in corners]
-    )
+    return Mission([waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=up) for each in corners])

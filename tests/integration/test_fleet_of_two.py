@@ -20,7 +20,7 @@ from any_vehicle import INSTANCE
 
 import aerokit
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.sim.kinds import wait_longer
+from aerokit.sim.kinds import scale_timeouts
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
@@ -65,9 +65,7 @@ async def two_vehicles() -> AsyncIterator[list[str]]:
     async with contextlib.AsyncExitStack() as stack:
         if ARDUCOPTER and PX4:
             port = free_port(socket.SOCK_DGRAM)
-            folders = [
-                stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)) for _ in "12"
-            ]
+            folders = [stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)) for _ in "12"]
             stack.enter_context(
                 running(
                     ARDUCOPTER, "--model", "+", "--speedup", "1", f"-I{INSTANCE}",
@@ -86,7 +84,7 @@ async def two_vehicles() -> AsyncIterator[list[str]]:
             SimulatedCopter(boot_time_s=0.0),
             SimulatedPx4(system_id=PX4_INSTANCE + 1, boot_time_s=0.0),
         ):
-            wait_longer([vehicle], SPEEDUP)
+            scale_timeouts([vehicle], SPEEDUP)
             server = open_simulator(vehicle, "tcpin:127.0.0.1:0", speedup=SPEEDUP)
             simulator = await stack.enter_async_context(server)
             addresses.append(simulator.addresses[0].replace("tcpin", "tcp"))
@@ -116,7 +114,7 @@ async def fly(address: str) -> None:
             assert len(await vehicle.parameters.download()) > 100
         (await fleet.arm()).raise_for_errors()
         (await fleet.take_off(10, timeout=90)).raise_for_errors()
-        await fleet.all_at_altitude(10, tolerance_m=2)
+        await fleet.wait_at_altitude(10, tolerance_m=2)
         starts = {name: vehicle.position.value for name, vehicle in fleet.vehicles.items()}
         result = await fleet.do(lambda member: member.vehicle.go_to(starts[member.name].offset(north_m=30)))
         result.raise_for_errors()

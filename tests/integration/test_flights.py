@@ -66,7 +66,7 @@ async def served(kind: str) -> AsyncIterator[str]:
 
 
 @pytest.mark.parametrize("kind", ["udp", "udp6", "tcp", "tcp6", "serial"])
-async def test_a_flight(kind: str) -> None:
+async def test_whole_flight(kind: str) -> None:
     async with served(kind) as address, connect(address, timeout=100) as vehicle:
         await vehicle.wait_ready(timeout=100)
         await vehicle.arm()
@@ -80,7 +80,7 @@ async def test_a_flight(kind: str) -> None:
         assert here.distance_to(vehicle.position.fresh(within=5)) > 8
 
 
-async def test_a_vehicle_that_calls_us() -> None:
+async def test_vehicle_that_connects_to_us() -> None:
     """The usual way round: we listen, the vehicle sends."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))

@@ -74,7 +74,7 @@ each_kind = pytest.mark.parametrize("kind", ["tcp", "udpin", "udpout", "serial"]
 
 
 @each_kind
-def test_cancelled_at_any_turn_it_leaves_no_socket(kind: str) -> None:
+def test_cancelled_at_any_iteration_leaves_no_socket(kind: str) -> None:
     for turns in range(32):
         asked: list[bool] = []
         task = run_and_do(

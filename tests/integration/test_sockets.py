@@ -1,4 +1,4 @@
-"""What only real sockets show: ports that are taken or closed, several vehicles on one, a server that goes."""
+"""Behaviour that only real sockets show: ports in use or closed, several vehicles on one, a server that closes."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ async def datagram(sock: socket.socket) -> bytes:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-async def test_we_speak_first_where_we_call(host: str) -> None:
-    """A vehicle that answers only whom it hears would be silent for ever."""
+async def test_udpout_sends_first(host: str) -> None:
+    """A vehicle that only answers known peers would stay silent otherwise."""
     with udp_socket(host) as vehicle:
         async with open_connection(address_of(vehicle, "udpout"), source_system=250):
             frames = Framer().receive(await datagram(vehicle))
             assert [(frame.system_id, frame.message_id) for frame in frames] == [(250, 0)]
 
 
-async def test_nobody_listens_there() -> None:
+async def test_udp_port_closed() -> None:
     with udp_socket() as gone:
         address = address_of(gone, "udpout")
-    with pytest.raises(ConnectFailed, match="not a single byte was heard"):
+    with pytest.raises(ConnectFailed, match="no bytes were received"):
         async with connect(address, timeout=0.3):
             pytest.fail("there is no vehicle")
     with pytest.raises(LinkOpenError, match="nothing listens there"):
@@ -62,14 +62,14 @@ async def test_nobody_listens_there() -> None:
             pytest.fail("there is no vehicle")
 
 
-async def test_a_port_that_another_program_has() -> None:
-    with udp_socket() as other, pytest.raises(LinkOpenError, match="another program has this port"):
+async def test_udp_port_in_use() -> None:
+    with udp_socket() as other, pytest.raises(LinkOpenError, match="another program uses this port"):
         async with connect(address_of(other, "udpin")):
             pytest.fail("it is taken")
 
 
 async def test_several_vehicles_on_one_port() -> None:
-    """Each sends from a port of its own to ours; what is for one of them goes to that one only."""
+    """Each sends from its own port to ours; messages for one of them are sent to that one only."""
     copters = [SimulatedCopter(boot_time_s=0, system_id=system_id) for system_id in (1, 2, 3)]
     heard: dict[int, list[int]] = {copter.system_id: [] for copter in copters}
     for copter in copters:
@@ -98,7 +98,7 @@ async def test_several_vehicles_on_one_port() -> None:
         assert [vehicle.mode_name for vehicle in vehicles] == ["STABILIZE", "STABILIZE", "GUIDED"]
 
 
-async def test_a_server_that_goes_is_told_at_once() -> None:
+async def test_tcp_server_closed_is_detected_immediately() -> None:
     async with contextlib.AsyncExitStack() as stack:
         simulator = await stack.enter_async_context(
             open_simulator(SimulatedCopter(boot_time_s=0), "tcpin:127.0.0.1:0", speedup=SPEEDUP)

@@ -1,4 +1,4 @@
-"""What the tests for any vehicle have to know of each kind: what it can do, and how it is brought up and down."""
+"""Properties of each kind for the tests of any vehicle: abilities, and how to start and stop it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class Kind:
     """One firmware; metres and seconds, in its own time."""
 
     name: str
-    """As `aerokit.sim.kinds` calls it."""
+    """Name in `aerokit.sim.kinds`."""
     parameters: int
-    """It has at least so many."""
+    """Minimum number of parameters."""
     parameter: tuple[str, float]
     """One that can be set, and what to."""
     modes: tuple[str, ...]
@@ -27,7 +27,7 @@ class Kind:
     guided: str | None = "GUIDED"
     """The mode it is armed in; None: it is armed where it is."""
     altitude_m: float = 10.0
-    """Where it takes off to, and where it travels."""
+    """Altitude of take-off and travel."""
     takes_off: bool = True
     lands: bool = True
     returns: bool = True

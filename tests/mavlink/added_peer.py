@@ -1,4 +1,4 @@
-"""What pymavlink's own generator makes of the messages that `additions` adds to pymavlink's files, or extends."""
+"""Modules made by pymavlink's generator for the messages that `additions` adds or extends."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from aerokit.mavlink.generator import definitions, read_additions
 __all__ = ["NAMED", "added_module"]
 
 NAMED = {(message.id, f.name) for d in read_additions() for message in d.messages for f in message.fields}
-"""Message id and field of everything in the additions."""
+"""Message id and name of each field in the additions."""
 
 
 @cache
 def added_module(version: int, known: frozenset[tuple[int, str]]) -> Any:
-    """Pymavlink's module for all messages that have fields which are not ``known``."""
+    """Generate pymavlink's module for all messages with fields that are not ``known``."""
     messages = [m for m in definitions()[0] if any((m.id, f.name) not in known for f in m.fields)]
     name = f"aerokit_additions_v{version}0"
     with TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Streams for the framer's tests: good frames, signed and unknown ones, noise, and cuts anywhere."""
+"""Byte streams for the framer's tests: valid, signed and unknown frames, noise, and random cuts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNED, x25
 
 __all__ = [
-    "LONGEST",
+    "MAX_FRAME_LENGTH",
     "cut",
     "cuts",
     "feed",
@@ -26,14 +26,12 @@ __all__ = [
     "unknown",
 ]
 
-LONGEST = 280
-"""Bytes of the longest frame there can be, signature included."""
+MAX_FRAME_LENGTH = 280
+"""Length of the longest possible frame in bytes, signature included."""
 
 
-def some_frames(
-    count: int, *, seed: int = 1, versions: Sequence[int] = (1, 2), system_id: int = 1
-) -> list[bytes]:
-    """Frames of one sender with one counter, of random messages, of both versions in turn."""
+def some_frames(count: int, *, seed: int = 1, versions: Sequence[int] = (1, 2), system_id: int = 1) -> list[bytes]:
+    """Return frames of one sender: random messages, consecutive sequence numbers, alternating protocol versions."""
     chance = random.Random(seed)
     classes = [message_class for message_class in STANDARD if message_class.ID < 256]
     encoders = {version: FrameEncoder(system_id, 1, version=version) for version in versions}
@@ -46,23 +44,23 @@ def some_frames(
 
 
 def unknown(length: int = 20, message_id: int = 16_000_000, sequence: int = 0, system_id: int = 1) -> bytes:
-    """A MAVLink 2 frame of a message that nobody knows."""
+    """Return a MAVLink 2 frame of an unknown message."""
     header = bytes((MAGIC_V2, length, 0, 0, sequence, system_id, 1)) + message_id.to_bytes(3, "little")
     return header + bytes(range(1, length + 1)) + b"\x11\x22"
 
 
 def signed(raw: bytes, extra: int, signature: bytes = bytes(range(100, 113))) -> bytes:
-    """The same MAVLink 2 frame with the flag and a signature; nobody checks the latter here."""
+    """Return the MAVLink 2 frame with the signed flag and a signature that is not valid."""
     return framed(raw[1:2] + bytes((SIGNED,)) + raw[3:-2], extra) + signature
 
 
 def framed(body: bytes, extra: int) -> bytes:
-    """A MAVLink 2 frame of everything between magic byte and checksum."""
+    """Return a MAVLink 2 frame made of the bytes between magic byte and checksum."""
     return bytes((MAGIC_V2,)) + body + x25(body + bytes((extra,))).to_bytes(2, "little")
 
 
 def feed(framer: Framer, pieces: Iterable[bytes]) -> list[Frame]:
-    """All frames out of these pieces."""
+    """Feed the pieces and return all frames."""
     return [frame for piece in pieces for frame in framer.receive(piece)]
 
 
@@ -71,7 +69,7 @@ def raws(frames: Iterable[Frame]) -> list[bytes]:
 
 
 def cut(stream: bytes, places: Iterable[int]) -> list[bytes]:
-    """The stream in pieces that end at these places."""
+    """Split the stream at the given offsets."""
     edges = [0, *sorted({place % (len(stream) + 1) for place in places}), len(stream)]
     return [stream[begin:end] for begin, end in pairwise(edges)]
 
@@ -86,7 +84,7 @@ good_frames = st.builds(
 )
 cuts = st.lists(st.integers(0, 4000), max_size=12)
 _magic = st.sampled_from([bytes((MAGIC_V1,)), bytes((MAGIC_V2,))])
-_claims = st.builds(  # the beginning of what could be a frame
+_claims = st.builds(  # the beginning of a possible frame
     lambda magic, length, rest: magic + bytes((length,)) + rest,
     _magic,
     st.integers(0, 255),

@@ -1,4 +1,4 @@
-"""Dialects loaded at run time from XML and from pymavlink's modules, and the standard one."""
+"""Dialects: the standard one, and those loaded from XML files and pymavlink modules."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def write(folder: Path, name: str = "private.xml", text: str = PRIVATE, **fields
 # ---------------------------------------------------------------------------------------- from XML
 
 
-def test_a_private_dialect_with_the_standard_included_from_pymavlinks_package(tmp_path: Path) -> None:
+def test_private_dialect_includes_standard(tmp_path: Path) -> None:
     dialect = Dialect.from_xml(write(tmp_path))
     assert dialect.name == "private"
     assert len(dialect) > 200
@@ -72,14 +72,14 @@ def test_a_private_dialect_with_the_standard_included_from_pymavlinks_package(tm
     assert repr(dialect) == f"<Dialect 'private': {len(dialect)} messages>"
 
 
-def test_includes_are_looked_for_beside_the_file_first(tmp_path: Path) -> None:
+def test_include_beside_file_takes_precedence(tmp_path: Path) -> None:
     text = one_message(7, "OWN", "float")
     (tmp_path / "common.xml").write_text(text)
     dialect = Dialect.from_xml(str(write(tmp_path)))
     assert [cls.NAME for cls in dialect] == ["OWN", "WINCH_REPORT"]
 
 
-def test_circular_includes_end(tmp_path: Path) -> None:
+def test_circular_includes_are_read_once(tmp_path: Path) -> None:
     write(tmp_path, "a.xml", include="b.xml", id=60_001)
     text = "<mavlink><include>a.xml</include></mavlink>"
     (tmp_path / "b.xml").write_text(text)
@@ -103,7 +103,7 @@ def winch(private: Dialect, **changes: Any) -> Any:
     return private[60_001](**{**fields, **changes})
 
 
-def test_a_private_message_is_like_the_standards(private: Dialect) -> None:
+def test_private_message_class_like_generated(private: Dialect) -> None:
     message = winch(private)
     assert private.by_name("WINCH_REPORT") is private[60_001]
     assert (message.NAME, message.ID, type(message).__name__) == ("WINCH_REPORT", 60_001, "WinchReport")
@@ -126,8 +126,8 @@ def test_a_private_message_is_like_the_standards(private: Dialect) -> None:
     assert [name for name, field in fields.items() if field.extension] == ["history", "letter"]
 
 
-def test_fields_behind_one_that_the_standard_fills_in_are_given_by_name(tmp_path: Path) -> None:
-    """As mavlink_version is, which a private message may have in front."""
+def test_fields_after_default_are_keyword_only(tmp_path: Path) -> None:
+    """The field mavlink_version has a fixed value; a private message may have such a field at the front."""
     fields = "".join(
         f'<field type="{kind}" name="{name}">N.</field>'
         for kind, name in (("uint8_t_mavlink_version", "version"), ("uint8_t", "one"), ("uint8_t", "two"))
@@ -141,7 +141,7 @@ def test_fields_behind_one_that_the_standard_fills_in_are_given_by_name(tmp_path
         mine(3, 1, 2)
 
 
-def test_a_private_message_goes_over_the_wire(private: Dialect) -> None:
+def test_private_message_round_trip(private: Dialect) -> None:
     message = winch(private, history=(0.5,) * 6, letter="x")
     raw = FrameEncoder(1, 1).encode(message)
     (frame,) = Framer(private).receive(raw)
@@ -163,7 +163,7 @@ def test_a_private_message_goes_over_the_wire(private: Dialect) -> None:
         ({"length": "long"}, "must be a number"),
     ],
 )
-def test_private_messages_complain_too(private: Dialect, changes: dict[str, Any], complaint: str) -> None:
+def test_private_message_error_names_field(private: Dialect, changes: dict[str, Any], complaint: str) -> None:
     with pytest.raises(InvalidArgument, match=complaint.replace(".", r"\.")):
         winch(private, **changes).encode()
 
@@ -182,7 +182,7 @@ def test_private_enums(private: Dialect) -> None:
     assert [member.value for member in flags] == [1, 8]
 
 
-def test_entries_are_added_to_the_standards_enums(private: Dialect) -> None:
+def test_private_entries_extend_standard_enum(private: Dialect) -> None:
     commands = private.enum("MAV_CMD")
     assert commands.WINCH_DROP == 60_000
     assert commands.NAV_TAKEOFF == enums.MavCmd.NAV_TAKEOFF
@@ -208,7 +208,7 @@ def one_message(id: object, name: str, type: str) -> str:  # noqa: A002
         ("<mavlink><include>nowhere.xml</include></mavlink>", "includes nowhere.xml, which is in none of"),
     ],
 )
-def test_wrong_files_are_told(tmp_path: Path, text: str, complaint: str) -> None:
+def test_invalid_dialect_file_is_rejected(tmp_path: Path, text: str, complaint: str) -> None:
     path = tmp_path / "wrong.xml"
     path.write_text(text)
     with pytest.raises(InvalidArgument) as caught:
@@ -217,12 +217,12 @@ def test_wrong_files_are_told(tmp_path: Path, text: str, complaint: str) -> None
     assert "wrong.xml" in str(caught.value)
 
 
-def test_a_missing_file_is_told(tmp_path: Path) -> None:
+def test_missing_dialect_file_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument, match=r"no dialect file .*nowhere\.xml"):
         Dialect.from_xml(tmp_path / "nowhere.xml")
 
 
-def test_an_id_that_means_two_messages_is_an_error(tmp_path: Path) -> None:
+def test_duplicate_message_id_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgument) as caught:
         Dialect.from_xml(write(tmp_path, id=30))
     text = str(caught.value)
@@ -231,7 +231,7 @@ def test_an_id_that_means_two_messages_is_an_error(tmp_path: Path) -> None:
 
 # -------------------------------------------------------------------------------- pymavlink's modules
 
-DIALECTS = ("all", "matrixpilot", "paparazzi")  # the first includes all others that pymavlink has
+DIALECTS = ("all", "matrixpilot", "paparazzi")  # the first includes all other dialects of pymavlink
 
 
 @cache
@@ -241,12 +241,10 @@ def loaded(name: str) -> tuple[ModuleType, Dialect]:
 
 
 @pytest.mark.parametrize("name", DIALECTS)
-def test_a_pymavlink_dialect_is_the_same_as_its_xml(name: str) -> None:
+def test_pymavlink_dialect_equals_xml_dialect(name: str) -> None:
     module, dialect = loaded(name)
     xml = Dialect.from_xml(xml_folder() / f"{name}.xml")
-    assert {cls.ID: cls.CRC_EXTRA for cls in dialect} == {
-        i: cls.crc_extra for i, cls in module.mavlink_map.items()
-    }
+    assert {cls.ID: cls.CRC_EXTRA for cls in dialect} == {i: cls.crc_extra for i, cls in module.mavlink_map.items()}
     assert dialect.rows == xml.rows
     for one, other in zip(dialect, xml, strict=True):
         assert one.NAME == other.NAME
@@ -255,7 +253,7 @@ def test_a_pymavlink_dialect_is_the_same_as_its_xml(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DIALECTS)
-def test_bytes_of_its_own_messages_are_pymavlinks(name: str) -> None:
+def test_private_message_bytes_match_pymavlink(name: str) -> None:
     module, dialect = loaded(name)
     own = [cls for cls in dialect if cls is not STANDARD.get(cls.ID)]
     assert own
@@ -274,14 +272,14 @@ def peer_bytes(module: ModuleType, message: Message) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["storm32", "pymavlink.dialects.v20.storm32"])
-def test_dialects_by_name(name: str) -> None:
+def test_pymavlink_dialect_by_name(name: str) -> None:
     dialect = Dialect.from_pymavlink(name)
     assert dialect.name == "storm32"
     assert dialect.by_name("QSHOT_STATUS").ID == 60020
     assert dialect.enum("MAV_CMD").QSHOT_DO_CONFIGURE == 60020
 
 
-def test_a_private_module_by_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_private_pymavlink_module_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "private_dialect.py").write_text(
         "from pymavlink.dialects.v20.test import *\nfrom pymavlink.dialects.v20.test import mavlink_map, enums\n"
@@ -290,29 +288,27 @@ def test_a_private_module_by_its_own_name(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("name", ["nowhere", "nowhere.at.all", "pymavlink.dialects.v20.nowhere"])
-def test_a_missing_module_is_told(name: str) -> None:
+def test_missing_pymavlink_module_is_rejected(name: str) -> None:
     with pytest.raises(InvalidArgument, match=f"no pymavlink dialect '{name}'"):
         Dialect.from_pymavlink(name)
 
 
-def test_a_module_that_is_no_dialect_is_told() -> None:
-    with pytest.raises(
-        InvalidArgument, match=r"pymavlink\.mavutil is no pymavlink dialect: it has no mavlink_map"
-    ):
+def test_other_module_is_rejected_as_dialect() -> None:
+    with pytest.raises(InvalidArgument, match=r"pymavlink\.mavutil is not a pymavlink dialect: it has no mavlink_map"):
         Dialect.from_pymavlink("pymavlink.mavutil")
 
 
-def test_a_module_that_cannot_be_imported_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pymavlink_module_import_error_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "broken_dialect.py").write_text("import a_module_that_is_not_there\n")
     with pytest.raises(ModuleNotFoundError, match="a_module_that_is_not_there"):
         Dialect.from_pymavlink("broken_dialect")
 
 
-# ------------------------------------------------------------------------------------- put together
+# -------------------------------------------------------------------------------- combined dialects
 
 
-def test_extended_by(tmp_path: Path) -> None:
+def test_dialect_extended_by(tmp_path: Path) -> None:
     (tmp_path / "empty.xml").write_text("<mavlink/>")
     private = Dialect.from_xml(write(tmp_path, include="empty.xml"))
     both = STANDARD.extended_by(private)
@@ -331,7 +327,7 @@ def test_extended_by(tmp_path: Path) -> None:
     assert sorted(cls.ID for cls in both) == sorted([*STANDARD.rows, 60_001])
 
 
-def test_extended_by_has_the_entries_of_both_enums(private: Dialect) -> None:
+def test_extended_dialect_merges_enums(private: Dialect) -> None:
     both = STANDARD.extended_by(private)
     commands = both.enum("MAV_CMD")
     assert (commands.WINCH_DROP, commands.NAV_TAKEOFF) == (60_000, 22)
@@ -342,8 +338,8 @@ def test_extended_by_has_the_entries_of_both_enums(private: Dialect) -> None:
 
 
 @pytest.mark.parametrize("name", ["ardupilotmega", "development"])
-def test_pymavlinks_dialects_with_fewer_extension_fields_are_the_standards_classes(name: str) -> None:
-    """Pymavlink's MISSION_ACK ends before ``opaque_id``; a program that loads its dialect sees one class."""
+def test_message_with_fewer_extensions_uses_standard_class(name: str) -> None:
+    """Pymavlink's MISSION_ACK lacks ``opaque_id``; a program that loads its dialect still gets one class."""
     module, dialect = loaded(name)
     assert "opaque_id" not in module.mavlink_map[messages.MissionAck.ID].fieldnames
     assert dialect[messages.MissionAck.ID] is messages.MissionAck
@@ -352,7 +348,7 @@ def test_pymavlinks_dialects_with_fewer_extension_fields_are_the_standards_class
     assert both.decode(frame) == messages.MissionAck(255, 190, 0, opaque_id=77)
 
 
-def test_a_clash_is_told(tmp_path: Path) -> None:
+def test_conflicting_dialects_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "empty.xml").write_text("<mavlink/>")
     private = Dialect.from_xml(write(tmp_path, include="empty.xml", id=30))
     with pytest.raises(InvalidArgument) as caught:
@@ -363,7 +359,7 @@ def test_a_clash_is_told(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------- the standard
 
 
-def test_the_standard() -> None:
+def test_standard_dialect_lookup() -> None:
     assert STANDARD.name == "standard"
     assert len(STANDARD) == len(list(STANDARD)) == 340
     assert [cls.ID for cls in STANDARD] == sorted(STANDARD.rows)
@@ -380,13 +376,13 @@ def test_the_standard() -> None:
         STANDARD.enum("NOPE")
 
 
-def test_decoding_a_frame_of_another_dialect_is_a_key_error(private: Dialect) -> None:
+def test_decode_of_unknown_message_raises_key_error(private: Dialect) -> None:
     (frame,) = Framer(private).receive(FrameEncoder(1, 1).encode(winch(private)))
     with pytest.raises(KeyError):
         STANDARD.decode(frame)
 
 
-def test_names_of_members() -> None:
+def test_enum_member_names() -> None:
     assert enums.MavCmd.NAV_TAKEOFF.value == 22
     assert enums.MavResult.ACCEPTED.value == 0
     assert enums.GpsFixType.TYPE_3D_FIX.value == 3
@@ -396,7 +392,7 @@ def test_names_of_members() -> None:
 
 
 @pytest.mark.parametrize("package", [messages, enums])
-def test_lazy_packages(package: ModuleType) -> None:
+def test_generated_packages_are_lazy(package: ModuleType) -> None:
     assert set(package.__all__) <= set(dir(package))
     assert len(dir(package)) == len(set(dir(package)))
     assert all(getattr(package, name).__name__ == name for name in package.__all__)
@@ -404,8 +400,8 @@ def test_lazy_packages(package: ModuleType) -> None:
         package.Nope  # noqa: B018
 
 
-def test_char_arrays_that_carry_bytes_do_so_in_any_dialect(tmp_path: Path) -> None:
-    """The message with one more field, which is none of the standard's classes."""
+def test_char_arrays_with_bytes_in_any_dialect(tmp_path: Path) -> None:
+    """A dialect's message with an additional field gets a class of its own."""
     own = """<?xml version="1.0"?><mavlink><messages><message id="324" name="PARAM_EXT_ACK">
         <field type="char[16]" name="param_id">Name.</field><field type="char[128]" name="param_value">V.</field>
         <field type="uint8_t" name="param_type">T.</field><field type="uint8_t" name="param_result">R.</field>

@@ -1,4 +1,4 @@
-"""What cannot be sent is refused with the field, the value and the range; what can is numbered."""
+"""The encoder: invalid values are refused with field, value and range; valid messages are numbered."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ WRONG: list[tuple[Callable[[], Message], str]] = [
 
 
 @pytest.mark.parametrize(("make", "complaint"), WRONG, ids=[complaint for _, complaint in WRONG])
-def test_what_does_not_fit_is_named(make: Callable[[], Message], complaint: str) -> None:
+def test_encode_error_names_field(make: Callable[[], Message], complaint: str) -> None:
     encoder = FrameEncoder(1, 1)
     with pytest.raises(InvalidArgument) as caught:
         encoder.encode(make())
@@ -98,9 +98,7 @@ def test_what_does_not_fit_is_named(make: Callable[[], Message], complaint: str)
     [
         attitude(roll=3),
         attitude(time_boot_ms=True),
-        messages.Heartbeat(
-            enums.MavType.QUADROTOR, enums.MavAutopilot.PX4, enums.MavModeFlag.SAFETY_ARMED, 0, 0
-        ),
+        messages.Heartbeat(enums.MavType.QUADROTOR, enums.MavAutopilot.PX4, enums.MavModeFlag.SAFETY_ARMED, 0, 0),
         battery([1]),
         battery(()),
         injected(bytearray(b"ab")),
@@ -109,7 +107,7 @@ def test_what_does_not_fit_is_named(make: Callable[[], Message], complaint: str)
     ],
     ids=repr,
 )
-def test_what_fits_in_spite_of_its_type(message: Message) -> None:
+def test_encode_accepts_compatible_types(message: Message) -> None:
     assert len(message.encode()) == message.LENGTH
 
 
@@ -122,17 +120,17 @@ def test_what_fits_in_spite_of_its_type(message: Message) -> None:
         ((1, -1), "component_id = -1 must be in 0..255"),
     ],
 )
-def test_wrong_ids(arguments: tuple[int, int], complaint: str) -> None:
+def test_encoder_rejects_invalid_ids(arguments: tuple[int, int], complaint: str) -> None:
     with pytest.raises(InvalidArgument, match=complaint):
         FrameEncoder(*arguments)
 
 
-def test_component_0_is_nobody_and_may_send() -> None:
+def test_encoder_accepts_component_zero() -> None:
     (frame,) = Framer().receive(FrameEncoder(255, 0).encode(attitude()))
     assert (frame.system_id, frame.component_id) == (255, 0)
 
 
-def test_wrong_version() -> None:
+def test_encoder_rejects_invalid_version() -> None:
     with pytest.raises(InvalidArgument, match="version = 3 must be 1 or 2"):
         FrameEncoder(1, 1, version=3)
     encoder = FrameEncoder(1, 1)
@@ -141,7 +139,7 @@ def test_wrong_version() -> None:
     assert encoder.version == 2
 
 
-def test_the_version_may_change_between_two_frames() -> None:
+def test_encoder_version_may_change() -> None:
     encoder = FrameEncoder(1, 1)
     data = encoder.encode(attitude())
     encoder.version = 1
@@ -150,14 +148,14 @@ def test_the_version_may_change_between_two_frames() -> None:
     assert [(frame.version, frame.sequence) for frame in frames] == [(2, 0), (1, 1)]
 
 
-def test_version_1_has_no_ids_above_255() -> None:
+def test_encoder_version_1_rejects_large_ids() -> None:
     encoder = FrameEncoder(1, 1, version=1)
-    with pytest.raises(InvalidArgument, match="PLAY_TUNE has id 258, MAVLink 1 has none above 255"):
+    with pytest.raises(InvalidArgument, match="PLAY_TUNE has id 258, but MAVLink 1 has no ids above 255"):
         encoder.encode(messages.PlayTune(1, 1, "A"))
     assert encoder.sequence == 0
 
 
-def test_sequence_numbers_wrap() -> None:
+def test_encoder_sequence_wraps() -> None:
     encoder = FrameEncoder(1, 1)
     raws = [encoder.encode(messages.Heartbeat(6, 8, 0, 0, 4)) for _ in range(300)]
     assert [raw[4] for raw in raws] == [number % 256 for number in range(300)]
@@ -166,14 +164,14 @@ def test_sequence_numbers_wrap() -> None:
     assert framer.statistics.sources[1, 1].lost == 0
 
 
-def test_trailing_zeros_are_trimmed_but_for_the_first_byte() -> None:
+def test_encoder_trims_trailing_zeros() -> None:
     encoder = FrameEncoder(1, 1)
     assert encoder.encode(messages.CommandAck(0, 0))[1] == 1
     assert encoder.encode(messages.CommandAck(400, 0))[1] == 2
     assert encoder.encode(messages.CommandAck(400, 0, target_component=7))[1] == 10
 
 
-def test_checksums_without_the_library_are_the_same() -> None:
+def test_python_checksum_matches_library() -> None:
     slow = x25_in_python()
     for size in (0, 1, 2, 9, 50, 280):
         data = bytes((number * 37 + size) & 0xFF for number in range(size))
@@ -182,7 +180,7 @@ def test_checksums_without_the_library_are_the_same() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_frame_that_is_taken_apart_has_its_checksum(version: int) -> None:
+def test_parsed_frame_has_checksum(version: int) -> None:
     raw = FrameEncoder(1, 1, version=version).encode(attitude())
     frame = Frame.parse(raw)
     assert frame.checksum == int.from_bytes(raw[-2:], "little")

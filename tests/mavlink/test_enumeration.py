@@ -1,4 +1,4 @@
-"""Enums are made in a quick way where Python has one: they are the same as those made in the usual way."""
+"""The fast way to make enums gives the same classes as the usual one."""
 
 from __future__ import annotations
 
@@ -10,21 +10,18 @@ import pytest
 from for_each import for_each
 
 from aerokit import enums
-from aerokit.mavlink import enumeration
-from aerokit.mavlink.enumeration import make_enum
+from aerokit.mavlink.message import make_enum
 
 NAMES = [name for name in dir(enums) if isinstance(getattr(enums, name), type)]
 
 
 @for_each("name", NAMES)
-def test_both_ways_make_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_enum_constructions_are_equal(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     quick: Any = getattr(enums, name)
     members = [(each, int(value)) for each, value in quick.__members__.items()]
-    monkeypatch.setattr(enumeration, "_QUICKLY", None)
+    monkeypatch.setattr("aerokit.mavlink.message._simple_enum", None)
     usual: Any = make_enum(quick.__module__, name, issubclass(quick, IntFlag), quick.__doc__, members)
-    assert [(*each,) for each in usual.__members__.items()] == [
-        (*each,) for each in quick.__members__.items()
-    ]
+    assert [(*each,) for each in usual.__members__.items()] == [(*each,) for each in quick.__members__.items()]
     assert [repr(each) for each in usual] == [repr(each) for each in quick]
     assert (usual.__doc__, usual.__mro__[1:]) == (quick.__doc__, quick.__mro__[1:])
     for each in quick:
@@ -32,7 +29,7 @@ def test_both_ways_make_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> 
         assert (quick(each.value), hash(each), f"{each}") == (each, hash(int(each)), str(int(each)))
 
 
-def test_bits_that_nobody_has_named_are_kept() -> None:
+def test_unnamed_flag_bits_are_kept() -> None:
     flags = enums.MavModeFlag(128 | 1 << 20)
     assert (int(flags), flags & enums.MavModeFlag.SAFETY_ARMED) == (
         128 | 1 << 20,
@@ -42,7 +39,7 @@ def test_bits_that_nobody_has_named_are_kept() -> None:
         enums.MavResult(99)
 
 
-def test_mixes_of_bits_are_not_kept() -> None:
+def test_flag_combinations_are_not_cached() -> None:
     known = len(enums.MavProtocolCapability._value2member_map_)
     for value in range(3000):
         assert int(enums.MavProtocolCapability(value)) == value

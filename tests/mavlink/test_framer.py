@@ -1,4 +1,4 @@
-"""The framer: whatever comes, it never raises, never gives a wrong frame and finds the good ones."""
+"""The framer: it never raises, never returns a wrong frame, and finds all valid ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import chain
 
 import pytest
 from framer_harness import (
-    LONGEST,
+    MAX_FRAME_LENGTH,
     cut,
     cuts,
     feed,
@@ -35,11 +35,11 @@ def frame_of(message: Message, *, sequence: int = 0, system_id: int = 1, version
     return encoder.encode(message)
 
 
-# ------------------------------------------------------------------------------------- good streams
+# ------------------------------------------------------------------------------------ valid streams
 
 
 @given(good_frames, cuts)
-def test_a_clean_stream_cut_anywhere_gives_every_frame(frames: list[bytes], places: list[int]) -> None:
+def test_framer_returns_all_frames_of_split_stream(frames: list[bytes], places: list[int]) -> None:
     framer = Framer()
     assert raws(feed(framer, cut(b"".join(frames), places))) == frames
     statistics = framer.statistics
@@ -50,7 +50,7 @@ def test_a_clean_stream_cut_anywhere_gives_every_frame(frames: list[bytes], plac
     assert (source.system_id, source.component_id, source.received, source.lost) == (1, 1, len(frames), 0)
 
 
-def test_every_single_cut_of_a_short_stream() -> None:
+def test_framer_handles_every_split_position() -> None:
     frames = some_frames(6)
     stream = b"".join(frames)
     for place in range(len(stream)):
@@ -58,7 +58,7 @@ def test_every_single_cut_of_a_short_stream() -> None:
     assert raws(feed(Framer(), (stream[i : i + 1] for i in range(len(stream))))) == frames
 
 
-def test_the_header_is_told() -> None:
+def test_frame_has_header_fields() -> None:
     raw = frame_of(ATTITUDE, sequence=200, system_id=9)
     (frame,) = Framer().receive(raw, 12.5)
     assert (frame.version, frame.sequence, frame.system_id, frame.component_id) == (2, 200, 9, 1)
@@ -68,21 +68,21 @@ def test_the_header_is_told() -> None:
     assert repr(frame) == "<Frame v2 id=30 from=9/1 seq=200>"
 
 
-def test_version_1_is_told() -> None:
+def test_frame_of_version_1() -> None:
     raw = frame_of(ATTITUDE, sequence=3, version=1)
     (frame,) = Framer().receive(raw)
     assert (frame.version, frame.sequence, frame.message_id, frame.payload) == (1, 3, 30, raw[6:-2])
     assert (frame.incompat_flags, frame.compat_flags, frame.signature) == (0, 0, b"")
 
 
-def test_compatibility_flags_are_ignored_and_told() -> None:
+def test_framer_ignores_compatibility_flags() -> None:
     body = bytes.fromhex("0900 80 00 0101 000000") + HEARTBEAT.encode()
     raw = framed(body, HEARTBEAT.CRC_EXTRA)
     (frame,) = Framer().receive(raw)
     assert (frame.compat_flags, STANDARD.decode(frame)) == (0x80, HEARTBEAT)
 
 
-def test_unknown_incompatibility_flags_are_refused() -> None:
+def test_framer_rejects_unknown_incompatibility_flags() -> None:
     body = bytes.fromhex("0902 00 00 0101 000000") + HEARTBEAT.encode()
     raw = framed(body, HEARTBEAT.CRC_EXTRA)
     framer = Framer()
@@ -91,17 +91,17 @@ def test_unknown_incompatibility_flags_are_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", [bytearray, memoryview])
-def test_any_bytes_like_data(kind: type) -> None:
+def test_framer_accepts_bytes_like_data(kind: type) -> None:
     frames = some_frames(3)
     assert raws(Framer().receive(kind(b"".join(frames)))) == frames
 
 
-def test_nothing_gives_nothing() -> None:
+def test_framer_of_empty_data() -> None:
     assert Framer().receive(b"") == []
 
 
-def test_payloads_longer_than_known_are_accepted() -> None:
-    """A sender with a newer standard has extensions that we do not know; the checksum is the same."""
+def test_framer_accepts_longer_payloads() -> None:
+    """A newer standard may add extension fields; the checksum stays the same."""
     payload = ATTITUDE.encode() + b"\x01\x02\x03"
     body = bytes((len(payload), 0, 0, 0, 1, 1, 30, 0, 0)) + payload
     raw = framed(body, ATTITUDE.CRC_EXTRA)
@@ -114,7 +114,7 @@ def test_payloads_longer_than_known_are_accepted() -> None:
 
 
 @given(cuts)
-def test_signed_frames(places: list[int]) -> None:
+def test_framer_returns_signed_frames(places: list[int]) -> None:
     plain = some_frames(4, versions=(2,))
     extras = [STANDARD[int.from_bytes(raw[7:10], "little")].CRC_EXTRA for raw in plain]
     frames = [signed(raw, extra) for raw, extra in zip(plain, extras, strict=True)]
@@ -129,12 +129,10 @@ def test_signed_frames(places: list[int]) -> None:
 
 
 @given(st.lists(st.tuples(noise, good_frames), min_size=1, max_size=4), cuts)
-def test_good_frames_between_noise_are_found(
-    parts: list[tuple[bytes, list[bytes]]], places: list[int]
-) -> None:
+def test_framer_finds_frames_between_noise(parts: list[tuple[bytes, list[bytes]]], places: list[int]) -> None:
     frames = [raw for _, group in parts for raw in group]
     stream = b"".join(bad + b"".join(group) for bad, group in parts)
-    trailer = some_frames(20, seed=77, system_id=200)  # as long as a false frame may claim to be
+    trailer = some_frames(20, seed=77, system_id=200)  # as long as a false header may claim
     framer = Framer()
     found = raws(feed(framer, cut(stream + b"".join(trailer), places)))
     assert [raw for raw in found if raw in set(frames)] == frames
@@ -142,7 +140,7 @@ def test_good_frames_between_noise_are_found(
 
 
 @given(st.lists(noise, max_size=30), cuts)
-def test_noise_alone_gives_nothing(parts: list[bytes], places: list[int]) -> None:
+def test_framer_returns_nothing_for_noise(parts: list[bytes], places: list[int]) -> None:
     stream = b"".join(parts)
     framer = Framer()
     assert feed(framer, cut(stream, places)) == []
@@ -152,10 +150,8 @@ def test_noise_alone_gives_nothing(parts: list[bytes], places: list[int]) -> Non
         assert framer.statistics.bad_bytes + framer.waiting == len(stream)
 
 
-@given(
-    good_frames, st.lists(st.tuples(st.integers(0, 4000), st.integers(1, 255)), min_size=1, max_size=6), cuts
-)
-def test_damage_never_gives_a_wrong_frame(
+@given(good_frames, st.lists(st.tuples(st.integers(0, 4000), st.integers(1, 255)), min_size=1, max_size=6), cuts)
+def test_framer_never_returns_damaged_frame(
     frames: list[bytes], damage: list[tuple[int, int]], places: list[int]
 ) -> None:
     stream = bytearray(b"".join(frames))
@@ -169,7 +165,7 @@ def test_damage_never_gives_a_wrong_frame(
 
 
 @given(good_frames, st.integers(0, 4000), st.integers(1, 60))
-def test_bytes_left_out_cost_only_the_frames_they_are_of(frames: list[bytes], place: int, count: int) -> None:
+def test_framer_recovers_after_missing_bytes(frames: list[bytes], place: int, count: int) -> None:
     stream = b"".join(frames)
     place %= len(stream)
     stream = stream[:place] + stream[place + count :]
@@ -186,12 +182,12 @@ def test_bytes_left_out_cost_only_the_frames_they_are_of(frames: list[bytes], pl
         b"\xfe\xff",
         b"\xfd\xff\x00\x00",
         b"\xfe\xff\x00\x01\x01\x0c",  # an unknown message of version 1
-        b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00",  # longer than an ATTITUDE can be
+        b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00",  # longer than any ATTITUDE
         b"\xfd\xff\x01\x00\x00\x01\x01\x99\x99\x99",  # unknown, signed
     ],
     ids=bytes.hex,
 )
-def test_a_false_beginning_that_claims_a_long_frame_holds_nothing_back(claim: bytes) -> None:
+def test_false_start_does_not_delay_frames(claim: bytes) -> None:
     framer, frames = Framer(), some_frames(3, versions=(2,))
     assert framer.receive(claim) == []
     found = [raw for raw in frames for raw in raws(framer.receive(raw))]
@@ -199,8 +195,8 @@ def test_a_false_beginning_that_claims_a_long_frame_holds_nothing_back(claim: by
     assert framer.statistics.bad_bytes == len(claim)
 
 
-def test_a_likely_false_beginning_is_waited_for_but_nothing_behind_it_is_lost() -> None:
-    claim = b"\xfd\x1c\x00\x00\x00\x01\x01\x1e\x00\x00"  # the header of a true ATTITUDE
+def test_plausible_false_start_loses_no_frames() -> None:
+    claim = b"\xfd\x1c\x00\x00\x00\x01\x01\x1e\x00\x00"  # the header of a valid ATTITUDE
     framer, frames = Framer(), some_frames(10)
     found = [raw for raw in frames for raw in raws(framer.receive(raw))]
     framer = Framer()
@@ -210,7 +206,7 @@ def test_a_likely_false_beginning_is_waited_for_but_nothing_behind_it_is_lost() 
     assert framer.statistics.bad_bytes == len(claim)
 
 
-def test_flags_that_do_not_exist_end_the_waiting_as_soon_as_they_come() -> None:
+def test_unknown_flags_end_waiting_at_once() -> None:
     framer = Framer()
     framer.receive(b"\xfd\x09")
     assert framer.waiting == 2
@@ -218,7 +214,7 @@ def test_flags_that_do_not_exist_end_the_waiting_as_soon_as_they_come() -> None:
     assert (framer.waiting, framer.statistics.bad_bytes) == (0, 3)
 
 
-def test_text_before_the_first_frame() -> None:
+def test_framer_skips_text_before_first_frame() -> None:
     text = b"\n\nInit ArduCopter V4.7.0-dev (21910f24)\n\nFree RAM: 524288\nBooting 0/0\n"
     framer = Framer()
     assert framer.receive(text) == []
@@ -226,7 +222,7 @@ def test_text_before_the_first_frame() -> None:
     assert (framer.statistics.bad_bytes, framer.statistics.bad_crcs) == (len(text), 0)
 
 
-def test_a_frame_with_a_wrong_checksum_is_counted_once() -> None:
+def test_bad_checksum_is_counted_once() -> None:
     raw = bytearray(frame_of(ATTITUDE))
     raw[-1] ^= 0x40
     framer = Framer()
@@ -235,19 +231,19 @@ def test_a_frame_with_a_wrong_checksum_is_counted_once() -> None:
 
 
 @given(st.lists(noise, min_size=1, max_size=60), good_frames)
-def test_memory_is_bounded(parts: list[bytes], frames: list[bytes]) -> None:
+def test_framer_memory_is_bounded(parts: list[bytes], frames: list[bytes]) -> None:
     framer = Framer()
     for part in (*parts, *frames, *parts):
         framer.receive(part)
-        assert framer.waiting <= 2 * LONGEST
+        assert framer.waiting <= 2 * MAX_FRAME_LENGTH
 
 
-def test_memory_is_bounded_under_random_bytes() -> None:
+def test_framer_memory_is_bounded_for_random_bytes() -> None:
     chance = random.Random(5)
     framer = Framer()
     for _ in range(400):
         framer.receive(chance.randbytes(chance.randint(0, 500)).replace(b"\x00", b"\xfd"))
-        assert framer.waiting <= 2 * LONGEST
+        assert framer.waiting <= 2 * MAX_FRAME_LENGTH
     assert framer.statistics.frames == 0
 
 
@@ -255,9 +251,7 @@ def test_memory_is_bounded_under_random_bytes() -> None:
 
 
 @given(good_frames, st.integers(0, 200), cuts)
-def test_unknown_frames_are_passed_over_and_counted(
-    frames: list[bytes], length: int, places: list[int]
-) -> None:
+def test_unknown_frames_are_skipped_and_counted(frames: list[bytes], length: int, places: list[int]) -> None:
     stream = b"".join(unknown(length) + raw for raw in frames)
     framer = Framer()
     assert raws(feed(framer, cut(stream, places))) == frames
@@ -266,8 +260,8 @@ def test_unknown_frames_are_passed_over_and_counted(
     assert framer.statistics.bad_bytes == 0
 
 
-def test_a_good_frame_inside_a_seeming_unknown_one_is_found() -> None:
-    """The length of an unknown frame proves nothing: its checksum cannot be checked."""
+def test_frame_inside_unknown_frame_is_found() -> None:
+    """An unknown message's checksum cannot be verified, so its length proves nothing."""
     raw = frame_of(HEARTBEAT)
     seeming = bytearray(unknown(80))
     seeming[30 : 30 + len(raw)] = raw
@@ -276,7 +270,7 @@ def test_a_good_frame_inside_a_seeming_unknown_one_is_found() -> None:
     assert framer.statistics.unknown_ids == 0
 
 
-def test_a_seeming_unknown_frame_inside_one_that_is_not_whole_yet_is_none() -> None:
+def test_unknown_frame_inside_incomplete_frame_is_ignored() -> None:
     inner, outer = unknown(20, 1_000_001), bytearray(unknown(200, 1_000_002))
     outer[40 : 40 + len(inner)] = inner
     framer = Framer()
@@ -284,8 +278,8 @@ def test_a_seeming_unknown_frame_inside_one_that_is_not_whole_yet_is_none() -> N
     assert framer.statistics.unknown_messages == {1_000_002: 1}
 
 
-def test_a_wrong_checksum_behind_an_unknown_frame_is_counted_once_however_it_is_cut() -> None:
-    claim = b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00"  # longer than an ATTITUDE can be
+def test_bad_checksum_after_unknown_frame_counts_once() -> None:
+    claim = b"\xfd\xff\x00\x00\x00\x01\x01\x1e\x00\x00"  # longer than any ATTITUDE
     damaged = frame_of(ATTITUDE)[:-1] + b"\x00"
     stream = (claim + unknown() + damaged).ljust(300, b"\0")
     for places in ([], [120], range(len(stream))):
@@ -294,7 +288,7 @@ def test_a_wrong_checksum_behind_an_unknown_frame_is_counted_once_however_it_is_
         assert (framer.statistics.bad_crcs, framer.statistics.unknown_ids) == (2, 1)
 
 
-def test_unknown_frames_of_a_known_sender_are_not_lost_ones() -> None:
+def test_unknown_frames_do_not_count_as_lost() -> None:
     framer = Framer()
     framer.receive(frame_of(HEARTBEAT, sequence=0))
     framer.receive(unknown(sequence=1))
@@ -302,7 +296,7 @@ def test_unknown_frames_of_a_known_sender_are_not_lost_ones() -> None:
     assert [source.lost for source in framer.statistics.sources.values()] == [0]
 
 
-def test_the_table_of_unknown_ids_is_bounded() -> None:
+def test_unknown_id_table_is_bounded() -> None:
     framer = Framer()
     for number in range(200):
         framer.receive(unknown(message_id=1_000_000 + number % 100))
@@ -310,7 +304,7 @@ def test_the_table_of_unknown_ids_is_bounded() -> None:
     assert len(framer.statistics.unknown_messages) == 64
 
 
-def test_unknown_frames_are_returned_on_demand() -> None:
+def test_framer_keep_unknown_returns_frames() -> None:
     framer = Framer()
     framer.keep_unknown = True
     framer.wanted = frozenset()
@@ -323,16 +317,16 @@ def test_unknown_frames_are_returned_on_demand() -> None:
     ]
 
 
-def test_a_dialect_of_few_messages_knows_no_others() -> None:
+def test_framer_of_small_dialect() -> None:
     framer = Framer(Dialect("heartbeats", [messages.Heartbeat]))
     assert raws(framer.receive(frame_of(ATTITUDE) + frame_of(HEARTBEAT))) == [frame_of(HEARTBEAT)]
     assert framer.statistics.unknown_messages == {30: 1}
 
 
-# -------------------------------------------------------------------------------------------- wanted
+# ------------------------------------------------------------------------------------------- filters
 
 
-def test_wanted_ids_are_returned_and_the_others_counted() -> None:
+def test_framer_returns_wanted_ids_only() -> None:
     framer = Framer()
     framer.wanted = {0}
     stream = b"".join(frame_of(m, sequence=i) for i, m in enumerate([HEARTBEAT, ATTITUDE, HEARTBEAT]))
@@ -341,7 +335,7 @@ def test_wanted_ids_are_returned_and_the_others_counted() -> None:
     assert (source.received, source.lost) == (3, 0)
 
 
-def test_wanted_may_change_while_frames_come() -> None:
+def test_framer_wanted_may_change() -> None:
     framer, wanted = Framer(), set[int]()
     framer.wanted = wanted
     assert framer.receive(frame_of(HEARTBEAT)) == []
@@ -381,7 +375,7 @@ def lost_after(sequences: list[int]) -> tuple[int, int]:
         ([100, 101, 50, 51, 52, 54], 1),
     ],
 )
-def test_lost_frames(sequences: list[int], lost: int) -> None:
+def test_lost_frames_are_counted(sequences: list[int], lost: int) -> None:
     assert lost_after(sequences) == (len(sequences), lost)
 
 
@@ -398,8 +392,8 @@ def test_every_gap_is_counted(first: int, came: list[bool]) -> None:
 
 
 @given(st.permutations(range(8)))
-def test_reordering_loses_nothing(order: list[int]) -> None:
-    """The last of a batch that came in any order: all eight came, none is missing."""
+def test_reordered_frames_are_not_lost(order: list[int]) -> None:
+    """The last of a reordered batch: all eight frames arrived, none is missing."""
     received, lost = lost_after([100, *(101 + number for number in order), 109, 110])
     assert (received, lost) == (11, 0)
 
@@ -428,7 +422,7 @@ def test_senders_are_counted_apart() -> None:
         (b"\xfd\xff\x01", 280),
     ],
 )
-def test_the_form_of_a_frame_is_its_magic_and_its_length(head: bytes, size: int) -> None:
+def test_whole_frame_has_magic_and_length(head: bytes, size: int) -> None:
     sizes = [length for length in range(300) if is_whole_frame(head.ljust(length, b"\0")[:length])]
     assert sizes == [size]
     assert not is_whole_frame(b"\xfc" + head[1:].ljust(size - 1, b"\0"))

@@ -1,4 +1,4 @@
-"""The committed modules are what the generator makes of pymavlink's XML."""
+"""The committed modules equal the generator's output for pymavlink's XML."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from aerokit.mavlink.generator import read_additions, with_added_enums, with_add
 PACKAGES = {"messages": messages, "enums": enums}
 
 
-def test_the_committed_modules_are_up_to_date() -> None:
+def test_generated_modules_are_up_to_date() -> None:
     if generator.fingerprint() != generator.generated_fingerprint():
-        pytest.skip("the installed pymavlink carries other XML than the committed modules were made from")
+        pytest.skip("the installed pymavlink has other XML than the committed modules were made from")
     assert generator.differences() == []
 
 
-def test_other_xml_has_another_fingerprint(tmp_path: Path) -> None:
+def test_fingerprint_depends_on_xml(tmp_path: Path) -> None:
     for stem in ("minimal", "standard", "common", "development", *generator.MODULES["ardupilotmega"]):
         (tmp_path / f"{stem}.xml").write_bytes((generator.xml_folder() / f"{stem}.xml").read_bytes())
     assert generator.fingerprint(tmp_path) == generator.fingerprint()
@@ -37,19 +37,19 @@ def test_other_xml_has_another_fingerprint(tmp_path: Path) -> None:
     assert set(generator.differences(tmp_path)) >= {"messages/__init__.py", "messages/minimal.py"}
 
 
-def test_one_name_for_two_messages_is_refused(tmp_path: Path) -> None:
-    """A module would have one of them, whichever comes last."""
+def test_generator_rejects_duplicate_names(tmp_path: Path) -> None:
+    """A module can hold only one of the two."""
     for stem in ("minimal", "standard", "common", "development", *generator.MODULES["ardupilotmega"]):
         (tmp_path / f"{stem}.xml").write_bytes((generator.xml_folder() / f"{stem}.xml").read_bytes())
     path = tmp_path / "development.xml"
     text, count = re.subn('(<message id="[0-9]+" name=")[A-Z_]+"', r'\1AHRS"', path.read_text(), count=1)
     assert count == 1
     path.write_text(text)
-    with pytest.raises(InvalidArgument, match="two definitions would both be called Ahrs"):
+    with pytest.raises(InvalidArgument, match="two definitions would both have the name Ahrs"):
         generator.generate(tmp_path)
 
 
-def test_without_the_check_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_generator_writes_without_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "messages").mkdir()
     (tmp_path / "messages" / "one.py").write_text("before")
     files = {"messages/one.py": "a\n\xe4\n", "enums/two.py": "b\n"}
@@ -60,11 +60,11 @@ def test_without_the_check_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("other", [False, True])
-def test_the_check(other: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_generator_check(other: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     if other:
         monkeypatch.setattr(generator, "fingerprint", lambda folder=None: "other")
         assert generator.main(["--check"]) == 0
-        assert capsys.readouterr().out.startswith("skipped: the installed pymavlink carries other XML")
+        assert capsys.readouterr().out.startswith("skipped: the installed pymavlink has other XML")
     elif generator.fingerprint() == generator.generated_fingerprint():
         monkeypatch.setattr(generator, "generate", lambda folder=None: {"messages/minimal.py": "changed"})
         assert generator.main(["--check"]) == 1
@@ -73,15 +73,15 @@ def test_the_check(other: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 @pytest.mark.parametrize("package", PACKAGES)
 @pytest.mark.parametrize("module", generator.MODULES)
-def test_every_module_says_what_it_exports(package: str, module: str) -> None:
+def test_generated_modules_have_all(package: str, module: str) -> None:
     loaded = importlib.import_module(f"aerokit.mavlink.{package}.{module}")
     names = loaded.__all__
     assert len(names) == len(set(names))
     assert all(getattr(PACKAGES[package], name) is getattr(loaded, name) for name in names)
 
 
-def test_importing_the_wire_imports_no_message() -> None:
-    """Nine hundred kilobytes of source are read when the first of their messages is needed."""
+def test_mavlink_import_loads_no_messages() -> None:
+    """Nine hundred kilobytes of source are imported only when one of their messages is needed."""
     code = (
         "import sys, aerokit.mavlink\n"
         "print(*sorted(name for name in sys.modules if name.startswith(('aerokit.mavlink.messages.',"
@@ -91,10 +91,10 @@ def test_importing_the_wire_imports_no_message() -> None:
     assert done.stdout.split() == []
 
 
-def test_the_additions_say_nothing_that_pymavlink_says() -> None:
-    """So that what it has learnt since is taken out of them."""
+def test_additions_do_not_repeat_pymavlink() -> None:
+    """An addition that pymavlink has meanwhile must be removed."""
     if generator.fingerprint() != generator.generated_fingerprint():
-        pytest.skip("the installed pymavlink carries other XML than the additions were made for")
+        pytest.skip("the installed pymavlink has other XML than the additions were made for")
     folder = generator.xml_folder()
     dialects = [read_xml(folder / f"{stem}.xml") for stems in generator.MODULES.values() for stem in stems]
     theirs, their_enums = [m for dialect in dialects for m in dialect.messages], merged_enums(dialects)
@@ -104,9 +104,7 @@ def test_the_additions_say_nothing_that_pymavlink_says() -> None:
             alone = DialectDefinition(dialect.name, messages=(message,))
             assert with_added_messages(theirs, [alone]) != theirs, message.name
             for f in message.fields:
-                assert known.get((message.id, f.name)) != (f.units, f.enum, f.invalid), (
-                    f"{message.name}.{f.name}"
-                )
+                assert known.get((message.id, f.name)) != (f.units, f.enum, f.invalid), f"{message.name}.{f.name}"
         for enum in dialect.enums:
             for entry in enum.entries:
                 one = DialectDefinition(dialect.name, enums=(replace(enum, entries=(entry,)),))

@@ -1,4 +1,4 @@
-"""What bytes of somebody who means no good cost, and what senders behind one peer are told apart by."""
+"""Hostile bytes: their processing costs, and how senders behind one peer are told apart."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOISE = {
 
 
 class Work:
-    """Counts what a framer does: places that it examines, bytes that it runs through the checksum."""
+    """A framer that counts examined offsets and bytes run through the checksum."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.places = self.checked_bytes = 0
@@ -49,10 +49,8 @@ class Work:
 
 @pytest.mark.parametrize("size", [1, 7, 1200])
 @pytest.mark.parametrize("noise", NOISE.values(), ids=NOISE)
-def test_each_byte_costs_a_bounded_number_of_steps(
-    noise: bytes, size: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """However the bytes are cut: each place is examined a few times, not with every byte that comes behind it."""
+def test_framer_work_per_byte_is_bounded(noise: bytes, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each offset is examined a few times only, not again with every following byte, however the bytes are split."""
     work, subject = Work(monkeypatch), Framer()
     for begin in range(0, len(noise), size):
         subject.receive(noise[begin : begin + size])
@@ -63,17 +61,17 @@ def test_each_byte_costs_a_bounded_number_of_steps(
     assert frame.message_id == 0
 
 
-def test_a_row_of_magic_bytes_is_passed_over_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_framer_skips_row_of_magic_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     work, subject = Work(monkeypatch), Framer()
     subject.receive(b"\xfd" * 1200)
     assert work.places <= 4
     assert work.checked_bytes == 0
 
 
-# ----------------------------------------------------------------------------- how many senders
+# ---------------------------------------------------------------------------- number of senders
 
 
-def heartbeats_of_everybody(rounds: int = 1) -> Iterable[bytes]:
+def heartbeats_of_all_ids(rounds: int = 1) -> Iterable[bytes]:
     encoder = FrameEncoder(1, 1)
     for _ in range(rounds):
         for system_id in range(1, 256):
@@ -82,16 +80,16 @@ def heartbeats_of_everybody(rounds: int = 1) -> Iterable[bytes]:
                 yield encoder.encode(HEARTBEAT)
 
 
-def test_no_more_senders_are_counted_apart_than_the_limit() -> None:
+def test_sender_count_is_limited() -> None:
     subject, count = Framer(), 0
-    for frame in heartbeats_of_everybody():
+    for frame in heartbeats_of_all_ids():
         count += len(subject.receive(frame))
     assert count == 255 * 32
-    assert len(subject.statistics.sources) == len(subject.statistics.by_key) == framer.MOST_SOURCES
+    assert len(subject.statistics.sources) == len(subject.statistics.by_key) == framer.MAX_SOURCES
     assert subject.statistics.frames == count
 
 
-def test_framers_share_a_limit_and_give_it_back() -> None:
+def test_framers_share_and_release_sender_limit() -> None:
     limit = SourceLimit(10)
     one, two = Framer(limit=limit), Framer(limit=limit)
     for system_id in range(1, 9):
@@ -99,11 +97,11 @@ def test_framers_share_a_limit_and_give_it_back() -> None:
             each.receive(FrameEncoder(system_id, 1).encode(HEARTBEAT))
     assert len(one.statistics.sources) + len(two.statistics.sources) == 10
     assert one.statistics.frames == two.statistics.frames == 8
-    one.retire()
+    one.close()
     assert limit.free == 5
 
 
-def test_quiet_senders_make_room_and_those_that_are_heard_stay() -> None:
+def test_silent_senders_are_dropped_for_new_ones() -> None:
     subject = Framer(limit=SourceLimit(10))
     vehicle = FrameEncoder(100, 1)
     for second in range(60):
@@ -118,7 +116,7 @@ def test_quiet_senders_make_room_and_those_that_are_heard_stay() -> None:
 
 
 class Sender:
-    """One vehicle's frames, numbered from anywhere."""
+    """One vehicle that sends frames, starting from any sequence number."""
 
     def __init__(self, first: int) -> None:
         self._encoder = FrameEncoder(1, 1)
@@ -131,13 +129,13 @@ class Sender:
         return [self.frame() for _ in range(count)]
 
 
-class Ear:
-    """A framer, and what it thinks of each frame: "" (in order), "late" or "foreign"."""
+class Judge:
+    """A framer and its verdict on each frame: "" (in order), "late" or "foreign"."""
 
     def __init__(self) -> None:
         self.framer, self.now = Framer(), 100.0
 
-    def hear(self, *frames: bytes, every_s: float = 0.02) -> list[str]:
+    def receive(self, *frames: bytes, every_s: float = 0.02) -> list[str]:
         verdicts: list[str] = []
         for raw in frames:
             self.now += every_s
@@ -150,29 +148,36 @@ class Ear:
         return "foreign" if frame in self.framer.foreign else ""
 
     @property
-    def is_double(self) -> bool:
-        return self.framer.statistics.sources[1, 1].is_double(self.now)
+    def has_duplicates(self) -> bool:
+        return self.framer.statistics.sources[1, 1].has_duplicates(self.now)
 
 
-def test_overtaken_frames_are_late_and_no_others() -> None:
-    ear, frames = Ear(), Sender(0).frames(20)
-    assert ear.hear(*frames[:3], frames[4], frames[3], *frames[5:9]) == ["", "", "", "", "late", *[""] * 4]
-    assert ear.hear(frames[8]) == ["late"]
-    assert ear.hear(frames[12], frames[9], frames[10], frames[11], frames[13]) == ["", *["late"] * 3, ""]
-    assert not ear.is_double
+def test_overtaken_frames_are_late() -> None:
+    judge, frames = Judge(), Sender(0).frames(20)
+    assert judge.receive(*frames[:3], frames[4], frames[3], *frames[5:9]) == [
+        "",
+        "",
+        "",
+        "",
+        "late",
+        *[""] * 4,
+    ]
+    assert judge.receive(frames[8]) == ["late"]
+    assert judge.receive(frames[12], frames[9], frames[10], frames[11], frames[13]) == ["", *["late"] * 3, ""]
+    assert not judge.has_duplicates
 
 
-def test_what_was_late_is_told_once() -> None:
-    ear, frames = Ear(), Sender(0).frames(9)
-    ear.hear(*frames[:3], frames[4], frames[3])
-    assert len(ear.framer.late) == 1
-    ear.hear(frames[5])
-    assert ear.framer.late == []
+def test_late_frames_are_reported_once() -> None:
+    judge, frames = Judge(), Sender(0).frames(9)
+    judge.receive(*frames[:3], frames[4], frames[3])
+    assert len(judge.framer.late) == 1
+    judge.receive(frames[5])
+    assert judge.framer.late == []
 
 
-def test_overtaken_frames_of_one_datagram_are_told_too() -> None:
-    ear, frames = Ear(), Sender(250).frames(20)
-    assert ear.hear(b"".join((*frames[:3], frames[5], frames[3], frames[4], frames[6]))) == [
+def test_overtaken_frames_in_one_datagram_are_late() -> None:
+    judge, frames = Judge(), Sender(250).frames(20)
+    assert judge.receive(b"".join((*frames[:3], frames[5], frames[3], frames[4], frames[6]))) == [
         *[""] * 4,
         "late",
         "late",
@@ -180,20 +185,20 @@ def test_overtaken_frames_of_one_datagram_are_told_too() -> None:
     ]
 
 
-def test_a_frame_may_be_late_by_many() -> None:
-    ear, frames = Ear(), Sender(7).frames(130)
-    ear.hear(*frames[:10], *frames[11:120])
-    assert ear.hear(frames[10]) == ["late"]
-    assert ear.framer.statistics.sources[1, 1].lost == 0
+def test_frame_late_by_many_numbers() -> None:
+    judge, frames = Judge(), Sender(7).frames(130)
+    judge.receive(*frames[:10], *frames[11:120])
+    assert judge.receive(frames[10]) == ["late"]
+    assert judge.framer.statistics.sources[1, 1].lost == 0
 
 
 @pytest.mark.parametrize("first", [0, 60, 128, 200, 250])
-def test_a_reboot_is_listened_to_within_two_frames(first: int) -> None:
-    ear = Ear()
-    ear.hear(*Sender(100).frames(50))
-    verdicts = ear.hear(*Sender(first).frames(30))
+def test_reboot_is_accepted_within_two_frames(first: int) -> None:
+    judge = Judge()
+    judge.receive(*Sender(100).frames(50))
+    verdicts = judge.receive(*Sender(first).frames(30))
     assert verdicts[1:] == [""] * 29
-    assert not ear.is_double
+    assert not judge.has_duplicates
 
 
 def interleaved(ours: Sender, theirs: Sender, burst: int, count: int) -> Iterable[tuple[bool, bytes]]:
@@ -204,51 +209,51 @@ def interleaved(ours: Sender, theirs: Sender, burst: int, count: int) -> Iterabl
 
 @pytest.mark.parametrize("burst", [1, 3, 6])
 @pytest.mark.parametrize("distance", [30, 90, 128, 150, 220])
-def test_of_two_senders_with_the_same_ids_the_first_is_listened_to(distance: int, burst: int) -> None:
-    ear, ours = Ear(), Sender(10)
-    ear.hear(*ours.frames(60))
+def test_first_of_two_senders_is_accepted(distance: int, burst: int) -> None:
+    judge, ours = Judge(), Sender(10)
+    judge.receive(*ours.frames(60))
     theirs = Sender(70 + distance)
     verdicts = [
         (is_ours, verdict)
         for is_ours, frame in interleaved(ours, theirs, burst, 60)
-        for verdict in ear.hear(frame)
+        for verdict in judge.receive(frame)
     ]
-    assert ear.is_double
+    assert judge.has_duplicates
     late = verdicts[len(verdicts) // 4 :]
     assert {verdict for is_ours, verdict in late if is_ours} == {""}
     assert {verdict for is_ours, verdict in late if not is_ours} == {"foreign"}
 
 
 @pytest.mark.parametrize("distance", [-8, -1, 0])
-def test_two_that_count_alike_are_noticed_too(distance: int) -> None:
-    ear, ours = Ear(), Sender(10)
-    ear.hear(*ours.frames(60))
+def test_senders_with_similar_sequences_are_detected(distance: int) -> None:
+    judge, ours = Judge(), Sender(10)
+    judge.receive(*ours.frames(60))
     theirs = Sender(70 + distance)
     for _, frame in interleaved(ours, theirs, 1, 60):
-        ear.hear(frame)
-    assert ear.is_double
+        judge.receive(frame)
+    assert judge.has_duplicates
 
 
-def test_when_the_first_is_over_the_other_is_listened_to() -> None:
-    ear, ours, theirs = Ear(), Sender(10), Sender(150)
-    ear.hear(*ours.frames(60))
+def test_second_sender_is_accepted_after_first_stops() -> None:
+    judge, ours, theirs = Judge(), Sender(10), Sender(150)
+    judge.receive(*ours.frames(60))
     for _, frame in interleaved(ours, theirs, 2, 30):
-        ear.hear(frame)
-    verdicts = ear.hear(*theirs.frames(200))
+        judge.receive(frame)
+    verdicts = judge.receive(*theirs.frames(200))
     assert verdicts[0] == "foreign"
     assert set(verdicts[100:]) == {""}
-    ear.hear(*theirs.frames(300))
-    assert not ear.is_double
+    judge.receive(*theirs.frames(300))
+    assert not judge.has_duplicates
 
 
-def test_when_the_first_comes_back_it_is_believed_with_its_third_frame() -> None:
-    ear, ours, theirs = Ear(), Sender(10), Sender(150)
-    ear.hear(*ours.frames(60))
+def test_returning_first_sender_is_accepted_after_three_frames() -> None:
+    judge, ours, theirs = Judge(), Sender(10), Sender(150)
+    judge.receive(*ours.frames(60))
     for _, frame in interleaved(ours, theirs, 2, 5):
-        ear.hear(frame)
-    ear.now += 2.0
-    assert ear.hear(*theirs.frames(10)) == [""] * 10
-    assert ear.hear(*ours.frames(5)) == ["late", "late", "", "", ""]
+        judge.receive(frame)
+    judge.now += 2.0
+    assert judge.receive(*theirs.frames(10)) == [""] * 10
+    assert judge.receive(*ours.frames(5)) == ["late", "late", "", "", ""]
 
 
 Disorder = Callable[[random.Random, list[bytes]], list[bytes]]
@@ -256,9 +261,7 @@ Disorder = Callable[[random.Random, list[bytes]], list[bytes]]
 
 def held_back(share: float, by: int) -> Disorder:
     def disorder(chance: random.Random, frames: list[bytes]) -> list[bytes]:
-        places = sorted(
-            range(len(frames)), key=lambda place: place + (by + 0.5 if chance.random() < share else 0)
-        )
+        places = sorted(range(len(frames)), key=lambda place: place + (by + 0.5 if chance.random() < share else 0))
         return [frames[place] for place in places]
 
     return disorder
@@ -275,10 +278,10 @@ def repeated(share: float) -> Disorder:
     "disorder",
     [held_back(0.1, 1), held_back(0.3, 3), held_back(0.3, 10), held_back(0.05, 100), repeated(0.3)],
 )
-def test_a_bad_radio_is_no_second_sender(disorder: Disorder) -> None:
+def test_bad_radio_is_not_second_sender(disorder: Disorder) -> None:
     for seed in range(5):
-        ear, chance = Ear(), random.Random(seed)
+        judge, chance = Judge(), random.Random(seed)
         frames = [frame for frame in Sender(0).frames(3000) if chance.random() > 0.1]
         for frame in disorder(chance, frames):
-            assert ear.hear(frame) != ["foreign"]
-            assert not ear.is_double
+            assert judge.receive(frame) != ["foreign"]
+            assert not judge.has_duplicates

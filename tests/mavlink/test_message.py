@@ -1,4 +1,4 @@
-"""Message classes: what they say of themselves, equality, copies, decoding of any payload."""
+"""Message classes: metadata, equality, copies, and decoding of arbitrary payloads."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def received(message: Message) -> Message:
 
 
 @for_each("message_class", EVERY)
-def test_what_every_class_says(message_class: type[Message]) -> None:
+def test_message_class_attributes(message_class: type[Message]) -> None:
     names = tuple(field.name for field in message_class.FIELDS)
     assert vars(message_class)["__match_args__"] == names
     assert message_class.FIELDS is message_class.FIELDS
@@ -38,20 +38,18 @@ def test_what_every_class_says(message_class: type[Message]) -> None:
     doc = message_class.__doc__ or ""
     assert doc.startswith(f"{message_class.NAME} ({message_class.ID}): ")
     assert f".html#{message_class.NAME}" in doc
-    assert [field.extension for field in message_class.FIELDS] == sorted(
-        f.extension for f in message_class.FIELDS
-    )
+    assert [field.extension for field in message_class.FIELDS] == sorted(f.extension for f in message_class.FIELDS)
 
 
 @for_each("message_class", EVERY)
-def test_copies_are_equal(message_class: type[Message]) -> None:
+def test_message_copies_are_equal(message_class: type[Message]) -> None:
     *_, message = samples(message_class, 3)
     for again in (copy.copy(message), copy.deepcopy(message), pickle.loads(pickle.dumps(message))):
         assert again == message
         assert type(again) is message_class
 
 
-def test_units_are_in_the_source_for_editors() -> None:
+def test_generated_source_has_units() -> None:
     import inspect
 
     source = inspect.getsource(messages.GlobalPositionInt)
@@ -70,18 +68,16 @@ def test_units_are_in_the_source_for_editors() -> None:
     assert repr(messages.BatteryStatus.FIELDS[4]) == "<Field uint16_t[10] voltages [mV]>"
 
 
-def test_the_first_field_is_the_first_argument_and_extensions_are_optional() -> None:
+def test_message_constructor_arguments() -> None:
     message = messages.CommandAck(400, 0)
     assert (message.command, message.result) == (400, 0)
-    assert (message.progress, message.result_param2, message.target_system, message.target_component) == (
-        0,
-    ) * 4
+    assert (message.progress, message.result_param2, message.target_system, message.target_component) == (0,) * 4
     assert messages.Heartbeat(2, 3, 81, 4, 3).mavlink_version == 3
     with pytest.raises(TypeError, match="system_status"):
         messages.Heartbeat(2, 3, 81, 4)  # type: ignore[call-arg]
 
 
-def test_equality() -> None:
+def test_message_equality() -> None:
     same = messages.Attitude(1000, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75)
     assert same == ATTITUDE
     assert messages.Attitude(1001, 0.25, 0.5, 0.75, -1.25, -1.5, -1.75) != ATTITUDE
@@ -92,15 +88,14 @@ def test_equality() -> None:
     assert nan != messages.Attitude(0, 0, 0, 0, 0, 0, 0)
 
 
-def test_equality_of_tuples_with_nan() -> None:
+def test_message_equality_of_tuples_with_nan() -> None:
     first, *others = (
-        messages.AttitudeQuaternionCov(0, (1.0, math.nan, 0.0, last), 0, 0, 0, (0.0,) * 9)
-        for last in (0.0, 0.0, 1.0)
+        messages.AttitudeQuaternionCov(0, (1.0, math.nan, 0.0, last), 0, 0, 0, (0.0,) * 9) for last in (0.0, 0.0, 1.0)
     )
     assert [first == other for other in others] == [True, False]
 
 
-def test_where_it_came_from_is_not_compared() -> None:
+def test_message_equality_ignores_frame() -> None:
     other = received(ATTITUDE)
     assert other == ATTITUDE
     assert ATTITUDE.received_frame is None
@@ -109,7 +104,7 @@ def test_where_it_came_from_is_not_compared() -> None:
     assert (frame.system_id, frame.component_id, frame.received_at) == (1, 1, 3.0)
 
 
-def test_copies_keep_where_it_came_from() -> None:
+def test_message_copies_keep_frame() -> None:
     for other in (copy.copy(received(ATTITUDE)), pickle.loads(pickle.dumps(received(ATTITUDE)))):
         assert other.received_frame is not None
         assert other.received_frame.raw == FrameEncoder(1, 1).encode(ATTITUDE)
@@ -120,18 +115,18 @@ def test_messages_are_not_hashable() -> None:
         hash(ATTITUDE)
 
 
-def test_no_other_attributes() -> None:
+def test_messages_have_no_other_attributes() -> None:
     with pytest.raises(AttributeError):
         ATTITUDE.rolll = 1.0  # type: ignore[attr-defined]
 
 
-def test_repr_can_be_evaluated() -> None:
+def test_message_repr_can_be_evaluated() -> None:
     message = messages.Statustext(6, "it's\n", 1, 2)
     assert repr(message) == 'Statustext(severity=6, text="it\'s\\n", id=1, chunk_seq=2)'
     assert eval(repr(message), vars(messages) | {"Statustext": messages.Statustext}) == message
 
 
-def test_keys_are_not_shown() -> None:
+def test_message_repr_hides_keys() -> None:
     key = bytes(range(32))
     message = messages.SetupSigning(1, 1, key, 5)
     assert repr(message) == (
@@ -142,7 +137,7 @@ def test_keys_are_not_shown() -> None:
     assert "secret_key = <not shown>" in str(raised.value)
 
 
-def test_to_dict_is_in_the_order_of_the_standard() -> None:
+def test_message_to_dict_order() -> None:
     assert messages.Statustext(6, "hello").to_dict() == {
         "severity": 6,
         "text": "hello",
@@ -152,7 +147,7 @@ def test_to_dict_is_in_the_order_of_the_standard() -> None:
     assert list(messages.Statustext(6, "hello").to_dict()) == ["severity", "text", "id", "chunk_seq"]
 
 
-def test_patterns() -> None:
+def test_message_pattern_matching() -> None:
     match received(messages.CommandAck(400, 4)):
         case messages.CommandAck(command, result=result):
             assert (command, result) == (400, 4)
@@ -160,7 +155,7 @@ def test_patterns() -> None:
             pytest.fail("no match")
 
 
-def test_sequences_become_tuples() -> None:
+def test_received_sequences_are_tuples() -> None:
     message = messages.BatteryStatus(0, 0, 0, 0, [3700, 3600], 0, 0, 0, 0)
     assert message.voltages == (3700, 3600)
     decoded = received(message)
@@ -169,7 +164,7 @@ def test_sequences_become_tuples() -> None:
     assert decoded.voltages_ext == (0, 0, 0, 0)
 
 
-def test_text_ends_at_the_first_nul() -> None:
+def test_text_field_ends_at_nul() -> None:
     payload = messages.Statustext(6, "PreArm: ok").encode()
     garbage = payload[:15] + b"garbage"
     assert messages.Statustext.decode(garbage).text == "PreArm: ok"
@@ -179,7 +174,7 @@ def test_text_ends_at_the_first_nul() -> None:
 
 
 @given(st.binary(max_size=300), st.sampled_from(list(STANDARD)))
-def test_any_payload_can_be_decoded(payload: bytes, message_class: type[Message]) -> None:
+def test_message_decodes_any_payload(payload: bytes, message_class: type[Message]) -> None:
     message = message_class.decode(payload)
     assert message.received_frame is None
     full = payload[: message_class.LENGTH].ljust(message_class.LENGTH, b"\0")
@@ -187,17 +182,17 @@ def test_any_payload_can_be_decoded(payload: bytes, message_class: type[Message]
     assert message_class.decode(full.rstrip(b"\0")) == message
 
 
-def test_field_is_public() -> None:
+def test_field_class_is_public() -> None:
     assert all(isinstance(field, Field) for message_class in STANDARD for field in message_class.FIELDS)
 
 
-def test_the_wrong_field_is_named_and_none_that_holds_its_greatest_or_least_value() -> None:
+def test_encode_error_names_only_invalid_field() -> None:
     for value in (0, 255):
         with pytest.raises(InvalidArgument, match=r"target_component = 300"):
             messages.CommandLong(value, 300, 400, 0, 0, 0, 0, 0, 0, 0, 0).encode()
 
 
-def test_what_integers_hold() -> None:
+def test_integer_field_ranges() -> None:
     assert INTEGER_RANGES == {
         "int8_t": (-128, 127),
         "uint8_t": (0, 255),
@@ -211,7 +206,7 @@ def test_what_integers_hold() -> None:
 
 
 @pytest.mark.parametrize("kind", [messages.ParamExtValue, messages.ParamExtSet, messages.ParamExtAck])
-def test_char_arrays_that_carry_bytes_keep_their_zeros(kind: type[Message]) -> None:
+def test_char_arrays_with_bytes_keep_zeros(kind: type[Message]) -> None:
     (field,) = (each for each in kind.FIELDS if each.name == "param_value")
     assert (field.type, field.array_length, field.is_text) == ("char", 128, False)
     number = (1000).to_bytes(8, "little", signed=True)

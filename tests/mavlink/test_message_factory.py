@@ -1,4 +1,4 @@
-"""pymavlink's maker of messages, sending by a function of the program's own."""
+"""pymavlink's message factory with a send function supplied by the program."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aerokit.mavlink.pymavlink import from_pymavlink
 TARGET = 7
 
 
-def test_what_it_sends_goes_to_the_program_as_any_message_of_pymavlink() -> None:
+def test_message_factory_passes_messages_to_program() -> None:
     sent: list[Message] = []
     factory: Any = MessageFactory(lambda message: sent.append(from_pymavlink(message, TARGET)), 255, 190)
     factory.param_set_send(0, 1, "RTL_ALT", 30, 9)
@@ -23,7 +23,7 @@ def test_what_it_sends_goes_to_the_program_as_any_message_of_pymavlink() -> None
     assert (factory.srcSystem, factory.srcComponent) == (255, 190)
 
 
-def test_what_cannot_be_sent_is_told_to_the_caller_and_not_counted() -> None:
+def test_message_factory_error_is_raised_and_not_counted() -> None:
     factory: Any = MessageFactory(from_pymavlink, 255, 0)
     with pytest.raises(InvalidArgument, match="param_type"):
         factory.param_set_send(1, 1, b"RTL_ALT", 30, 900)

@@ -1,4 +1,4 @@
-"""Every message of the standard: our bytes are pymavlink's, and we read its bytes as it does, in both versions."""
+"""Encoding and decoding of every standard message, compared with pymavlink in both protocol versions."""
 
 from __future__ import annotations
 
@@ -57,17 +57,17 @@ def check(message_class: type[Message], version: int) -> None:
 
 
 @for_each("message_class", EVERY)
-def test_version_2(message_class: type[Message]) -> None:
+def test_version_2_matches_pymavlink(message_class: type[Message]) -> None:
     check(message_class, 2)
 
 
 @for_each("message_class", SMALL)
-def test_version_1(message_class: type[Message]) -> None:
+def test_version_1_matches_pymavlink(message_class: type[Message]) -> None:
     check(message_class, 1)
 
 
 @for_each("message_class", SMALL)
-def test_version_1_has_no_extensions(message_class: type[Message]) -> None:
+def test_version_1_omits_extensions(message_class: type[Message]) -> None:
     for message in samples(message_class, 3):
         raw = our_bytes(message, 1, 0)
         assert (raw[0], raw[1]) == (MAGIC_V1, message_class.BASE_LENGTH)
@@ -78,7 +78,7 @@ def test_version_1_has_no_extensions(message_class: type[Message]) -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("name", PEERS)
-def test_we_know_every_message_that_these_dialects_know(name: str, version: int) -> None:
+def test_all_pymavlink_messages_are_known(name: str, version: int) -> None:
     theirs = dialect_module(name, version).mavlink_map
     assert {message_id: cls.crc_extra for message_id, cls in theirs.items()} == {
         message_id: STANDARD[message_id].CRC_EXTRA for message_id in theirs
@@ -89,7 +89,7 @@ def test_we_know_every_message_that_these_dialects_know(name: str, version: int)
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_units_and_enums_of_fields(name: str) -> None:
+def test_field_units_and_enums_match_pymavlink(name: str) -> None:
     for message_id, cls in dialect_module(name, 2).mavlink_map.items():
         fields = STANDARD[message_id].FIELDS
         assert [field.name for field in fields][: len(cls.fieldnames)] == cls.fieldnames
@@ -99,12 +99,12 @@ def test_units_and_enums_of_fields(name: str) -> None:
 
 
 def without(facts: dict[str, str], message_id: int) -> dict[str, str]:
-    """The facts of fields that our additions do not name."""
+    """Metadata of fields that the additions do not change."""
     return {field: fact for field, fact in facts.items() if (message_id, field) not in NAMED}
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_enums(name: str) -> None:
+def test_enums_match_pymavlink(name: str) -> None:
     for enum_name, entries in dialect_module(name, 2).enums.items():
         values = {value for value, entry in entries.items() if entry.name != f"{enum_name}_ENUM_END"}
         assert values <= {int(member) for member in STANDARD.enum(enum_name).__members__.values()}

@@ -1,4 +1,4 @@
-"""Messages of pymavlink as ours, and back; tests/dronekit/test_dronekit_messages.py goes through all of them."""
+"""Conversion of pymavlink messages; tests/dronekit/test_dronekit_messages.py covers all messages."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ from aerokit.mavlink.signing import Signing, SigningKey
 ATTITUDE = Frame.parse(FrameEncoder(1, 1).encode(messages.Attitude(7, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0)))
 
 
-def test_there_and_back() -> None:
+def test_pymavlink_message_round_trip() -> None:
     theirs = to_pymavlink(ATTITUDE)
     assert isinstance(theirs, ardupilotmega.MAVLink_attitude_message)
     assert (theirs.get_srcSystem(), theirs.roll, theirs.get_msgbuf()) == (1, 0.5, bytearray(ATTITUDE.raw))
     assert from_pymavlink(theirs) == messages.Attitude(7, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0)
 
 
-def test_its_time_and_dialect_are_the_programs() -> None:
+def test_to_pymavlink_timestamp_and_dialect() -> None:
     assert to_pymavlink(ATTITUDE)._timestamp == 0.0
     theirs = to_pymavlink(ATTITUDE, dialect=common, timestamp=12.5)
     assert theirs._timestamp == 12.5
     assert isinstance(theirs, common.MAVLink_attitude_message)
 
 
-def test_what_is_wrong_is_named() -> None:
+def test_from_pymavlink_error_names_field() -> None:
     with pytest.raises(InvalidArgument, match=r"COMMAND_LONG.command = 70000 .*0\.\.65535"):
         from_pymavlink(ardupilotmega.MAVLink_command_long_message(1, 1, 70000, 0, 0, 0, 0, 0, 0, 0, 0))
 
 
-def test_pymavlink_is_imported_when_it_is_used() -> None:
+def test_pymavlink_is_imported_on_first_use() -> None:
     modules = "aerokit.mavlink.pymavlink, aerokit.mavlink.pymavlink"
     program = f"import sys, {modules}; print('pymavlink' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert result.stdout == "False\n"
 
 
-def test_what_the_standard_has_not_is_checked_by_the_programs_dialect() -> None:
+def test_unknown_message_is_verified_by_program_dialect() -> None:
     theirs = matrixpilot.MAVLink_serial_udb_extra_f21_message(1, 2, 3, 4, 5, 6)
     raw = bytearray(theirs.pack(matrixpilot.MAVLink(None, srcSystem=1, srcComponent=1)))
     assert to_pymavlink(Frame.parse(bytes(raw)), dialect=matrixpilot).get_type() == "SERIAL_UDB_EXTRA_F21"
@@ -71,8 +71,8 @@ def test_what_the_standard_has_not_is_checked_by_the_programs_dialect() -> None:
         messages.SystemTime,
     ],
 )
-def test_arrays_and_texts_there_and_back(kind: type[Message]) -> None:
-    """Arrays of numbers, of bytes, texts, and messages with neither: all values, and a copy that is pymavlink's own."""
+def test_pymavlink_arrays_and_texts_round_trip(kind: type[Message]) -> None:
+    """Arrays of numbers and bytes, texts, and messages without either keep all values; copies too."""
     for how in ("zeros", "extremes", "random"):
         message = random_message(kind, random.Random(7), how)
         frame = Frame.parse(FrameEncoder(1, 1).encode(message))
@@ -86,20 +86,20 @@ def test_arrays_and_texts_there_and_back(kind: type[Message]) -> None:
         assert not hasattr(plain, "_frame")
 
 
-def test_the_payload_of_a_signed_frame_ends_before_its_signature() -> None:
+def test_pymavlink_payload_excludes_signature() -> None:
     encoder = FrameEncoder(1, 1)
     encoder.signing = Signing(SigningKey(bytes(range(32))))
     theirs = to_pymavlink(Frame.parse(encoder.encode(messages.Attitude(7, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0))))
     assert theirs.get_payload() == to_pymavlink(ATTITUDE).get_payload()
 
 
-def test_what_it_has_not_is_an_attribute_error() -> None:
+def test_pymavlink_missing_attribute_raises() -> None:
     with pytest.raises(AttributeError, match="'MAVLink_attitude_message' object has no attribute 'height'"):
         to_pymavlink(ATTITUDE).height  # noqa: B018
 
 
 @pytest.mark.parametrize(("target", "told"), [(9, 9), (0, 1), (None, 1)])
-def test_the_target_is_written_into_theirs_and_into_a_copy_of_ours(target: int | None, told: int) -> None:
+def test_from_pymavlink_sets_target_system(target: int | None, told: int) -> None:
     theirs: Any = ardupilotmega.MAVLink_command_long_message(1, 2, 400, 0, 1, 0, 0, 0, 0, 0, 0)
     copied: Any = from_pymavlink(theirs, target)
     assert (copied.target_system, copied.target_component, theirs.target_system) == (told, 2, told)
@@ -116,7 +116,7 @@ def looks_like(name: str, **fields: Any) -> Any:
     return SimpleNamespace(get_type=lambda: name, **fields)
 
 
-def test_anything_with_a_type_and_fields_is_a_message() -> None:
+def test_from_pymavlink_accepts_any_object_with_fields() -> None:
     numbers = {
         "time_boot_ms": Decimal("6.6"),
         "roll": Decimal("0.5"),
@@ -131,8 +131,8 @@ def test_anything_with_a_type_and_fields_is_a_message() -> None:
     assert from_pymavlink(text).encode()[51:53] == b"\7\0"
 
 
-def test_of_pymavlinks_classes_an_id_is_no_field_of_version_1() -> None:
-    """Each of them has one, and STATUSTEXT has an extension field of this name."""
+def test_from_pymavlink_does_not_read_class_id() -> None:
+    """Every pymavlink class has an attribute ``id``, and STATUSTEXT has an extension field of this name."""
     theirs = version_1.MAVLink_statustext_message(3, b"hello\0")
     assert from_pymavlink(theirs) == messages.Statustext(3, "hello")
     assert from_pymavlink(ardupilotmega.MAVLink_statustext_message(3, b"hello", 8, 1)) == messages.Statustext(
@@ -140,7 +140,7 @@ def test_of_pymavlinks_classes_an_id_is_no_field_of_version_1() -> None:
     )
 
 
-def test_texts_are_bytes_or_text_and_the_later_one_counts() -> None:
+def test_from_pymavlink_reads_latest_text() -> None:
     theirs: Any = ardupilotmega.MAVLink_statustext_message(3, "gr\xfc\xdf".encode())
     assert from_pymavlink(theirs) == messages.Statustext(3, "gr\xfc\xdf")
     theirs.text = "changed\0"
@@ -150,7 +150,7 @@ def test_texts_are_bytes_or_text_and_the_later_one_counts() -> None:
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
-        (object(), "is no MAVLink message"),
+        (object(), "is not a MAVLink message"),
         (looks_like("ATTITUDE", time_boot_ms=1), "ATTITUDE.roll cannot be sent: it is missing"),
         (looks_like("PLAY_TUNE", target_system=1, target_component=1, tune=5), "PLAY_TUNE.tune = 5"),
         (
@@ -178,23 +178,23 @@ def test_texts_are_bytes_or_text_and_the_later_one_counts() -> None:
             looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data="ab"),
             "GPS_INJECT_DATA.data = 'ab' cannot be sent: must be a sequence",
         ),
-        (ardupilotmega.MAVLink_unknown(60_000, b""), "MAVLink_unknown is nothing that can be sent"),
+        (ardupilotmega.MAVLink_unknown(60_000, b""), "MAVLink_unknown is not a message that can be sent"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_cannot_be_sent_is_named(given: Any, complaint: str) -> None:
+def test_from_pymavlink_rejects_invalid_messages(given: Any, complaint: str) -> None:
     with pytest.raises(InvalidArgument, match=complaint):
         from_pymavlink(given)
 
 
 @pytest.mark.parametrize("data", [[1, 2], b"\1\2", bytearray(b"\1\2"), memoryview(b"\1\2"), (1, Decimal(2))])
-def test_bytes_in_any_form(data: Any) -> None:
+def test_from_pymavlink_accepts_bytes_in_any_form(data: Any) -> None:
     given = looks_like("GPS_INJECT_DATA", target_system=1, target_component=1, len=2, data=data)
     assert from_pymavlink(given) == messages.GpsInjectData(1, 1, 2, b"\1\2")
 
 
 @pytest.mark.parametrize("value", [b"\0\x80\xff\0", "long text"])
-def test_numbers_in_char_arrays_come_through_as_bytes(value: bytes | str) -> None:
+def test_from_pymavlink_keeps_bytes_in_char_arrays(value: bytes | str) -> None:
     theirs: Any = ardupilotmega.MAVLink_param_ext_set_message(1, 100, b"CAM_EV", b"", 9)
     if isinstance(value, bytes):
         theirs = ardupilotmega.MAVLink_param_ext_set_message(1, 100, b"CAM_EV", value, 9)

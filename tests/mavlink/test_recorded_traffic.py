@@ -1,4 +1,4 @@
-"""Every recorded frame that pymavlink accepts is accepted here, with the same fields."""
+"""Every recorded frame that pymavlink accepts is decoded with the same fields."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COUNTS = {
     "ardupilot-rover": 17_446,
     "px4-quad": 35_528,
 }
-"""Frames in the whole flights, by their README."""
+"""Number of frames in each complete flight, from its README."""
 SHORT_COUNTS = {"ardupilot-copter": 2_820, "px4-quad": 2_388}
 KINDS = {"ardupilot-copter": 48, "ardupilot-plane": 50, "ardupilot-rover": 45, "px4-quad": 44}
 BOOT = "ardupilot-copter-serial-boot.raw"
@@ -34,7 +34,7 @@ NOT_IN_PYMAVLINK = {
     m.Event.ID,
     m.CurrentEventSequence.ID,
 }
-"""PX4 sends them; MAVLink's own definitions have them."""
+"""Messages that PX4 sends and only MAVLink's own definitions have."""
 
 
 @cache
@@ -51,7 +51,7 @@ def message_id(raw: bytes) -> int:
 
 
 @pytest.mark.parametrize("flight", sampled(FLIGHTS, 3))
-def test_frames_one_by_one_are_what_pymavlink_reads(flight: str) -> None:
+def test_recorded_frames_match_pymavlink(flight: str) -> None:
     added = added_peer()
     framer, peers = Framer(), [module.MAVLink(None) for module in (added, ardupilotmega, development)]
     for raw in records(flight):
@@ -68,7 +68,7 @@ def is_known(theirs: Any) -> bool:
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_counts(flight: str) -> None:
+def test_recorded_frame_counts(flight: str) -> None:
     raws = records(flight)
     framer = Framer()
     seen = sum(len(framer.receive(raw)) for raw in raws)
@@ -83,7 +83,7 @@ def test_counts(flight: str) -> None:
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_as_one_stream_in_pieces_of_any_size(flight: str) -> None:
+def test_recorded_stream_in_pieces(flight: str) -> None:
     raws = records(flight)
     stream, framer, chance = b"".join(raws), Framer(), random.Random(flight)
     found: list[Frame] = []
@@ -97,7 +97,7 @@ def test_as_one_stream_in_pieces_of_any_size(flight: str) -> None:
 
 
 @pytest.mark.parametrize("size", [1, 13, 64, 4096])
-def test_a_serial_port_at_boot_begins_with_text(size: int) -> None:
+def test_recorded_serial_boot_text_is_skipped(size: int) -> None:
     path = recording(BOOT)
     stream = path.read_bytes() if size > 1 else path.read_bytes()[:4096]
     framer = Framer()
@@ -105,5 +105,5 @@ def test_a_serial_port_at_boot_begins_with_text(size: int) -> None:
     assert len(frames) == (33_760 if len(stream) > 4096 else 106)
     assert [frame.sequence for frame in frames[:100]] == list(range(100))
     assert STANDARD.decode(frames[0]).to_dict()["text"] == "RCInput: decoding UDP (Pulses)"
-    assert framer.statistics.bad_bytes >= 152  # the text before the first frame
+    assert framer.statistics.bad_bytes >= 152  # the text in front of the first frame
     assert framer.statistics.bad_crcs == 0

@@ -1,4 +1,4 @@
-"""Signatures: golden bytes, both ways with pymavlink, and what a receiver must refuse."""
+"""Signatures: known bytes, interoperability with pymavlink, and what receivers must reject."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ OTHER = SigningKey(bytes(range(32)))
 HEARTBEAT = Heartbeat(2, 3, 81, 0, 4)
 NOW = 1_790_000_000.0
 STAMP = 36_992_960_000_000
-"""``NOW`` as a time stamp."""
+"""``NOW`` as a timestamp."""
 GOLDEN = bytes.fromhex("fd09010007ffbe000000000000000203510403749c0500703d18a521409a061af9bb")
-"""HEARTBEAT as 255/190, number 7, link 5, at `NOW`, with `KEY`: made by pymavlink 2.4."""
+"""HEARTBEAT from 255/190, sequence 7, link 5, at `NOW`, signed with `KEY` by pymavlink 2.4."""
 
 
 def signed(signing: Signing, *, system_id: int = 1, now: float = 0.0, sequence: int = 0) -> bytes:
@@ -49,7 +49,7 @@ def pymavlink(key: SigningKey = KEY, *, link_id: int = 0, timestamp: int = 0) ->
 # ------------------------------------------------------------------------------------------- keys
 
 
-def test_a_passphrase_is_hashed_as_ground_stations_do() -> None:
+def test_passphrase_hash_matches_ground_stations() -> None:
     assert KEY.secret == hashlib.sha256(b"a long secret").digest()
     assert SigningKey.from_text(" a long secret\n") == KEY
     assert SigningKey.from_text(KEY.secret.hex().upper()) == KEY
@@ -59,12 +59,12 @@ def test_a_passphrase_is_hashed_as_ground_stations_do() -> None:
 
 
 @pytest.mark.parametrize("secret", [b"", bytes(31), bytes(32), bytes(33), "a" * 32])
-def test_what_is_no_key_is_refused(secret: Any) -> None:
+def test_invalid_key_is_rejected(secret: Any) -> None:
     with pytest.raises(InvalidArgument, match="key"):
         SigningKey(secret)
 
 
-def test_no_text_shows_the_key() -> None:
+def test_key_is_never_shown() -> None:
     signing = Signing(KEY)
     for text in (repr(KEY), str(KEY), repr(signing), f"{signing}"):
         assert KEY.fingerprint in text
@@ -73,18 +73,16 @@ def test_no_text_shows_the_key() -> None:
     assert OTHER.fingerprint != KEY.fingerprint
 
 
-@pytest.mark.parametrize(
-    "options", [{"link_id": -1}, {"link_id": 256}, {"timestamp": -1}, {"timestamp": 1 << 48}]
-)
-def test_options_out_of_range(options: Any) -> None:
+@pytest.mark.parametrize("options", [{"link_id": -1}, {"link_id": 256}, {"timestamp": -1}, {"timestamp": 1 << 48}])
+def test_signing_rejects_options_out_of_range(options: Any) -> None:
     with pytest.raises(InvalidArgument, match=next(iter(options))):
         Signing(KEY, **options)
 
 
-# ------------------------------------------------------------------------- golden bytes, both ways
+# ---------------------------------------------------------------- known bytes and interoperability
 
 
-def test_golden_bytes() -> None:
+def test_signature_golden_bytes() -> None:
     assert timestamp_at(NOW) == STAMP
     encoder = FrameEncoder(255, 190)
     encoder.sequence = 7
@@ -92,14 +90,14 @@ def test_golden_bytes() -> None:
     assert encoder.encode(HEARTBEAT, NOW) == GOLDEN
 
 
-def test_pymavlink_makes_the_same_bytes() -> None:
+def test_signature_matches_pymavlink() -> None:
     mav = pymavlink(link_id=5, timestamp=STAMP)
     mav.seq = 7
     message = mav.heartbeat_encode(2, 3, 81, 0, 4)
     assert message.pack(mav) == GOLDEN
 
 
-def test_pymavlink_accepts_what_we_sign_and_we_what_it_signs() -> None:
+def test_signatures_are_compatible_with_pymavlink() -> None:
     mav = pymavlink(timestamp=STAMP)
     signing = Signing(KEY)
     for number in range(5):
@@ -109,7 +107,7 @@ def test_pymavlink_accepts_what_we_sign_and_we_what_it_signs() -> None:
         assert signing.check(framed(theirs), NOW) is None
 
 
-def test_pymavlink_refuses_another_key() -> None:
+def test_pymavlink_rejects_other_key() -> None:
     mav = pymavlink(timestamp=STAMP)
     with pytest.raises(peer.MAVError, match="signature"):
         mav.parse_char(signed(Signing(OTHER), now=NOW))
@@ -123,12 +121,12 @@ def test_version_1_is_not_signed() -> None:
     assert Signing(KEY).check(frame) is Refusal.UNSIGNED
 
 
-# ------------------------------------------------------------------------------------ time stamps
+# ------------------------------------------------------------------------------------- timestamps
 
 
 @given(st.lists(st.floats(0, 4e9), max_size=20))
 @example([NOW, 0.0, NOW - 100, NOW + 1, NOW])
-def test_time_stamps_always_rise(clock: list[float]) -> None:
+def test_timestamps_always_increase(clock: list[float]) -> None:
     signing = Signing(KEY)
     stamps = [int.from_bytes(signing.sign(b"frame", now)[1:7], "little") for now in clock]
     assert stamps == sorted(set(stamps))
@@ -136,7 +134,7 @@ def test_time_stamps_always_rise(clock: list[float]) -> None:
     assert signing.timestamp == (stamps[-1] + 1 if stamps else 0)
 
 
-def test_a_time_stamp_that_was_kept_is_later_than_a_clock_that_was_not() -> None:
+def test_stored_timestamp_precedes_clock() -> None:
     before = Signing(KEY)
     signed(before, now=NOW)
     after = Signing(KEY, timestamp=before.timestamp)
@@ -147,37 +145,37 @@ def test_a_time_stamp_that_was_kept_is_later_than_a_clock_that_was_not() -> None
     assert listener.accepts(framed(signed(after, now=0.0)))
 
 
-def test_what_was_heard_moves_our_time_stamps_on() -> None:
+def test_received_timestamps_advance_ours() -> None:
     ahead, listener = Signing(KEY, timestamp=STAMP), Signing(KEY)
     assert listener.accepts(framed(signed(ahead)), NOW - 1000)
     assert listener.timestamp == STAMP
     assert framed(signed(listener)).signature[1:7] == STAMP.to_bytes(6, "little")
 
 
-def test_an_end_of_all_time_stamps() -> None:
+def test_exhausted_timestamps_raise() -> None:
     signing = Signing(KEY, timestamp=(1 << 48) - 1)
     signed(signing)
-    with pytest.raises(InvalidArgument, match="used up"):
+    with pytest.raises(InvalidArgument, match="exhausted"):
         signed(signing)
 
 
-# --------------------------------------------------------------------------------------- refusals
+# -------------------------------------------------------------------------------- rejected frames
 
 
 @given(st.integers(0, 8 * len(GOLDEN) - 1))
-def test_any_flipped_bit_is_refused(bit: int) -> None:
+def test_flipped_bit_is_rejected(bit: int) -> None:
     raw = bytearray(GOLDEN)
     raw[bit // 8] ^= 1 << bit % 8
     listener = Signing(KEY)
     assert not any(listener.accepts(frame) for frame in Framer().receive(bytes(raw)))
-    # a sender who knows the format can make the checksum right, but not the signature
+    # anybody can compute the checksum, but not the signature
     if 1 <= bit // 8 < len(GOLDEN) and raw[0] == 0xFD and raw[1] == GOLDEN[1] and raw[2] == 1:
         assert listener.check(Frame.parse(bytes(raw))) is Refusal.WRONG_SIGNATURE
     assert listener.accepts(framed(GOLDEN))
 
 
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=40))
-def test_each_frame_of_a_sender_once_and_in_order(order: list[int]) -> None:
+def test_replayed_frames_are_rejected(order: list[int]) -> None:
     sender, listener = Signing(KEY), Signing(KEY)
     frames = [framed(signed(sender, sequence=number)) for number in range(10)]
     newest = -1
@@ -188,7 +186,7 @@ def test_each_frame_of_a_sender_once_and_in_order(order: list[int]) -> None:
     assert listener.refused[Refusal.REPLAYED] == listener.frames_refused
 
 
-def test_senders_and_links_have_time_stamps_of_their_own() -> None:
+def test_timestamps_are_kept_for_each_stream() -> None:
     listener = Signing(KEY)
     assert listener.accepts(framed(signed(Signing(KEY, timestamp=100))))
     assert listener.accepts(framed(signed(Signing(KEY, timestamp=50, link_id=1))))
@@ -197,13 +195,13 @@ def test_senders_and_links_have_time_stamps_of_their_own() -> None:
 
 
 @pytest.mark.parametrize(("behind", "expected"), [(6_000_000, None), (6_000_001, Refusal.TOO_OLD)])
-def test_a_new_sender_may_be_a_minute_behind(behind: int, expected: Refusal | None) -> None:
+def test_new_sender_may_lag_one_minute(behind: int, expected: Refusal | None) -> None:
     frame = framed(signed(Signing(KEY, timestamp=STAMP - behind)))
     assert Signing(KEY).check(frame, NOW) is expected
     assert Signing(KEY, timestamp=STAMP).check(frame) is expected
 
 
-def test_what_another_link_has_heard_cannot_be_played_on_this_one() -> None:
+def test_replay_from_other_link_is_rejected() -> None:
     first = Signing(KEY)
     second = first.for_link(1)
     frame = framed(signed(Signing(KEY)))
@@ -212,7 +210,7 @@ def test_what_another_link_has_heard_cannot_be_played_on_this_one() -> None:
     assert (first.link_id, second.link_id, second.key) == (0, 1, KEY)
 
 
-def test_unsigned_frames() -> None:
+def test_unsigned_frames_are_rejected_unless_allowed() -> None:
     plain = framed(FrameEncoder(1, 1).encode(HEARTBEAT))
     radio = framed(FrameEncoder(51, 68).encode(RadioStatus(1, 2, 3, 4, 5, 6, 7)))
     signing = Signing(KEY)
@@ -225,14 +223,14 @@ def test_unsigned_frames() -> None:
     assert trusting.refused == {**dict.fromkeys(Refusal, 0), Refusal.UNSIGNED: 1}
 
 
-def test_a_wrong_signature_moves_no_time_stamp() -> None:
+def test_invalid_signature_does_not_advance_timestamp() -> None:
     listener = Signing(KEY)
     assert not listener.accepts(framed(signed(Signing(OTHER, timestamp=STAMP))))
     assert listener.timestamp == 0
     assert listener.accepts(framed(signed(Signing(KEY))))
 
 
-def test_a_trimmed_payload_is_signed_as_it_is_on_the_wire() -> None:
+def test_trimmed_payload_is_signed_as_sent() -> None:
     encoder = FrameEncoder(1, 1)
     encoder.signing = Signing(KEY)
     frame = framed(encoder.encode(ParamValue("", 0.0, 0, 0, 0)))
@@ -240,8 +238,8 @@ def test_a_trimmed_payload_is_signed_as_it_is_on_the_wire() -> None:
     assert Signing(KEY).accepts(frame)
 
 
-def test_streams_that_are_remembered_are_bounded() -> None:
-    """Whoever has the key may make up senders; the table of them does not grow beyond 1024."""
+def test_remembered_streams_are_bounded() -> None:
+    """A sender with the key may invent system ids; the table of senders is limited to 1024."""
     listener = Signing(KEY)
     for number in range(1100):
         sender = Signing(KEY, timestamp=100 + number, link_id=number // 250)

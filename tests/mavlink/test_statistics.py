@@ -1,4 +1,4 @@
-"""What is counted of one sender, also where a second one has its ids: stories told number by number, and by seeds."""
+"""Statistics of one sender, including a second sender with the same ids."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from aerokit.mavlink.statistics import IN_ORDER, LATE, OTHERS, SourceStatistics
 
 Frames = Iterable[tuple[float, int]]
-"""(when, sequence number)"""
+"""Time and sequence number."""
 
 
-def heard(source: SourceStatistics, frames: Frames) -> list[int]:
-    """As a framer does; the verdicts."""
+def verdicts_of(source: SourceStatistics, frames: Frames) -> list[int]:
+    """Return the verdicts, as a framer does."""
     verdicts = []
     for at, sequence in frames:
         if source.expected & 0xFF == sequence:
@@ -31,27 +31,25 @@ def numbers(begin: int, end: int, at: float = 0.0, step_s: float = 0.01) -> list
 
 @pytest.fixture
 def source() -> SourceStatistics:
-    """Fifty frames have come, and three of somebody else, who says 100 next; then the sender again."""
+    """Fifty frames, then three of another sender whose last number is 100, then the first sender again."""
     source = SourceStatistics(1, 1, 0)
-    heard(source, [*numbers(0, 50), (0.6, 97), (0.61, 98), (0.62, 99), *numbers(50, 53, 0.7)])
+    verdicts_of(source, [*numbers(0, 50), (0.6, 97), (0.61, 98), (0.62, 99), *numbers(50, 53, 0.7)])
     assert (source.received, source.lost, source.expected & 0xFF) == (56, 0, 53)
     return source
 
 
-def test_a_frame_of_somebody_else_is_none_that_was_missing(source: SourceStatistics) -> None:
-    """He comes to a number that the sender has lost."""
-    heard(source, numbers(53, 110, 0.8))
-    heard(source, numbers(111, 130, 1.4))
+def test_frame_of_other_sender_does_not_fill_gap(source: SourceStatistics) -> None:
+    """The other sender reaches a number that the first one lost."""
+    verdicts_of(source, numbers(53, 110, 0.8))
+    verdicts_of(source, numbers(111, 130, 1.4))
     assert source.lost == 1
-    assert heard(source, [(1.6, number) for number in (100, 103, 106, 109, 110)]) == [OTHERS] * 5
+    assert verdicts_of(source, [(1.6, number) for number in (100, 103, 106, 109, 110)]) == [OTHERS] * 5
     assert source.lost == 1
 
 
 @pytest.mark.parametrize(("after_s", "verdict"), [(1.5, OTHERS), (1.6, IN_ORDER)])
-def test_the_other_is_the_sender_when_this_one_is_over(
-    source: SourceStatistics, after_s: float, verdict: int
-) -> None:
-    assert heard(source, [(1.0, 100), (1.0 + after_s, 101)]) == [OTHERS, verdict]
+def test_other_stream_takes_over_after_timeout(source: SourceStatistics, after_s: float, verdict: int) -> None:
+    assert verdicts_of(source, [(1.0, 100), (1.0 + after_s, 101)]) == [OTHERS, verdict]
 
 
 class _Sender:
@@ -59,8 +57,8 @@ class _Sender:
         self._chance, self.number = chance, chance.randrange(256)
         self._loss = chance.choice((0.0, 0.05, 0.3))
 
-    def speaks(self) -> list[int]:
-        """A frame or some, lost, doubled, overtaken, after a reboot or in a burst."""
+    def next_numbers(self) -> list[int]:
+        """Append frames: one or several, lost, doubled, reordered, after a reboot, or in a burst."""
         chance, begin = self._chance, self.number
         self.number += chance.choice((1, 1, 1, 2, 3, 8))
         frames = [each & 0xFF for each in range(begin, self.number) if chance.random() >= self._loss]
@@ -73,21 +71,21 @@ class _Sender:
         return frames
 
 
-def heard_by_chance(seed: int) -> str:
-    """How many verdicts of each kind, how many frames are lost, and how long two senders were told."""
+def random_summary(seed: int) -> str:
+    """Return the number of verdicts of each kind, the lost frames, and how long two senders were reported."""
     chance = random.Random(seed)
     senders = [_Sender(chance) for _ in range(chance.choice((1, 2, 2, 3)))]
     source, now, verdicts, doubles = SourceStatistics(1, 1, senders[0].number), 0.0, [0, 0, 0], 0
     for _ in range(400):
         now += chance.choice((0.01, 0.01, 0.1, 0.4, 2.0 if chance.random() < 0.1 else 0.02))
-        for verdict in heard(source, [(now, each) for each in chance.choice(senders).speaks()]):
+        for verdict in verdicts_of(source, [(now, each) for each in chance.choice(senders).next_numbers()]):
             verdicts[verdict] += 1
-        doubles += source.is_double(now)
+        doubles += source.has_duplicates(now)
     return " ".join(map(str, (*verdicts, source.received, source.lost, doubles)))
 
 
 @pytest.mark.parametrize(
-    ("seed", "told"),
+    ("seed", "summary"),
     [
         (0, "415 341 153 909 427 75"),
         (1, "495 79 430 1004 15 203"),
@@ -115,14 +113,19 @@ def heard_by_chance(seed: int) -> str:
         (23, "575 85 405 1065 48 285"),
     ],
 )
-def test_what_is_heard_by_chance_is_counted_as_ever(seed: int, told: str) -> None:
-    """IN_ORDER, LATE, OTHERS, received, lost, doubles: kept, so that a change of any rule shows."""
-    assert heard_by_chance(seed) == told
+def test_random_traffic_statistics_are_unchanged(seed: int, summary: str) -> None:
+    """Recorded counts (IN_ORDER, LATE, OTHERS, received, lost, duplicates) show any change of the rules."""
+    assert random_summary(seed) == summary
 
 
-def test_frames_that_were_skipped_and_come_late_are_not_taken_off_twice() -> None:
+def test_late_frames_are_subtracted_once() -> None:
     source = SourceStatistics(1, 1, 0)
-    heard(source, numbers(0, 50))
+    verdicts_of(source, numbers(0, 50))
     frames = (100, 60, 61, 50, 51, 52, 53)
-    assert heard(source, [(0.6, each) for each in frames]) == [IN_ORDER, *[LATE] * 4, IN_ORDER, IN_ORDER]
+    assert verdicts_of(source, [(0.6, each) for each in frames]) == [
+        IN_ORDER,
+        *[LATE] * 4,
+        IN_ORDER,
+        IN_ORDER,
+    ]
     assert (source.lost, source.loss) == (0, 0.0)

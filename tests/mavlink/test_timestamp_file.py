@@ -1,4 +1,4 @@
-"""``Signing(key, keep=path)``: a restart cannot be replayed."""
+"""``Signing(key, keep=path)``: after a restart, old frames cannot be replayed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aerokit._internal.files import write_whole
+from aerokit._internal.files import write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink import Frame, FrameEncoder, Framer
 from aerokit.mavlink import signing as timestamp_file
@@ -29,11 +29,11 @@ def frame_of(signing: Signing, now: float = NO_CLOCK) -> Frame:
     return frame
 
 
-def why_not_kept(signing: Signing) -> int | None:
+def keep_errno(signing: Signing) -> int | None:
     return None if signing.keep_error is None else signing.keep_error.errno
 
 
-def test_what_was_heard_before_a_restart_is_refused_after_it(path: Path) -> None:
+def test_frames_before_restart_are_rejected(path: Path) -> None:
     vehicle = Signing(KEY, timestamp=30 * ONE_MINUTE)
     old = frame_of(vehicle)
     assert Signing(KEY, keep=path).accepts(old)
@@ -45,7 +45,7 @@ def test_what_was_heard_before_a_restart_is_refused_after_it(path: Path) -> None
         assert again.check(old) is Refusal.TOO_OLD
 
 
-def test_what_is_signed_after_a_restart_is_later_than_all_before(path: Path) -> None:
+def test_timestamps_increase_across_restart(path: Path) -> None:
     ear = Signing(KEY)
     for _ in range(5):
         signing = Signing(KEY, keep=path)
@@ -53,17 +53,15 @@ def test_what_is_signed_after_a_restart_is_later_than_all_before(path: Path) -> 
             assert ear.accepts(frame_of(signing))
 
 
-def test_the_file_is_ahead_of_every_frame_and_written_rarely(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_timestamp_file_is_ahead_and_rarely_written(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writes: list[str] = []
-    write = write_whole
+    write = write_atomically
 
     def counting(target: Path, text: str) -> None:
         writes.append(text)
         write(target, text)
 
-    monkeypatch.setattr(timestamp_file, "write_whole", counting)
+    monkeypatch.setattr(timestamp_file, "write_atomically", counting)
     signing, now = Signing(KEY, keep=path), 1_700_000_000.0
     for count in range(600):
         frame = frame_of(signing, now + count / 10)
@@ -73,20 +71,20 @@ def test_the_file_is_ahead_of_every_frame_and_written_rarely(
     assert int(path.read_text()) - signing.timestamp <= ONE_MINUTE // 2
 
 
-def test_other_links_with_the_key_share_the_file(path: Path) -> None:
+def test_links_with_same_key_share_timestamp_file(path: Path) -> None:
     other = Signing(KEY, keep=path).for_link(1)
     frame_of(other, 1_700_000_000.0)
     assert Signing(KEY, keep=path).timestamp > other.timestamp - 1
 
 
 @pytest.mark.parametrize("text", ["", "abc", "-5", "1.5", str(1 << 48), "9" * 5000, "\u0661"])
-def test_another_file_is_not_taken_for_one(path: Path, text: str) -> None:
+def test_other_file_is_rejected_as_timestamp_file(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(FileFormatError, match="holds no time stamp"):
+    with pytest.raises(FileFormatError, match="does not contain a signing timestamp"):
         Signing(KEY, keep=path)
 
 
-def test_a_time_stamp_has_48_bits_all_of_which_may_be_set(path: Path) -> None:
+def test_timestamp_must_fit_48_bits(path: Path) -> None:
     last = (1 << 48) - 1
     assert Signing(KEY, timestamp=last).timestamp == last
     for wrong in (-1, 1 << 48):
@@ -96,31 +94,29 @@ def test_a_time_stamp_has_48_bits_all_of_which_may_be_set(path: Path) -> None:
     assert Signing(KEY, keep=path).timestamp == last
 
 
-def test_a_place_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:
+def test_unwritable_timestamp_file_raises(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="stamp"):
         Signing(KEY, keep=tmp_path / "missing" / "stamp")
     with pytest.raises(OSError):  # noqa: PT011
         Signing(KEY, keep=tmp_path)
 
 
-def test_a_disk_that_is_full_later_does_not_stop_a_flight(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_timestamp_write_error_is_stored(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     signing = Signing(KEY, keep=path)
 
     def full(target: Path, text: str) -> None:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr(timestamp_file, "write_whole", full)
+        broken.setattr(timestamp_file, "write_atomically", full)
         frame_of(signing, 1_700_000_000.0)
-        assert why_not_kept(signing) == 28
+        assert keep_errno(signing) == 28
     frame_of(signing, 1_700_000_100.0)
-    assert why_not_kept(signing) is None
+    assert keep_errno(signing) is None
     assert Signing(KEY).keep_error is None
 
 
-def test_the_table_of_senders_is_bounded() -> None:
+def test_sender_table_is_bounded() -> None:
     signing, now = Signing(KEY), 1_700_000_000.0
     for link_id in range(8):
         for system_id in range(1, 256):

@@ -1,4 +1,4 @@
-"""Telemetry logs: what is written is read again, and damage costs the records it is in."""
+"""Telemetry logs: writing, reading, and damaged files."""
 
 from __future__ import annotations
 
@@ -37,43 +37,43 @@ def read(data: bytes) -> Records:
 
 
 @given(good_frames)
-def test_round_trip(frames: list[bytes]) -> None:
+def test_tlog_round_trip(frames: list[bytes]) -> None:
     assert read(written(stamped(frames))) == stamped(frames)
 
 
-def test_the_bytes() -> None:
+def test_tlog_golden_bytes() -> None:
     raw = some_frames(1)[0]
     assert written([(1.5, raw)]) == (1_500_000).to_bytes(8, "big") + raw
 
 
-def test_microseconds_are_kept() -> None:
+def test_tlog_keeps_microseconds() -> None:
     raw = some_frames(1)[0]
     assert read(written([(1_700_000_000.123456, raw)])) == [(1_700_000_000.123456, raw)]
 
 
-def test_clocks_that_were_never_set() -> None:
+def test_tlog_with_unset_clock() -> None:
     records = [(number / 8, raw) for number, raw in enumerate(some_frames(5))]
     assert read(written(records)) == records
 
 
-def test_zeros_in_a_frame_that_was_cut_off_are_no_time_stamp() -> None:
-    # 0xFE and 46 are the head of a MAVLink 1 frame that would end where the file does, behind eight bytes near zero
+def test_tlog_zeros_in_truncated_frame_are_not_timestamp() -> None:
+    # 0xFE and 46 look like a MAVLink 1 frame that ends with the file, after eight bytes near zero
     raw = FrameEncoder(1, 1).encode(V2Extension(0, 85, 0, 0x2EFE, bytes(range(1, 250))))
     assert read(written(stamped([raw]))[:72]) == []
 
 
-def test_unknown_and_signed_frames_are_kept() -> None:
+def test_tlog_keeps_unknown_and_signed_frames() -> None:
     frames = [unknown(), *some_frames(2)]
     assert read(written(stamped(frames))) == stamped(frames)
 
 
-def test_an_empty_file() -> None:
+def test_tlog_empty_file() -> None:
     assert read(b"") == []
     assert read(b"\0" * 7) == []
 
 
 @given(good_frames, st.integers(0, 4000))
-def test_a_file_that_was_cut_off(frames: list[bytes], left: int) -> None:
+def test_tlog_truncated_file(frames: list[bytes], left: int) -> None:
     records = stamped(frames)
     data = written(records)
     left %= len(data)
@@ -85,8 +85,8 @@ def test_a_file_that_was_cut_off(frames: list[bytes], left: int) -> None:
 
 
 @given(st.lists(st.tuples(good_frames, noise), min_size=1, max_size=3))
-def test_noise_between_records(parts: list[tuple[list[bytes], bytes]]) -> None:
-    """The recorder was stopped in the middle and began again: the same file goes on."""
+def test_tlog_skips_noise_between_records(parts: list[tuple[list[bytes], bytes]]) -> None:
+    """A recorder stopped in the middle of a record continues the same file."""
     records: Records = []
     data = b""
     for frames, garbage in parts:
@@ -101,13 +101,13 @@ def test_noise_between_records(parts: list[tuple[list[bytes], bytes]]) -> None:
     assert missing <= 2 * len(parts), "noise hides at most its neighbours"
 
 
-def test_files_put_together() -> None:
+def test_tlog_concatenated_files() -> None:
     first, second = stamped(some_frames(5)), stamped(some_frames(7, seed=2))
     assert read(written(first)[:-5] + written(second)) in (first[:-1] + second, first[:-1] + second[1:])
     assert read(written(first) + written(second)) == first + second
 
 
-def test_appending_to_an_open_file(tmp_path: Path) -> None:
+def test_tlog_append_to_open_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     first, second = stamped(some_frames(3)), stamped(some_frames(3, seed=2))
     path.write_bytes(written(first))
@@ -121,7 +121,7 @@ def test_appending_to_an_open_file(tmp_path: Path) -> None:
     assert list(read_tlog(path)) == first + second
 
 
-def test_a_file_of_its_own_is_begun_anew_and_closed(tmp_path: Path) -> None:
+def test_tlog_writer_replaces_and_closes_own_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"old")
     with TlogWriter(str(path)) as writer:
@@ -133,7 +133,7 @@ def test_a_file_of_its_own_is_begun_anew_and_closed(tmp_path: Path) -> None:
         writer.write(b"x", 1.0)
 
 
-def test_a_reader_that_stops_early_closes_the_file(tmp_path: Path) -> None:
+def test_tlog_reader_closes_file_early(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(written(stamped(some_frames(5))))
     records = read_tlog(path)
@@ -142,29 +142,29 @@ def test_a_reader_that_stops_early_closes_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("when", [-1.0, 1.9e13, 1e14])
-def test_time_stamps_must_fit(when: float) -> None:
+def test_tlog_rejects_invalid_timestamp(when: float) -> None:
     with pytest.raises(InvalidArgument, match=r"timestamp_s = .* must be seconds since 1970"):
         TlogWriter(io.BytesIO()).write(b"", when)
 
 
-def test_a_time_stamp_may_have_all_its_bits() -> None:
+def test_tlog_accepts_largest_timestamp() -> None:
     file = io.BytesIO()
     TlogWriter(file).write(b"x", 1.8e13)
     assert file.getvalue() == int(1.8e19).to_bytes(8, "big") + b"x"
 
 
-def test_a_missing_file_is_an_os_error(tmp_path: Path) -> None:
+def test_tlog_missing_file_raises_os_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         next(read_tlog(tmp_path / "no.tlog"))
 
 
 @pytest.mark.parametrize("flight", ["ardupilot-copter", "px4-quad"])
-def test_a_recording_written_again_is_the_same_file(flight: str) -> None:
+def test_tlog_rewritten_recording_is_identical(flight: str) -> None:
     path = recording(f"{flight}.tlog")
     assert written(list(read_tlog(path))) == path.read_bytes()
 
 
-def test_pymavlink_reads_what_we_write(tmp_path: Path) -> None:
+def test_pymavlink_reads_our_tlog(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     frames = some_frames(20, versions=(2,))
     path.write_bytes(written(stamped(frames)))

@@ -1,4 +1,4 @@
-"""Random messages of every kind, ours and pymavlink's of the same fields, and how to compare the two."""
+"""Random messages of every class, the same messages in pymavlink, and comparison of the two."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 PEERS = ("ardupilotmega", "development")
-"""Pymavlink's dialects which together know every message of `STANDARD` but those of our additions."""
+"""Pymavlink dialects that together have every message of `STANDARD` except our additions."""
 
 _BITS = {"int8_t": 7, "uint8_t": 8, "int16_t": 15, "uint16_t": 16, "int32_t": 31, "uint32_t": 32} | {
     "int64_t": 63,
@@ -39,14 +39,14 @@ _LETTERS = "abcXYZ019 _-%µß→"
 
 
 def samples(message_class: type[Message], count: int = 6) -> Iterator[Message]:
-    """Messages with random fields, always the same ones; the first has nothing but zeros, the second the extremes."""
+    """Return reproducible random messages; the first has only zeros, the second the extremes."""
     chance = random.Random(message_class.ID)
     for number in range(count):
         yield random_message(message_class, chance, ("zeros", "extremes")[number] if number < 2 else "random")
 
 
 def random_message(message_class: type[Message], chance: random.Random, kind: str = "random") -> Message:
-    """A message whose fields are zeros, at their extremes, or random."""
+    """Return a message whose fields are zero, extreme or random."""
     return message_class(**{field.name: _value(field, chance, kind) for field in message_class.FIELDS})
 
 
@@ -64,9 +64,7 @@ def _number(kind: str, chance: random.Random, how: str) -> Any:
     if how == "zeros":
         return 0
     if kind in ("float", "double"):
-        value = (
-            chance.choice(_ODD_FLOATS) if how == "extremes" or chance.random() < 0.3 else chance.gauss(0, 1e3)
-        )
+        value = chance.choice(_ODD_FLOATS) if how == "extremes" or chance.random() < 0.3 else chance.gauss(0, 1e3)
         return _rounded(value) if kind == "float" else value
     bits = _BITS[kind]
     low, high = (0 if kind.startswith("u") else -(1 << bits)), (1 << bits) - 1
@@ -76,16 +74,14 @@ def _number(kind: str, chance: random.Random, how: str) -> Any:
 
 
 def _rounded(value: float) -> float:
-    """The nearest value that a float of four bytes can have, so that a round trip gives it back."""
+    """Round to the nearest 32-bit float, so that a round trip returns the same value."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 def _text(size: int, chance: random.Random, how: str) -> str:
     if how == "zeros":
         return ""
-    text = "".join(
-        chance.choice(_LETTERS) for _ in range(size if how == "extremes" else chance.randint(0, size))
-    )
+    text = "".join(chance.choice(_LETTERS) for _ in range(size if how == "extremes" else chance.randint(0, size)))
     return text.encode()[:size].decode(errors="ignore")
 
 
@@ -93,12 +89,12 @@ def _text(size: int, chance: random.Random, how: str) -> str:
 
 
 def dialect_module(name: str, version: int) -> Any:
-    """Pymavlink's module for a dialect and a version of the protocol."""
+    """Return pymavlink's module of a dialect and protocol version."""
     return import_module(f"pymavlink.dialects.v{version}0.{name}")
 
 
 def peer_class(message_class: type[Message], version: int) -> tuple[Any, Any]:
-    """Pymavlink's (module, class) for one of our classes; MAVLink 1 has none above 255."""
+    """Return pymavlink's (module, class) for one of our classes; MAVLink 1 has no ids above 255."""
     modules = [dialect_module(name, version) for name in PEERS]
     if any((message_class.ID, field.name) not in _known() for field in message_class.FIELDS):
         modules = [added_peer(version)]
@@ -109,26 +105,26 @@ def peer_class(message_class: type[Message], version: int) -> tuple[Any, Any]:
 
 
 def added_peer(version: int = 2) -> Any:
-    """Pymavlink's module, made in the tests, for the messages that it lacks or knows fewer fields of."""
+    """Return the generated pymavlink module for messages or fields that pymavlink lacks."""
     return added_module(version, _known())
 
 
 @cache
 def _known() -> frozenset[tuple[int, str]]:
-    """Message id and name of every field in pymavlink's own modules."""
+    """Return message id and name of every field in pymavlink's own modules."""
     classes = [cls for name in PEERS for cls in dialect_module(name, 2).mavlink_map.values()]
     return frozenset((cls.id, field) for cls in classes for field in cls.fieldnames)
 
 
 def peer_message(message: Message, version: int) -> tuple[Any, Any]:
-    """Pymavlink's (module, message) with the same fields."""
+    """Return pymavlink's (module, message) with the same fields."""
     module, cls = peer_class(type(message), version)
     fields = [field for field in message.FIELDS if field.name in cls.fieldnames]
     return module, cls(**{field.name: for_peer(field, getattr(message, field.name)) for field in fields})
 
 
 def for_peer(field: Field, value: Any) -> Any:
-    """A field's value as pymavlink's constructors take it."""
+    """Convert a field's value to what pymavlink's constructors take."""
     if field.type == "char" and not field.is_text:
         return value
     if field.is_text:
@@ -137,7 +133,7 @@ def for_peer(field: Field, value: Any) -> Any:
 
 
 def peer_fields(message: Any) -> dict[str, Any]:
-    """What pymavlink decoded, in our types; its text goes on behind the first NUL, ours ends there."""
+    """Convert a decoded pymavlink message to our types; its texts continue after the first NUL, ours end there."""
     fields = {name: getattr(message, name) for name in message.fieldnames}
     for field in _fields_of_other_types(message.get_msgId()):
         if field.name in fields:
@@ -161,10 +157,8 @@ def _from_peer(field: Field, message: Any) -> Any:
 
 
 def same(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
-    """Whether all fields are equal, NaN being equal to NaN."""
-    return ours == theirs or (
-        ours.keys() == theirs.keys() and all(_equal(ours[name], theirs[name]) for name in ours)
-    )
+    """Return whether all fields are equal; NaN equals NaN."""
+    return ours == theirs or (ours.keys() == theirs.keys() and all(_equal(ours[name], theirs[name]) for name in ours))
 
 
 def _equal(one: Any, other: Any) -> bool:

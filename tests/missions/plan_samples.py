@@ -1,4 +1,4 @@
-"""Plans as QGroundControl writes them, made up for the tests."""
+"""Sample plans in QGroundControl's format."""
 
 from __future__ import annotations
 

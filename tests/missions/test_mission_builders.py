@@ -1,4 +1,4 @@
-"""Builders: the numbers that go out, and what they refuse."""
+"""Mission item builders: encoded values and refused arguments."""
 
 from __future__ import annotations
 
@@ -51,9 +51,7 @@ CASES: list[tuple[MissionItem, MissionItem]] = [
     (missions.waypoint(*PLACE, altitude_amsl_m=30), at(16, 0, 0, 0, NAN, frame=0)),
     (missions.waypoint(*PLACE, altitude_terrain_m=30), at(16, 0, 0, 0, NAN, frame=10)),
     (
-        missions.waypoint(
-            *PLACE, altitude_relative_m=30, hold_s=5, acceptance_radius_m=2, pass_by_m=-3, yaw_deg=90
-        ),
+        missions.waypoint(*PLACE, altitude_relative_m=30, hold_s=5, acceptance_radius_m=2, pass_by_m=-3, yaw_deg=90),
         at(16, 5, 2, -3, 90),
     ),
     (missions.spline_waypoint(*PLACE, altitude_relative_m=30, hold_s=2), at(82, 2)),
@@ -104,12 +102,12 @@ CASES: list[tuple[MissionItem, MissionItem]] = [
 
 
 @for_each("built, expected", CASES)
-def test_what_builders_make(built: MissionItem, expected: MissionItem) -> None:
+def test_builders_create_items(built: MissionItem, expected: MissionItem) -> None:
     assert built == expected
     check_item(built, "item", 2 if built.command == MavCmd.NAV_RALLY_POINT else 0)
 
 
-def test_the_position_given_is_the_position_read() -> None:
+def test_builder_position_reads_back() -> None:
     position = missions.waypoint(-33.8567844, 151.2152967, altitude_relative_m=30).position
     assert position is not None
     assert (position.latitude_deg, position.longitude_deg) == (-33.8567844, 151.2152967)
@@ -131,20 +129,20 @@ AT_POSITION: list[tuple[Any, tuple[float, ...]]] = [
 
 
 @pytest.mark.parametrize(("build", "first"), AT_POSITION)
-def test_builders_take_a_position_as_well_as_numbers(build: Any, first: tuple[float, ...]) -> None:
+def test_builders_accept_position_or_numbers(build: Any, first: tuple[float, ...]) -> None:
     assert build(*first, POSITION) == build(*first, *PLACE, altitude_relative_m=30)
     assert build(*first, Position(*PLACE, altitude_amsl_m=518)) == build(*first, *PLACE, altitude_amsl_m=518)
     assert build(*first, POSITION, altitude_terrain_m=7) == build(*first, *PLACE, altitude_terrain_m=7)
 
 
 @pytest.mark.parametrize("build", [missions.land, missions.vtol_land])
-def test_landing_at_a_position_ignores_its_altitude(build: Any) -> None:
+def test_land_at_position_ignores_altitude(build: Any) -> None:
     assert build(POSITION) == build(*PLACE)
     assert build(POSITION, altitude_amsl_m=488) == build(*PLACE, altitude_amsl_m=488)
 
 
 @pytest.mark.parametrize("build", [missions.take_off, missions.vtol_take_off, missions.loiter_to_altitude])
-def test_a_number_alone_is_the_altitude_above_home(build: Any) -> None:
+def test_single_number_is_altitude_above_home(build: Any) -> None:
     assert build(10) == build(altitude_relative_m=10)
 
 
@@ -171,7 +169,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.take_off(47, altitude_relative_m=3), "latitude_deg and longitude_deg: give both"),
     (lambda: missions.waypoint(POSITION, altitude_amsl_m=3, altitude_relative_m=3), "exactly one of"),
     (lambda: missions.waypoint(Position(*PLACE)), "exactly one of .* not none"),
-    (lambda: missions.waypoint(POSITION, 8.5), "longitude_deg = 8.5 .* beside a Position"),  # type: ignore[call-overload]
+    (lambda: missions.waypoint(POSITION, 8.5), "longitude_deg = 8.5 .* together with a Position"),  # type: ignore[call-overload]
     (lambda: missions.waypoint(47.0, altitude_amsl_m=3), "give both, or a Position"),  # type: ignore[call-overload]
     (lambda: missions.waypoint(None, altitude_amsl_m=3), "give both, or a Position"),  # type: ignore[call-overload]
     (lambda: missions.take_off(True), "altitude_relative_m = True"),
@@ -202,12 +200,12 @@ WRONG: list[tuple[Callable[[], object], str]] = [
 
 
 @pytest.mark.parametrize(("build", "message"), WRONG)
-def test_builders_refuse(build: Callable[[], object], message: str) -> None:
+def test_builders_reject_invalid_arguments(build: Callable[[], object], message: str) -> None:
     with pytest.raises(InvalidArgument, match=message):
         build()
 
 
-def test_places_without_a_place_are_ardupilots_alone() -> None:
+def test_zero_place_is_rejected_except_for_ardupilot() -> None:
     mission = missions.Mission([missions.take_off(altitude_relative_m=10), missions.land()])
     mission.check()
     mission.check(home_is_item_0=True)

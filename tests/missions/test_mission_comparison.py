@@ -1,4 +1,4 @@
-"""Comparison with tolerance: what firmwares give back of what they were sent is no difference, all else is one."""
+"""Mission comparison: rounding by a firmware is no difference, anything else is."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from aerokit.missions import (
     Fence,
     FenceCircle,
     FencePolygon,
+    ItemStorage,
     Mission,
     MissionItem,
     RallyPoints,
-    Storage,
     change_speed,
     delay,
     jump,
@@ -48,13 +48,13 @@ def f32(value: float) -> float:
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
-def back(item: MissionItem, **changes: object) -> MissionItem:
-    """The item as it comes back: 32-bit floats, and these fields changed."""
+def returned(item: MissionItem, **changes: object) -> MissionItem:
+    """Return the item rounded to 32-bit floats, with the given fields changed."""
     numbers = {name: f32(getattr(item, name)) for name in ("param1", "param2", "param3", "param4", "z")}
     return item.replace(**numbers).replace(**changes)
 
 
-ARDUPILOT = [  # sent, and what ArduPilot 4.7 gives back
+ARDUPILOT = [  # what is sent, and what ArduPilot 4.7 returns
     (waypoint(*PLACE, altitude_relative_m=30.29, hold_s=2.5), {"param1": 2, "param4": 0, "z": f32(30.28)}),
     (waypoint(*PLACE, altitude_relative_m=30, acceptance_radius_m=7), {"param2": 0, "param4": 0}),  # Copter
     (
@@ -87,9 +87,9 @@ ARDUPILOT = [  # sent, and what ArduPilot 4.7 gives back
 
 
 @for_each("sent, changes", ARDUPILOT)
-def test_what_ardupilot_changes_is_no_difference(sent: MissionItem, changes: dict[str, object]) -> None:
-    received = back(sent, **changes)
-    assert item_differences(sent, received, Storage.ARDUPILOT) == ()
+def test_comparison_ignores_ardupilot_conversions(sent: MissionItem, changes: dict[str, object]) -> None:
+    received = returned(sent, **changes)
+    assert item_differences(sent, received, ItemStorage.ARDUPILOT) == ()
     assert item_differences(sent, received) == ()
     assert item_differences(sent, received.replace(autocontinue=True)) == ()
 
@@ -111,16 +111,16 @@ PX4 = [
 
 
 @for_each("sent, changes", PX4)
-def test_what_px4_changes_is_no_difference(sent: MissionItem, changes: dict[str, object]) -> None:
-    received = back(sent, **changes)
-    assert item_differences(sent, received, Storage.PX4) == ()
+def test_comparison_ignores_px4_conversions(sent: MissionItem, changes: dict[str, object]) -> None:
+    received = returned(sent, **changes)
+    assert item_differences(sent, received, ItemStorage.PX4) == ()
     assert item_differences(sent, received) == ()
 
 
 WAYPOINT = waypoint(*PLACE, altitude_relative_m=30, hold_s=5)
 
 
-@pytest.mark.parametrize("storage", list(Storage))
+@pytest.mark.parametrize("storage", list(ItemStorage))
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
@@ -136,32 +136,32 @@ WAYPOINT = waypoint(*PLACE, altitude_relative_m=30, hold_s=5)
         ({"z": NAN}, "z is nan"),
     ],
 )
-def test_real_differences_are_told(changes: dict[str, object], text: str, storage: Storage) -> None:
+def test_comparison_reports_real_differences(changes: dict[str, object], text: str, storage: ItemStorage) -> None:
     (difference,) = item_differences(WAYPOINT, WAYPOINT.replace(**changes), storage)
     assert text in difference
 
 
-@for_each("sent, storage", list(itertools.product([item for item, _ in ARDUPILOT + PX4], list(Storage))))
-def test_an_item_is_as_itself(sent: MissionItem, storage: Storage) -> None:
+@for_each("sent, storage", list(itertools.product([item for item, _ in ARDUPILOT + PX4], list(ItemStorage))))
+def test_comparison_of_item_with_itself_is_empty(sent: MissionItem, storage: ItemStorage) -> None:
     assert item_differences(sent, sent, storage) == ()
-    assert item_differences(sent, back(sent), storage) == ()
+    assert item_differences(sent, returned(sent), storage) == ()
     near = sent.replace(x=sent.x + 1, y=sent.y - 1) if sent.position else sent
     assert item_differences(sent, near, storage) == ()
 
 
-def test_the_wire_forgets_nothing_else() -> None:
+def test_wire_comparison_reports_other_changes() -> None:
     sent = waypoint(*PLACE, altitude_relative_m=30, hold_s=2.5)
-    assert item_differences(sent, sent.replace(param1=2.0, frame=6), Storage.WIRE)
-    assert not item_differences(sent, sent.replace(frame=6), Storage.WIRE)
-    assert item_differences(sent.replace(autocontinue=False), sent, Storage.WIRE) == (
+    assert item_differences(sent, sent.replace(param1=2.0, frame=6), ItemStorage.WIRE)
+    assert not item_differences(sent, sent.replace(frame=6), ItemStorage.WIRE)
+    assert item_differences(sent.replace(autocontinue=False), sent, ItemStorage.WIRE) == (
         "autocontinue is True instead of False",
     )
-    assert not item_differences(sent.replace(autocontinue=False), sent, Storage.ARDUPILOT)
-    assert item_differences(sent.replace(autocontinue=False), sent, Storage.PX4)
-    assert item_differences(return_to_launch(), return_to_launch().replace(frame=0), Storage.PX4)
+    assert not item_differences(sent.replace(autocontinue=False), sent, ItemStorage.ARDUPILOT)
+    assert item_differences(sent.replace(autocontinue=False), sent, ItemStorage.PX4)
+    assert item_differences(return_to_launch(), return_to_launch().replace(frame=0), ItemStorage.PX4)
 
 
-def test_missions() -> None:
+def test_mission_comparison() -> None:
     mission = Mission([take_off(altitude_relative_m=10), WAYPOINT, return_to_launch()])
     assert mission.matches(mission.replace(home=Position(1, 2)))
     other = Mission([mission[0], WAYPOINT.replace(z=20.0)])
@@ -174,38 +174,30 @@ def test_missions() -> None:
     assert changed_items(other.items, mission.items) == (1,)
 
 
-def test_fences() -> None:
+def test_fence_comparison() -> None:
     corners = [Position(47.0, 8.0), Position(47.0, 8.1), Position(47.1, 8.1)]
-    fence = Fence(
-        [FencePolygon(corners)], [FenceCircle(corners[0], 100.3)], Position(47, 8, altitude_relative_m=20)
-    )
-    ardupilot = Fence.from_items(
-        [back(item, frame=0, z=0.0, autocontinue=False) for item in fence.to_items()]
-    )
-    px4 = Fence.from_items([back(item, frame=5) for item in fence.to_items()])
-    assert fence.matches(ardupilot, Storage.ARDUPILOT)
-    assert fence.matches(px4, Storage.PX4)
+    fence = Fence([FencePolygon(corners)], [FenceCircle(corners[0], 100.3)], Position(47, 8, altitude_relative_m=20))
+    ardupilot = Fence.from_items([returned(item, frame=0, z=0.0, autocontinue=False) for item in fence.to_items()])
+    px4 = Fence.from_items([returned(item, frame=5) for item in fence.to_items()])
+    assert fence.matches(ardupilot, ItemStorage.ARDUPILOT)
+    assert fence.matches(px4, ItemStorage.PX4)
     assert fence.matches(ardupilot)
     smaller = fence.replace(circles=[FenceCircle(corners[0], 90)])
-    assert fence.differences(smaller) == (
-        "item 3 (NAV_FENCE_CIRCLE_INCLUSION): param1 is 90 instead of 100.3",
-    )
+    assert fence.differences(smaller) == ("item 3 (NAV_FENCE_CIRCLE_INCLUSION): param1 is 90 instead of 100.3",)
     assert not fence.matches(Fence())
 
 
-def test_rally_points() -> None:
+def test_rally_point_comparison() -> None:
     points = RallyPoints([rally_point(*PLACE, altitude_relative_m=30.7)])
-    assert points.matches(RallyPoints([back(points[0], z=30.0, autocontinue=False)]), Storage.ARDUPILOT)
-    assert points.matches(RallyPoints([back(points[0], frame=6)]), Storage.PX4)
-    assert not points.matches(RallyPoints([back(points[0], z=29.0)]))
+    assert points.matches(RallyPoints([returned(points[0], z=30.0, autocontinue=False)]), ItemStorage.ARDUPILOT)
+    assert points.matches(RallyPoints([returned(points[0], frame=6)]), ItemStorage.PX4)
+    assert not points.matches(RallyPoints([returned(points[0], z=29.0)]))
 
 
 numbers = st.floats(width=32) | st.integers(-300, 300).map(float) | st.just(NAN)
 items = st.builds(
     MissionItem,
-    st.sampled_from(
-        [16, 17, 18, 19, 20, 21, 22, 82, 93, 112, 177, 178, 183, 203, 205, 1000, 2000, 5001, 5100, 42702]
-    ),
+    st.sampled_from([16, 17, 18, 19, 20, 21, 22, 82, 93, 112, 177, 178, 183, 203, 205, 1000, 2000, 5001, 5100, 42702]),
     st.sampled_from([0, 2, 3, 6, 10]),
     numbers,
     numbers,
@@ -217,19 +209,19 @@ items = st.builds(
 )
 
 
-@given(items, items, st.sampled_from(list(Storage)))
+@given(items, items, st.sampled_from(list(ItemStorage)))
 @settings(max_examples=150)
-def test_any_two_items_can_be_compared(one: MissionItem, other: MissionItem, storage: Storage) -> None:
+def test_comparison_accepts_any_items(one: MissionItem, other: MissionItem, storage: ItemStorage) -> None:
     assert item_differences(one, one, storage) == ()
     texts = item_differences(one, other.replace(command=one.command), storage)
     assert all(" instead of " in text for text in texts)
-    if storage is not Storage.ANY:  # what passes for one autopilot passes for any
-        assert len(item_differences(one, other, Storage.ANY)) <= len(item_differences(one, other, storage))
+    if storage is not ItemStorage.ANY:  # ANY accepts what a specific autopilot accepts
+        assert len(item_differences(one, other, ItemStorage.ANY)) <= len(item_differences(one, other, storage))
 
 
-def test_places_in_32_bit_floats() -> None:
+def test_comparison_tolerates_32_bit_places() -> None:
     sent = waypoint(-34.3, 149.1662345, altitude_relative_m=30)
-    came = back(sent, x=round(f32(-34.3) * 1e7), y=round(f32(149.1662345) * 1e7))
+    came = returned(sent, x=round(f32(-34.3) * 1e7), y=round(f32(149.1662345) * 1e7))
     assert item_differences(sent, came)
     assert not item_differences(sent, came, single_precision=True)
     assert item_differences(sent, sent.replace(y=sent.y + 500), single_precision=True)

@@ -1,4 +1,4 @@
-"""Missions as values: what a mission is, what is refused, home and jumps as the vehicle counts them."""
+"""Mission objects: their values, refused items, and home and jumps in the vehicle's numbering."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def jump(to: float, times: float = 3) -> MissionItem:
     return MissionItem(MavCmd.DO_JUMP, MavFrame.MISSION, float(to), float(times))
 
 
-def test_a_mission_is_a_tuple_of_items() -> None:
+def test_mission_behaves_like_tuple_of_items() -> None:
     mission = Mission([WAYPOINT, RTL])
     assert mission.items == (WAYPOINT, RTL)
     assert len(mission) == 2
@@ -34,7 +34,7 @@ def test_a_mission_is_a_tuple_of_items() -> None:
     mission.check()
 
 
-def test_items_are_equal_with_nan() -> None:
+def test_items_with_nan_are_equal() -> None:
     one, other = WAYPOINT.replace(param4=math.nan), WAYPOINT.replace(param4=float("nan"))
     assert one == other
     assert hash(one) == hash(other)
@@ -42,7 +42,7 @@ def test_items_are_equal_with_nan() -> None:
     assert pickle.loads(pickle.dumps(Mission([one]))) == Mission([other])
 
 
-def test_positions_of_items() -> None:
+def test_item_position() -> None:
     assert WAYPOINT.position == Position(47.3977419, 8.545594, altitude_relative_m=30.0)
     assert WAYPOINT.replace(frame=MavFrame.GLOBAL_INT).position == Position(47.3977419, 8.545594, 30.0)
     assert WAYPOINT.replace(frame=11).position == Position(47.3977419, 8.545594)
@@ -59,7 +59,7 @@ def test_positions_of_items() -> None:
     [
         (
             {"x": 910000000},
-            r"item 1 \(NAV_WAYPOINT\): x = 910000000 .* latitude from -90 to 90 .* this is 91",
+            r"item 1 \(NAV_WAYPOINT\): x = 910000000 .* latitude of -90 to 90 .* this is 91",
         ),
         ({"y": -1800000001}, r"y = .* longitude"),
         ({"x": 47.4}, "x = 47.4 .* an integer"),
@@ -79,12 +79,12 @@ def test_positions_of_items() -> None:
         ({"autocontinue": 1}, "autocontinue = 1"),
     ],
 )
-def test_wrong_items_are_refused(changes: dict[str, object], message: str) -> None:
+def test_check_rejects_invalid_items(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InvalidArgument, match=message):
         Mission([RTL, WAYPOINT.replace(**changes)]).check()
 
 
-def test_what_the_standard_allows_passes() -> None:
+def test_check_accepts_standard_values() -> None:
     for changes in (
         {"param4": math.nan},
         {"x": 0x7FFFFFFF, "y": 0x7FFFFFFF},
@@ -94,14 +94,14 @@ def test_what_the_standard_allows_passes() -> None:
     Mission([RTL.replace(param1=math.nan, z=math.nan), RTL.replace(frame=0)]).check()
 
 
-def test_no_item_at_all() -> None:
-    with pytest.raises(InvalidArgument, match="item 1 = 'land' is no MissionItem"):
+def test_check_rejects_other_objects() -> None:
+    with pytest.raises(InvalidArgument, match="item 1 = 'land' is not a MissionItem"):
         Mission([WAYPOINT, "land"])  # type: ignore[list-item]
     with pytest.raises(InvalidArgument, match="item 0 = None"):
         RallyPoints([None])  # type: ignore[list-item]
 
 
-def test_too_many_items() -> None:
+def test_check_rejects_too_many_items() -> None:
     Mission([RTL] * 65_535).check()
     with pytest.raises(InvalidArgument, match="65536 items are too many: at most 65535"):
         Mission([RTL] * 65_536).check()
@@ -110,12 +110,12 @@ def test_too_many_items() -> None:
 
 
 @pytest.mark.parametrize("target", [-1, 2, 0.5, 70000])
-def test_jumps_must_lead_into_the_mission(target: float) -> None:
+def test_check_rejects_jump_outside_mission(target: float) -> None:
     with pytest.raises(InvalidArgument, match=r"item 1 \(DO_JUMP\): param1 = .* 0 to 1"):
         Mission([WAYPOINT, jump(target)]).check()
 
 
-def test_jump_tags() -> None:
+def test_check_rejects_unknown_jump_tag() -> None:
     tag = MissionItem(MavCmd.JUMP_TAG, MavFrame.MISSION, 7.0)
     leap = MissionItem(MavCmd.DO_JUMP_TAG, MavFrame.MISSION, 7.0, 1.0)
     Mission([tag, WAYPOINT, leap]).check()
@@ -123,7 +123,7 @@ def test_jump_tags() -> None:
         Mission([tag, leap.replace(param1=8.0)]).check()
 
 
-def test_home_is_hidden_and_jumps_are_counted_without_it() -> None:
+def test_home_is_removed_and_jumps_adjusted() -> None:
     mission = Mission([WAYPOINT, jump(0), RTL], HOME)
     items = mission.to_items(home_is_item_0=True)
     assert len(items) == 4
@@ -134,7 +134,7 @@ def test_home_is_hidden_and_jumps_are_counted_without_it() -> None:
     assert Mission.from_items(mission.items) == mission.replace(home=None)
 
 
-def test_home_unknown_and_empty_missions() -> None:
+def test_unknown_home_and_empty_mission_convert() -> None:
     assert Mission().to_items(home_is_item_0=True) == (MissionItem(MavCmd.NAV_WAYPOINT, 0),)
     assert Mission.from_items([], home_is_item_0=True) == Mission()
     assert Mission.from_items(Mission().to_items(home_is_item_0=True), home_is_item_0=True) == Mission()
@@ -143,7 +143,7 @@ def test_home_unknown_and_empty_missions() -> None:
 SQUARE = [Position(47.0, 8.0), Position(47.0, 8.1), Position(47.1, 8.1), Position(47.1, 8.0)]
 
 
-def test_fence_items_and_back() -> None:
+def test_fence_items_round_trip() -> None:
     fence = Fence(
         polygons=[FencePolygon(SQUARE), FencePolygon(SQUARE[:3], inclusion=False)],
         circles=[
@@ -163,10 +163,10 @@ def test_fence_items_and_back() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: FencePolygon(SQUARE[:2]), "2 places, a polygon needs at least 3"),
+        (lambda: FencePolygon(SQUARE[:2]), "2 places; a polygon needs at least 3"),
         (
             lambda: FencePolygon([1, 2, 3]),  # type: ignore[list-item]
-            r"vertices\[0\] = 1 is no Position",
+            r"vertices\[0\] = 1 is not a Position",
         ),
         (lambda: FenceCircle(SQUARE[0], 0), "radius_m = 0 is not allowed"),
         (lambda: FenceCircle(SQUARE[0], math.nan), "radius_m = nan"),
@@ -180,17 +180,17 @@ def test_fence_items_and_back() -> None:
         ),
         (
             lambda: Fence([FenceCircle(SQUARE[0], 1)]),  # type: ignore[list-item]
-            r"polygons\[0\] .* no FencePolygon",
+            r"polygons\[0\] .* not a FencePolygon",
         ),
     ],
 )
-def test_wrong_fences_cannot_be_made(make: object, message: str) -> None:
+def test_invalid_fence_is_rejected(make: object, message: str) -> None:
     assert callable(make)
     with pytest.raises(InvalidArgument, match=message):
         make()
 
 
-def test_rally_points() -> None:
+def test_rally_points_round_trip() -> None:
     item = MissionItem(MavCmd.NAV_RALLY_POINT, MavFrame.GLOBAL_RELATIVE_ALT, x=473977419, y=85455940, z=40.0)
     points = RallyPoints([item])
     points.check()

@@ -1,4 +1,4 @@
-"""Items as messages and packed files: there and back, and as pymavlink lays them out."""
+"""Mission items as messages and packed files: round trips, and pymavlink's layout."""
 
 from __future__ import annotations
 
@@ -14,8 +14,16 @@ from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions import Fence, Mission, MissionItem
-from aerokit.missions.pack import HEADER, MAGIC, NO_CLEAR, pack_items, unpack_items
-from aerokit.missions.wire import from_wire, to_wire, to_wire_float
+from aerokit.missions.wire import (
+    HEADER,
+    MAGIC,
+    NO_CLEAR,
+    from_wire,
+    pack_items,
+    to_wire,
+    to_wire_float,
+    unpack_items,
+)
 
 float32 = st.floats(width=32) | st.just(math.nan)
 int32 = st.integers(-(2**31), 2**31 - 1)
@@ -35,19 +43,19 @@ items = st.builds(
 
 
 @given(items, st.integers(0, 65534))
-def test_the_integer_form_keeps_all(item: MissionItem, seq: int) -> None:
+def test_integer_form_round_trip(item: MissionItem, seq: int) -> None:
     message = to_wire(item, seq, target_system=1, target_component=1, mission_type=1, current=True)
     assert (message.seq, message.current, message.mission_type, message.target_system) == (seq, 1, 1, 1)
     assert from_wire(messages.MissionItemInt.decode(message.encode())) == item
 
 
-def test_the_float_form_has_degrees() -> None:
+def test_float_form_uses_degrees() -> None:
     item = MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL_RELATIVE_ALT, x=473977419, y=-85455940, z=30.0)
     message = to_wire_float(item, 3, target_system=1, target_component=1)
     assert (message.x, message.y, message.seq) == (47.3977419, -8.545594, 3)
     assert from_wire(message) == item
     received = from_wire(messages.MissionItem.decode(message.encode()))
-    assert abs(received.x - item.x) < 40  # 32 bits: some metres
+    assert abs(received.x - item.x) < 40  # some metres as a 32-bit float
     assert isinstance(received.x, int)
 
 
@@ -58,11 +66,11 @@ def test_the_float_form_has_degrees() -> None:
         (MissionItem(MavCmd.DO_DIGICAM_CONTROL, 2, x=1), 1.0),
         (MissionItem(MavCmd.DO_SET_ACTUATOR, 2, x=0.5), 0.5),
         (MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.LOCAL_NED, x=125000), 12.5),
-        (MissionItem(31999, 3, x=10_000_000), 1.0),  # of another dialect: a place
+        (MissionItem(31999, 3, x=10_000_000), 1.0),  # an unknown command is taken as a place
         (MissionItem(MavCmd.NAV_LAND, 3, x=0x7FFFFFFF), math.nan),
     ],
 )
-def test_what_x_is_in_the_float_form(item: MissionItem, x: float) -> None:
+def test_float_form_scales_x(item: MissionItem, x: float) -> None:
     message = to_wire_float(item, 0, target_system=1, target_component=1)
     assert message.x == x or (math.isnan(x) and math.isnan(message.x))
     assert from_wire(message) == item
@@ -70,26 +78,24 @@ def test_what_x_is_in_the_float_form(item: MissionItem, x: float) -> None:
 
 @given(float32, float32)
 @settings(max_examples=50)
-def test_the_float_form_off_the_air_never_raises(x: float, y: float) -> None:
+def test_float_form_decodes_any_numbers(x: float, y: float) -> None:
     from_wire(messages.MissionItem(1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, x, y, 0, 0))
 
 
-def test_a_fraction_does_not_fit_into_the_integer_form() -> None:
+def test_integer_form_rejects_fraction() -> None:
     with pytest.raises(InvalidArgument, match=r"MISSION_ITEM_INT.x = 0.5"):
-        to_wire(
-            MissionItem(MavCmd.DO_SET_ACTUATOR, 2, x=0.5), 0, target_system=1, target_component=1
-        ).encode()
+        to_wire(MissionItem(MavCmd.DO_SET_ACTUATOR, 2, x=0.5), 0, target_system=1, target_component=1).encode()
 
 
 @given(st.lists(items, max_size=5), st.integers(0, 2))
 @settings(max_examples=50)
-def test_packed_there_and_back(plan: list[MissionItem], mission_type: int) -> None:
+def test_packed_plan_round_trip(plan: list[MissionItem], mission_type: int) -> None:
     data = pack_items(plan, mission_type)
     assert len(data) == 10 + 38 * len(plan)
     assert unpack_items(data, mission_type) == tuple(plan)
 
 
-def test_packed_as_the_firmware_has_it() -> None:
+def test_packed_plan_matches_firmware_layout() -> None:
     item = MissionItem(MavCmd.NAV_WAYPOINT, 3, 1.0, 2.0, 3.0, 4.0, 473977419, 85455940, 30.0)
     data = pack_items([item], first=5, options=NO_CLEAR)
     assert data[:10] == struct.pack("<5H", 0x763D, 0, 1, 5, 1)
@@ -107,22 +113,22 @@ GOOD = pack_items([MissionItem(16, 3), MissionItem(20, 2)])
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "10 bytes of header, these are 0"),
-        (GOOD[:9], "10 bytes of header"),
-        (b"\x1b" + GOOD[1:], "0x763D, this with 0x761B"),
-        (GOOD[:-1], "2 items has 86 bytes, this has 85"),
-        (GOOD + b"\0", "86 bytes, this has 87"),
-        (HEADER.pack(MAGIC, 1, 0, 0, 0), "MAV_MISSION_TYPE 0 was expected, this is of 1"),
+        (b"", "header of 10 bytes, received 0"),
+        (GOOD[:9], "header of 10 bytes"),
+        (b"\x1b" + GOOD[1:], "0x763D, found 0x761B"),
+        (GOOD[:-1], "86 bytes for 2 items, received 85"),
+        (GOOD + b"\0", "86 bytes for 2 items, received 87"),
+        (HEADER.pack(MAGIC, 1, 0, 0, 0), "expected MAV_MISSION_TYPE 0, found 1"),
     ],
 )
-def test_damaged_files(data: bytes, message: str) -> None:
+def test_damaged_packed_plan_is_rejected(data: bytes, message: str) -> None:
     with pytest.raises(RemoteProtocolError, match=message):
         unpack_items(data, 0)
 
 
 @given(st.binary(max_size=200))
 @settings(max_examples=50)
-def test_any_bytes_are_a_plan_or_an_error(data: bytes) -> None:
+def test_unpack_accepts_any_bytes_or_raises(data: bytes) -> None:
     for content in (data, HEADER.pack(MAGIC, 0, 0, 0, 2) + data):
         try:
             unpack_items(content)
@@ -130,14 +136,14 @@ def test_any_bytes_are_a_plan_or_an_error(data: bytes) -> None:
             continue
 
 
-def test_too_many_items_are_not_packed() -> None:
+def test_pack_rejects_too_many_items() -> None:
     with pytest.raises(InvalidArgument, match="65536 items are too many"):
         pack_items([MissionItem(20, 2)] * 65_535, first=1)
 
 
 @given(st.lists(items, max_size=6), st.booleans())
 @settings(max_examples=60)
-def test_missions_as_vehicles_count_them_and_back(plan: list[MissionItem], home_is_item_0: bool) -> None:
+def test_vehicle_item_indices_round_trip(plan: list[MissionItem], home_is_item_0: bool) -> None:
     mission = Mission([item.replace(param1=1.0) for item in plan])
     listed = mission.to_items(home_is_item_0=home_is_item_0)
     assert len(listed) == len(plan) + home_is_item_0
@@ -146,7 +152,7 @@ def test_missions_as_vehicles_count_them_and_back(plan: list[MissionItem], home_
 
 @given(st.lists(items, max_size=6))
 @settings(max_examples=60)
-def test_any_items_are_a_fence_or_an_error(plan: list[MissionItem]) -> None:
+def test_fence_from_any_items_or_error(plan: list[MissionItem]) -> None:
     for command in (5000, 5001, 5003, None):
         try:
             Fence.from_items([item if command is None else item.replace(command=command) for item in plan])
@@ -163,12 +169,12 @@ def test_any_items_are_a_fence_or_an_error(plan: list[MissionItem]) -> None:
         ([3, 3, 3, 3], "item 3"),
     ],
 )
-def test_polygons_that_are_not_whole(counts: list[float], message: str) -> None:
+def test_incomplete_polygon_is_rejected(counts: list[float], message: str) -> None:
     with pytest.raises(RemoteProtocolError, match=message):
         Fence.from_items([MissionItem(5001, 0, count, x=1, y=1) for count in counts])
 
 
-def test_what_is_no_fence() -> None:
+def test_fence_rejects_other_items() -> None:
     with pytest.raises(RemoteProtocolError, match=r"item 0 \(NAV_WAYPOINT\) does not belong"):
         Fence.from_items([MissionItem(16, 0)])
     with pytest.raises(RemoteProtocolError, match=r"item 0 .* radius_m = -1"):

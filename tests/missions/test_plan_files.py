@@ -1,4 +1,4 @@
-"""QGroundControl's .plan files: what is read, that writing gives it back, what is refused."""
+"""QGroundControl's .plan files: reading, round trips and refused files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def written(plan: Plan) -> Any:
 # ------------------------------------------------------------------------------------------ reading
 
 
-def test_everything_is_read() -> None:
+def test_plan_file_is_read_completely() -> None:
     plan = read(samples.full_document())
     assert [item.command for item in plan.mission] == [
         22,
@@ -103,7 +103,7 @@ def test_everything_is_read() -> None:
     plan.rally.check()
 
 
-def test_vtol_landings_and_waypoint_approaches() -> None:
+def test_plan_file_landing_patterns() -> None:
     pattern = samples.landing() | {
         "complexItemType": "vtolLandingPattern",
         "useLoiterToAlt": False,
@@ -128,7 +128,7 @@ def test_vtol_landings_and_waypoint_approaches() -> None:
         ({"AltitudeMode": 3, "AMSLAltAboveTerrain": None}, 0, NAN),
     ],
 )
-def test_altitude_modes_where_the_item_has_no_altitude(changes: dict[str, Any], frame: int, z: float) -> None:
+def test_plan_file_altitude_mode_without_altitude(changes: dict[str, Any], frame: int, z: float) -> None:
     entry = samples.place(16, 1, 47, 8, 50) | changes
     entry["params"][6] = None
     item = read(samples.document(entry)).mission[0]
@@ -138,7 +138,7 @@ def test_altitude_modes_where_the_item_has_no_altitude(changes: dict[str, Any], 
             Mission([item]).check()
 
 
-def test_the_frame_of_the_item_is_what_is_flown() -> None:
+def test_plan_file_frame_takes_precedence() -> None:
     entry = samples.place(16, 1, 47, 8, 530) | {
         "frame": 0,
         "AltitudeMode": 3,
@@ -148,7 +148,7 @@ def test_the_frame_of_the_item_is_what_is_flown() -> None:
     assert read(samples.document(entry)).mission[0].position == Position(47, 8, altitude_amsl_m=530)
 
 
-def test_jumps_lead_to_ids() -> None:
+def test_plan_file_jumps_refer_to_ids() -> None:
     jumping = samples.simple(177, 8, 2, 20, 1)
     plan = read(samples.document(samples.place(16, 10, 47, 8, 5), jumping, samples.place(16, 20, 47, 8, 6)))
     assert plan.mission[1] == jump(2, repeat=1)
@@ -159,7 +159,7 @@ def test_jumps_lead_to_ids() -> None:
     assert read(samples.document(first, jumping, second)).mission[1].param1 == 2
 
 
-def test_fence_only_and_old_empty_sections() -> None:
+def test_plan_file_with_fence_only() -> None:
     document = samples.document()
     del document["mission"], document["rallyPoints"]
     plan = read(document)
@@ -176,14 +176,14 @@ def test_fence_only_and_old_empty_sections() -> None:
 # ------------------------------------------------------------------------------------------ writing
 
 
-def test_writing_what_was_read_changes_nothing() -> None:
+def test_unchanged_plan_file_is_written_unchanged() -> None:
     document = samples.full_document()
     plan = read(document)
     assert written(plan) == document
     assert parse_plan(format_plan(plan)) == plan
 
 
-def test_only_what_changed_is_written_anew() -> None:
+def test_plan_file_keeps_unchanged_parts() -> None:
     document = samples.full_document()
     plan = read(document)
     speed = plan.replace(cruise_speed_m_s=20.5, vehicle_type=1)
@@ -202,7 +202,7 @@ def test_only_what_changed_is_written_anew() -> None:
     assert written(home)["mission"]["items"] == document["mission"]["items"]
 
 
-def test_surveys_stay_when_others_change() -> None:
+def test_plan_file_keeps_unchanged_survey() -> None:
     document = samples.full_document()
     plan = read(document)
     extra = waypoint(47.4, 8.5, altitude_amsl_m=600)
@@ -227,7 +227,7 @@ def test_surveys_stay_when_others_change() -> None:
     assert parse_plan(format_plan(changed)) == changed
 
 
-def test_a_changed_survey_becomes_simple_items() -> None:
+def test_changed_survey_becomes_simple_items() -> None:
     plan = read(samples.full_document())
     items = list(plan.mission)
     items[3] = items[3].replace(z=60.0)
@@ -237,7 +237,7 @@ def test_a_changed_survey_becomes_simple_items() -> None:
     assert parse_plan(format_plan(changed)) == changed
 
 
-def test_a_new_plan(tmp_path: Path) -> None:
+def test_new_plan_file(tmp_path: Path) -> None:
     mission = Mission(
         [take_off(47, 8, altitude_relative_m=10), set_servo(9, 1500), jump(0, repeat=2), return_to_launch()],
         Position(47.1, 8.1, 500.0),
@@ -253,7 +253,7 @@ def test_a_new_plan(tmp_path: Path) -> None:
     assert [entry["doJumpId"] for entry in document["mission"]["items"]] == [1, 2, 3, 4]
 
 
-def test_plans_are_compared_without_their_source() -> None:
+def test_plan_comparison_ignores_source() -> None:
     plan = read(samples.full_document())
     assert plan == plan.replace(source="")
     assert hash(plan) == hash(plan.replace(source=""))
@@ -266,13 +266,13 @@ def test_plans_are_compared_without_their_source() -> None:
     [
         (
             Plan(rally=RallyPoints([rally_point(47, 8, altitude_amsl_m=5)])),
-            r"rally\[0\]: frame = .* above home only",
+            r"rally\[0\]: frame = .* only altitudes above home",
         ),
         (Plan(fence=Fence(return_point=Position(47, 8, 500.0))), "return_point.altitude_amsl_m = 500.0"),
         (Plan(Mission([MissionItem(16, 3, math.inf)])), "not finite"),
     ],
 )
-def test_what_a_plan_file_cannot_keep(plan: Plan, message: str) -> None:
+def test_plan_file_rejects_values_it_cannot_store(plan: Plan, message: str) -> None:
     with pytest.raises(InvalidArgument, match=message):
         format_plan(plan)
 
@@ -299,10 +299,7 @@ raw_items = st.builds(
 
 def with_real_jumps(items: list[MissionItem]) -> list[MissionItem]:
     last = len(items) - 1
-    return [
-        item.replace(param1=float(i % (last + 1))) if item.command == 177 else item
-        for i, item in enumerate(items)
-    ]
+    return [item.replace(param1=float(i % (last + 1))) if item.command == 177 else item for i, item in enumerate(items)]
 
 
 missions = st.builds(
@@ -336,7 +333,7 @@ plans = st.builds(
 
 @given(plans)
 @settings(max_examples=40, deadline=None)
-def test_any_plan_comes_back_as_it_was(plan: Plan) -> None:
+def test_plan_file_round_trip(plan: Plan) -> None:
     text = format_plan(plan)
     assert parse_plan(text) == plan
     assert format_plan(parse_plan(text)) == text
@@ -344,7 +341,7 @@ def test_any_plan_comes_back_as_it_was(plan: Plan) -> None:
 
 @given(plans, missions)
 @settings(max_examples=25, deadline=None)
-def test_any_change_of_a_file_comes_back(plan: Plan, mission: Mission) -> None:
+def test_changed_plan_file_round_trip(plan: Plan, mission: Mission) -> None:
     read_plan = read(samples.full_document())
     for changed in (read_plan.replace(mission=mission), plan.replace(source=read_plan.source)):
         assert parse_plan(format_plan(changed)) == changed
@@ -379,7 +376,7 @@ DAMAGES: list[tuple[tuple[str | int, ...], object, str]] = [
     (("mission", "items", 0, "command"), True, r"items\[0\].command = true"),
     (("mission", "items", 0, "frame"), 1.5, r"items\[0\].frame = 1.5"),
     (("mission", "items", 0, "autoContinue"), 1, r"items\[0\].autoContinue = 1: expected true or false"),
-    (("mission", "items", 0, "params"), [1], r"items\[0\].params = .* 7 values, and it has 1"),
+    (("mission", "items", 0, "params"), [1], r"items\[0\].params = .* 7 values; it has 1"),
     (("mission", "items", 0, "params", 1), "x", r'items\[0\].params\[1\] = "x": expected a number, or null'),
     (
         ("mission", "items", 0, "params", 4),
@@ -438,7 +435,7 @@ DAMAGES: list[tuple[tuple[str | int, ...], object, str]] = [
 
 
 @pytest.mark.parametrize(("path", "value", "message"), DAMAGES)
-def test_damaged_values_are_named(path: tuple[str | int, ...], value: object, message: str) -> None:
+def test_plan_file_error_names_invalid_value(path: tuple[str | int, ...], value: object, message: str) -> None:
     document = samples.full_document()
     at(document, *path[:-1])[path[-1]] = value
     with pytest.raises(FileFormatError, match=r"^test\.plan: .*" + message):
@@ -459,7 +456,7 @@ def test_damaged_values_are_named(path: tuple[str | int, ...], value: object, me
         ("rallyPoints", "points"),
     ],
 )
-def test_missing_values_are_named(path: tuple[str | int, ...]) -> None:
+def test_plan_file_error_names_missing_value(path: tuple[str | int, ...]) -> None:
     document = samples.full_document()
     del at(document, *path[:-1])[path[-1]]
     with pytest.raises(FileFormatError, match=f"^test.plan: .* has no '{path[-1]}', which is required"):
@@ -469,32 +466,32 @@ def test_missing_values_are_named(path: tuple[str | int, ...]) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "x.plan: line 1, column 1: no JSON"),
-        ('{\n "fileType": \n}', "x.plan: line 3, column 1: no JSON"),
-        ('{"version": NaN}', "x.plan: no JSON: NaN is none of its numbers"),
-        ("[" * 100_000, "x.plan: no JSON"),
+        ("", "x.plan: line 1, column 1: not valid JSON"),
+        ('{\n "fileType": \n}', "x.plan: line 3, column 1: not valid JSON"),
+        ('{"version": NaN}', "x.plan: not valid JSON: NaN is not allowed"),
+        ("[" * 100_000, "x.plan: not valid JSON"),
         ("[]", "x.plan: the document = .*: expected an object"),
         ('{"fileType": "Plan", "version": 1}', "the document has no 'mission'"),
     ],
 )
-def test_what_is_no_plan(text: str, message: str, tmp_path: Path) -> None:
+def test_other_files_are_rejected_as_plan(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.plan"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(FileFormatError, match=message):
         read_plan_file(path)
 
 
-def test_bytes_that_are_no_text(tmp_path: Path) -> None:
+def test_plan_file_with_invalid_utf8_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "x.plan"
     path.write_bytes(b'{"a": "\xff"}')
-    with pytest.raises(FileFormatError, match=r"x.plan: byte 7: no text"):
+    with pytest.raises(FileFormatError, match=r"x.plan: byte 7 is not valid UTF-8"):
         read_plan_file(path)
     path.write_bytes(b"\xef\xbb\xbf" + samples.text(samples.full_document()).encode())
     assert len(read_plan_file(path).mission) == 13
 
 
 def damaged(value: Any, rng: random.Random, junk: Callable[[], Any]) -> Any:
-    """The same document with one value replaced or removed somewhere."""
+    """Return the document with one value replaced or removed."""
     document = copy.deepcopy(value)
     node = document
     while isinstance(node, (dict, list)) and node:
@@ -520,7 +517,7 @@ def damaged(value: Any, rng: random.Random, junk: Callable[[], Any]) -> Any:
     | st.just([]),
 )
 @settings(max_examples=100, deadline=None)
-def test_any_damage_is_an_error_of_ours_or_none(seed: int, junk: object) -> None:
+def test_damaged_plan_file_raises_only_our_errors(seed: int, junk: object) -> None:
     document = damaged(samples.full_document(), random.Random(seed), lambda: junk)
     try:
         plan = read(document)

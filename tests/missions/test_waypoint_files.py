@@ -1,4 +1,4 @@
-"""QGC WPL files: read as people have them, written as Mission Planner does, understood by pymavlink."""
+"""QGC WPL files: reading of real files, writing as Mission Planner does, and pymavlink's reading."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MISSION_PLANNER = """QGC WPL 110
 """
 
 
-def test_mission_planners_form_is_read_and_written_to_the_byte() -> None:
+def test_mission_planner_file_round_trip_is_exact() -> None:
     mission = parse_waypoints(MISSION_PLANNER)
     assert mission.home == Position(-35.363262, 149.165237, 584.09)
     assert [item.command for item in mission] == [22, 16, 203, 177, 20]
@@ -59,35 +59,35 @@ def test_mission_planners_form_is_read_and_written_to_the_byte() -> None:
         MISSION_PLANNER.replace("\n", "\r\n"),
         "\ufeff" + MISSION_PLANNER.replace("\n", "\n\n# a remark\n"),
         MISSION_PLANNER.replace("QGC WPL 110", "QGC WPL  110 ").rstrip("\n"),
-        MISSION_PLANNER.replace("0\t1\t0\t16", "0\t1\t0\t0"),  # older Mission Planners
+        MISSION_PLANNER.replace("0\t1\t0\t16", "0\t1\t0\t0"),  # older Mission Planner versions
     ],
 )
-def test_forms_that_mean_the_same(text: str, tmp_path: Path) -> None:
+def test_equivalent_waypoint_files_read_the_same(text: str, tmp_path: Path) -> None:
     path = tmp_path / "mission.waypoints"
     path.write_text(text, encoding="utf-8", newline="")
     assert read_waypoint_file(path) == parse_waypoints(MISSION_PLANNER)
 
 
-def test_without_home() -> None:
+def test_waypoint_file_without_home() -> None:
     lines = MISSION_PLANNER.splitlines()
     rows = [f"{index}\t{line.split(chr(9), 1)[1]}" for index, line in enumerate(lines[2:])]
     text = "\n".join(["QGC WPL 120", *rows]).replace("177\t2.0", "177\t1.0")
     expected = parse_waypoints(MISSION_PLANNER).replace(home=None)
     assert parse_waypoints(text) == expected
-    assert parse_waypoints(text.replace("120", "110")) == expected  # a take-off is no home
+    assert parse_waypoints(text.replace("120", "110")) == expected  # a take-off is not taken as home
     assert format_waypoints(expected, version=120).splitlines() == text.splitlines()
     assert parse_waypoints(format_waypoints(expected)) == expected
     assert format_waypoints(expected).splitlines()[1].startswith("0\t1\t0\t16\t0\t0\t0\t0\t0.000000")
 
 
-def test_empty_missions() -> None:
+def test_waypoint_file_with_empty_mission() -> None:
     assert parse_waypoints("QGC WPL 110\n") == Mission()
     assert parse_waypoints(format_waypoints(Mission())) == Mission()
     home = Mission(home=Position(47, 8, 400.0))
     assert parse_waypoints(format_waypoints(home)) == home
 
 
-def test_numbers_that_need_more_digits() -> None:
+def test_waypoint_file_writes_enough_digits() -> None:
     mission = Mission(
         [
             MissionItem(183, 2, 0.1 + 0.2, 1e-12, 1e20, math.nan, z=1 / 3),
@@ -118,7 +118,7 @@ missions = st.builds(Mission, st.lists(items, max_size=6), homes)
 
 @given(missions)
 @settings(max_examples=60, deadline=None)
-def test_any_mission_comes_back_as_it_was(mission: Mission) -> None:
+def test_waypoint_file_round_trip(mission: Mission) -> None:
     text = format_waypoints(mission)
     assert parse_waypoints(text) == mission
     assert format_waypoints(parse_waypoints(text)) == text
@@ -126,7 +126,7 @@ def test_any_mission_comes_back_as_it_was(mission: Mission) -> None:
 
 @given(st.text(max_size=60), st.integers(0, 400), st.integers(0, 400))
 @settings(max_examples=100, deadline=None)
-def test_any_damage_is_an_error_of_ours_or_none(junk: str, start: int, length: int) -> None:
+def test_damaged_waypoint_file_raises_only_our_errors(junk: str, start: int, length: int) -> None:
     for text in (
         junk,
         "QGC WPL 110\n" + junk,
@@ -142,7 +142,7 @@ def test_any_damage_is_an_error_of_ours_or_none(junk: str, start: int, length: i
     ("old", "new", "message"),
     [
         ("QGC WPL 110", "QGC WPL 100", "line 1: expected 'QGC WPL 110', found 'QGC WPL 100'"),
-        ("\n2\t0", "\n3\t0", "line 4: index = 3: expected 2, lines are missing"),
+        ("\n2\t0", "\n3\t0", "line 4: index = 3: expected 2; lines are missing"),
         ("\t0.000000\t0\n", "\t0\n", "line 7: expected 12 columns, found 11"),
         ("-35.36180530", "91.0", "line 4: latitude = '91.0': expected a number from -90 to 90"),
         ("149.16507460", "181", "line 4: longitude = '181'"),
@@ -157,14 +157,14 @@ def test_any_damage_is_an_error_of_ours_or_none(junk: str, start: int, length: i
         ("0.000000\t0\n", "0.000000\t-1\n", "line 7: autocontinue = '-1'"),
     ],
 )
-def test_damaged_files(old: str, new: str, message: str) -> None:
+def test_waypoint_file_error_names_line(old: str, new: str, message: str) -> None:
     text = MISSION_PLANNER.replace(old, new, 1)
     assert text != MISSION_PLANNER
     with pytest.raises(FileFormatError, match=f"^a.txt: {message}"):
         parse_waypoints(text, "a.txt")
 
 
-def test_what_cannot_be_written() -> None:
+def test_waypoint_file_rejects_infinite_numbers() -> None:
     with pytest.raises(InvalidArgument, match="infinite"):
         format_waypoints(Mission([MissionItem(16, 3, math.inf)]))
     with pytest.raises(InvalidArgument, match="version = 100 is not allowed"):
@@ -185,7 +185,7 @@ MISSION = Mission(
 )
 
 
-def test_pymavlink_reads_what_we_write(tmp_path: Path) -> None:
+def test_pymavlink_reads_our_waypoint_file(tmp_path: Path) -> None:
     path = tmp_path / "ours.waypoints"
     write_waypoint_file(path, MISSION)
     loader = mavwp.MAVWPLoader()
@@ -202,7 +202,7 @@ def test_pymavlink_reads_what_we_write(tmp_path: Path) -> None:
     assert loader.wpoints[5].param1 == 2
 
 
-def test_we_read_what_pymavlink_writes(tmp_path: Path) -> None:
+def test_waypoint_file_of_pymavlink_is_read(tmp_path: Path) -> None:
     ours, theirs = tmp_path / "ours.txt", tmp_path / "theirs.txt"
     write_waypoint_file(ours, MISSION)
     loader = mavwp.MAVWPLoader()

@@ -1,8 +1,8 @@
-"""Does a test notice when one thing in the sources is changed? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`.
+"""Mutation tests: does a test fail for a changed line? `nox -s mutants -- [PATH …] [--sample N] [--seed S]`.
 
-A sample of all single changes (`mutations.py`) is drawn; for each the tests that run the changed lines (`reach.py`) are
-run on a copy of the sources, the nearest and quickest first, until one fails. What no test notices is printed, unless
-`equivalent.json` says why it changes nothing.
+Draws a sample of all single changes (`mutations.py`); for each, the tests that run the changed lines (`reach.py`) run
+on a copy of the sources, the nearest and fastest first, until one fails. Undetected changes are printed, unless
+`equivalent.json` says why they change nothing.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def main() -> int:
     return 0 if score >= GOAL else 1
 
 
-def _verdict(
-    trials: Trials, mutation: Mutation, changed: str, tests: list[str], reach: Reach
-) -> tuple[str, str]:
-    """What became of the change. A test counts only if it passes, after the same others, without the change, too."""
+def _verdict(trials: Trials, mutation: Mutation, changed: str, tests: list[str], reach: Reach) -> tuple[str, str]:
+    """Return the result of a change. A failing test counts only if it passes, after the same others, without the
+    change.
+    """
     while True:
         verdict, by = trials.run(mutation.path, changed, tests, reach.seconds)
         test = next((each for each in tests if verdict == NOTICED and each in by), None)
@@ -104,9 +104,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("paths", nargs="*", default=PACKAGES, help="files or folders in src/aerokit")
     parser.add_argument("--sample", type=int, default=200, help="so many changes, drawn by chance (200)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--seconds", type=float, default=60, help="processor time of the tests of a change (60)"
-    )
+    parser.add_argument("--seconds", type=float, default=60, help="processor time of the tests of a change (60)")
     parser.add_argument("--tests", nargs="*", default=TESTS, help="test files or folders in tests/")
     parser.add_argument("--only", nargs="*", type=int, help="of the sample, those with these numbers")
     parser.add_argument("--verbose", action="store_true", help="show the changes that were noticed, too")

@@ -80,12 +80,12 @@ class Mutation:
     operator: str
     occurrence: int
     lines: tuple[int, ...]
-    """Of the statement: the tests that run one of them run the change."""
+    """Lines of the statement: the tests that run one of them run the change."""
     at_import: bool
-    """Whether it is run once only, by whoever imports the file first: then any test may depend on it."""
+    """True if it runs only at import: then any test may depend on it."""
 
     def apply(self, source: str) -> str | None:
-        """The changed source; ``None`` where only an annotation changes, which nobody runs."""
+        """Return the changed source; ``None`` if only an annotation changes, which is not executed."""
         changed = mutate_code(source, OPERATORS[self.operator](), self.occurrence)
         return changed if changed is not None and _runs_otherwise(source, changed) else None
 
@@ -137,7 +137,7 @@ def _statements(source: str) -> dict[int, tuple[tuple[int, ...], bool]]:
 
 
 def difference(before: str, after: str) -> tuple[str, str]:
-    """What stood there and what stands there now, in one line each."""
+    """Return the code before and after, in one line each."""
     changes = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0))[3:]
     old, new = (" ".join(line[1:].strip() for line in changes if line[0] == sign) for sign in "-+")
     return old, new

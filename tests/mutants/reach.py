@@ -1,4 +1,4 @@
-"""Which tests run which lines: each test file runs once under coverage, again only when it or the sources change."""
+"""Lines run by each test: a test file runs once under coverage, again only when it or the sources change."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ AT_IMPORT = ""
 
 @dataclass
 class Reach:
-    """What the measured tests run, and how long they take."""
+    """Lines run by the measured tests, and their durations."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     by_line: dict[tuple[str, int], set[str]] = field(default_factory=dict)

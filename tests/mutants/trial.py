@@ -30,8 +30,8 @@ PRELOADED = (
 )
 
 NOTICED_BY = (pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.INTERRUPTED, pytest.ExitCode.USAGE_ERROR)
+# pytest fails at its very end, without an exit code, if a test left a file open.
 LEFT_OPEN = "PytestUnraisableExceptionWarning"
-"""Of a file, say, that nobody closed: pytest fails at its very end, with no exit code for it."""
 
 PRELOADED_IS_FINE = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 
@@ -44,7 +44,7 @@ class Trials:
 
     def __enter__(self) -> Trials:
         shutil.copytree(SOURCE, self._copy)
-        compileall.compile_dir(self._copy, quiet=2)  # what was not imported yet
+        compileall.compile_dir(self._copy, quiet=2)  # Modules that were not imported yet.
         for name in PRELOADED:
             importlib.import_module(name)
         return self
@@ -54,10 +54,8 @@ class Trials:
     ) -> None:
         pass
 
-    def run(
-        self, path: str, changed: str, tests: Sequence[str], seconds: Mapping[str, float]
-    ) -> tuple[str, str]:
-        """What became of the change, and the test that noticed it."""
+    def run(self, path: str, changed: str, tests: Sequence[str], seconds: Mapping[str, float]) -> tuple[str, str]:
+        """Return the result of the change, and the test that detected it."""
         if not tests:
             return SURVIVED, "no test runs it"
         target = self._copy / path

@@ -1,4 +1,4 @@
-"""Camera definition files: what is read of them, what excludes what, and what a setting takes."""
+"""Camera definition files: parsing, exclusions, and valid values of a setting."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit._internal.files import LARGEST_FILE
+from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters import CameraDefinition, SettingValue, load_definition, parse_definition
-from aerokit.parameters.setting import checked_setting, setting_bytes, setting_value, settings_equal
+from aerokit.parameters.parameter import checked_setting, setting_bytes, setting_value, settings_equal
 from aerokit.sim import components
 
 OWN = Path(components.__file__).with_name("camera_definition.xml")
@@ -37,10 +37,10 @@ def refusal(camera: CameraDefinition, name: str, value: object, **values: Settin
     return str(caught.value)
 
 
-# ------------------------------------------------------------------------------------ what is read
+# ----------------------------------------------------------------------------------------- reading
 
 
-def test_what_the_file_says_of_a_camera_and_its_settings() -> None:
+def test_definition_file_is_parsed() -> None:
     assert (CAMERA.vendor, CAMERA.model, CAMERA.version) == ("aerokit", "Simulated camera", 1)
     assert repr(CAMERA) == "<CameraDefinition of aerokit Simulated camera: 12 settings>"
     ev = CAMERA.settings["CAM_EV"]
@@ -58,13 +58,13 @@ def test_what_the_file_says_of_a_camera_and_its_settings() -> None:
     assert (pin.write_only, pin.read_only, pin.is_control) == (True, False, False)
 
 
-def test_compressed_or_not(tmp_path: Path) -> None:
+def test_definition_file_may_be_compressed(tmp_path: Path) -> None:
     path = tmp_path / "camera.xml.xz"
     path.write_bytes(lzma.compress(OWN.read_bytes()))
     assert load_definition(path) == CAMERA
 
 
-def test_texts_in_other_languages() -> None:
+def test_definition_translations() -> None:
     for locale in ("de_DE", "de", "de_CH"):
         german = CAMERA.localized(locale).settings["CAM_WBMODE"]
         assert german.description == "Weißabgleich"
@@ -73,7 +73,7 @@ def test_texts_in_other_languages() -> None:
     assert CAMERA.localized("de").checked("CAM_WBMODE", "Sonnig", {}) == 4
 
 
-def test_what_makes_no_sense_is_left_out() -> None:
+def test_invalid_definitions_are_ignored() -> None:
     camera = of(
         """<parameter name="A" type="uint8" default="300" min="low" max="nan" step="">
              <options><option name="big" value="999"/><option name="none"/><option name="x" value="x"/>
@@ -92,10 +92,10 @@ def test_what_makes_no_sense_is_left_out() -> None:
     assert camera.settings["B"].type == "int8"
 
 
-# ---------------------------------------------------------------------------- what excludes what
+# ------------------------------------------------------------------------------------ exclusions
 
 
-def test_what_an_option_excludes_cannot_be_set() -> None:
+def test_excluded_setting_cannot_be_set() -> None:
     text = refusal(CAMERA, "CAM_ISO", 400, CAM_EXPMODE=0)
     assert text == "CAM_ISO = 400 is not allowed now: excluded by CAM_EXPMODE = Auto"
     assert CAMERA.checked("CAM_ISO", 400, {"CAM_EXPMODE": 1}) == 400
@@ -103,13 +103,11 @@ def test_what_an_option_excludes_cannot_be_set() -> None:
     assert CAMERA.excluded_by("CAM_EV", {}) == ()
 
 
-def test_ranges_hold_under_their_condition() -> None:
+def test_range_applies_under_its_condition() -> None:
     assert len(CAMERA.options("CAM_ISO", {"CAM_MODE": 1})) == 5
     assert [each.name for each in CAMERA.options("CAM_ISO", VIDEO_BY_HAND)] == ["100", "200", "400"]
     text = refusal(CAMERA, "CAM_ISO", 800, CAM_MODE=1, CAM_EXPMODE=1)
-    assert (
-        text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100' (100), '200' (200), '400' (400)"
-    )
+    assert text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100' (100), '200' (200), '400' (400)"
     assert "1/30" in refusal(CAMERA, "CAM_SHUTTER", "1/30", **VIDEO_BY_HAND)
     assert len(CAMERA.options("CAM_SHUTTER", {**VIDEO_BY_HAND, "CAM_MODE": 0})) == 4
 
@@ -132,7 +130,7 @@ def test_ranges_hold_under_their_condition() -> None:
         ("A=0.016666", {"A": 0.016666000708937645}, True),
     ],
 )
-def test_conditions(condition: str, values: dict[str, SettingValue], holds: bool) -> None:
+def test_condition_evaluation(condition: str, values: dict[str, SettingValue], holds: bool) -> None:
     condition = condition.replace("<", "&lt;").replace(">", "&gt;")
     camera = of(
         f"""<parameter name="R" type="uint8"><options><option name="on" value="1"><parameterranges>
@@ -141,22 +139,22 @@ def test_conditions(condition: str, values: dict[str, SettingValue], holds: bool
             <parameter name="A" type="float"/><parameter name="B" type="float"/>"""
     )
     assert bool(camera.options("S", {"R": 1, **values})) == holds
-    assert set(camera.rulers("S")) >= {"R"}
+    assert set(camera.dependencies("S")) >= {"R"}
 
 
-def test_of_several_ranges_each_has_its_say() -> None:
+def test_several_ranges_apply_together() -> None:
     def ruler(name: str, *allowed: int) -> str:
         options = "".join(f'<roption name="{each}" value="{each}"/>' for each in allowed)
         return f"""<parameter name="{name}" type="uint8"><options><option name="on" value="1"><parameterranges>
             <parameterrange parameter="S">{options}</parameterrange></parameterranges></option></options></parameter>"""
 
     camera = of(f'{ruler("A", 1, 2)}{ruler("B", 2, 3)}<parameter name="S" type="uint8"/>')
-    assert camera.rulers("S") == ("A", "B")
+    assert camera.dependencies("S") == ("A", "B")
     assert [each.value for each in camera.options("S", {"A": 1, "B": 1})] == [2]
     assert "while A = on, B = on: '2' (2)" in refusal(camera, "S", 3, A=1, B=1)
 
 
-def test_an_option_cannot_exclude_its_own_setting() -> None:
+def test_option_cannot_exclude_own_setting() -> None:
     camera = of(
         """<parameter name="A" type="uint8"><options><option name="off" value="0"><exclusions>
              <exclude>A</exclude></exclusions></option><option name="on" value="1"/></options></parameter>"""
@@ -164,12 +162,12 @@ def test_an_option_cannot_exclude_its_own_setting() -> None:
     assert camera.checked("A", "on", {"A": 0}) == 1
 
 
-def test_who_decides_on_a_setting() -> None:
-    assert CAMERA.rulers("CAM_SHUTTER") == ("CAM_EXPMODE", "CAM_VIDRES", "CAM_MODE")
-    assert CAMERA.rulers("CAM_WBMODE") == ()
+def test_setting_dependencies() -> None:
+    assert CAMERA.dependencies("CAM_SHUTTER") == ("CAM_EXPMODE", "CAM_VIDRES", "CAM_MODE")
+    assert CAMERA.dependencies("CAM_WBMODE") == ()
 
 
-# ------------------------------------------------------------------------------- what it takes
+# -------------------------------------------------------------------------------- valid values
 
 
 @pytest.mark.parametrize(
@@ -186,7 +184,7 @@ def test_who_decides_on_a_setting() -> None:
         ("CAM_OFFSET", -100, -100),
     ],
 )
-def test_what_is_taken(name: str, value: object, sent: object) -> None:
+def test_definition_accepts_value(name: str, value: object, sent: object) -> None:
     taken = CAMERA.checked(name, value, {})
     assert taken == sent
     assert type(taken) is type(sent) or not isinstance(sent, bool)
@@ -203,7 +201,7 @@ def test_what_is_taken(name: str, value: object, sent: object) -> None:
         ("CAM_EV", float("nan"), "a finite number"),
         ("CAM_QUALITY", 91, r"10, 15, 20 …"),
         ("CAM_QUALITY", 5, r"10\.\.100"),
-        ("CAM_QUALITY", 50.5, "whole numbers"),
+        ("CAM_QUALITY", 50.5, "a whole number"),
         ("CAM_STAMP", 2, "True or False"),
         ("CAM_OWNER", 5, "a text or bytes"),
         ("CAM_OWNER", "x" * 129, "at most 128"),
@@ -211,7 +209,7 @@ def test_what_is_taken(name: str, value: object, sent: object) -> None:
         ("CAM_LENS", "new", "can only be read"),
     ],
 )
-def test_what_is_refused(name: str, value: object, complaint: str) -> None:
+def test_definition_rejects_value(name: str, value: object, complaint: str) -> None:
     with pytest.raises(InvalidArgument, match=complaint) as caught:
         CAMERA.checked(name, value, {})
     assert str(caught.value).startswith(f"{name} = ")
@@ -233,17 +231,13 @@ NUMBERS = st.one_of(
     ),
     st.tuples(st.floats(allow_nan=False, allow_infinity=False), st.just(MavParamExtType.REAL64)),
     st.tuples(st.floats(width=32, allow_nan=False, allow_infinity=False), st.just(MavParamExtType.REAL32)),
-    st.tuples(
-        st.text(max_size=30).filter(lambda text: not text.endswith("\0")), st.just(MavParamExtType.CUSTOM)
-    ),
-    st.tuples(
-        st.binary(max_size=128).filter(lambda data: data[-1:] != b"\0"), st.just(MavParamExtType.CUSTOM)
-    ),
+    st.tuples(st.text(max_size=30).filter(lambda text: not text.endswith("\0")), st.just(MavParamExtType.CUSTOM)),
+    st.tuples(st.binary(max_size=128).filter(lambda data: data[-1:] != b"\0"), st.just(MavParamExtType.CUSTOM)),
 )
 
 
 @given(NUMBERS)
-def test_values_there_and_back(given_value: tuple[SettingValue, MavParamExtType]) -> None:
+def test_setting_value_round_trip(given_value: tuple[SettingValue, MavParamExtType]) -> None:
     value, kind = given_value
     try:
         wanted = checked_setting("A", value, kind)
@@ -256,12 +250,12 @@ def test_values_there_and_back(given_value: tuple[SettingValue, MavParamExtType]
 
 
 @given(st.binary(max_size=128), st.integers(0, 255))
-def test_any_bytes_of_any_type_are_some_value(data: bytes, kind: int) -> None:
+def test_setting_value_decodes_any_bytes(data: bytes, kind: int) -> None:
     value = setting_value(data, kind)
     assert settings_equal(value, value)
 
 
-def test_the_bytes_of_numbers_are_those_of_c() -> None:
+def test_setting_bytes_match_c() -> None:
     assert setting_bytes(-2, MavParamExtType.INT16) == b"\xfe\xff"
     assert setting_bytes(0.5, MavParamExtType.REAL32) == b"\0\0\0\x3f"
     assert setting_value(b"\xff", 77) == b"\xff"
@@ -271,7 +265,7 @@ def test_the_bytes_of_numbers_are_those_of_c() -> None:
     ("one", "other", "same"),
     [(1, True, True), (0.1, 0.10000000149, True), (1, 2, False), ("a", b"a", True), ("1", 1, False)],
 )
-def test_what_a_component_cannot_tell_apart(one: SettingValue, other: SettingValue, same: bool) -> None:
+def test_settings_equal_as_32_bit_floats(one: SettingValue, other: SettingValue, same: bool) -> None:
     assert settings_equal(one, other) == settings_equal(other, one) == same
 
 
@@ -297,25 +291,25 @@ BOMB = b"""<?xml version="1.0"?><!DOCTYPE mavlinkcamera [<!ENTITY a "aaaaaaaaaa"
     ],
     ids=lambda data: repr(data[-30:]),
 )
-def test_a_file_that_is_none(data: bytes) -> None:
-    with pytest.raises(FileFormatError, match=r"^camera definition (is|describes) "):
+def test_other_files_are_rejected_as_definition(data: bytes) -> None:
+    with pytest.raises(FileFormatError, match=r"^camera definition (is|defines) "):
         parse_definition(data)
 
 
-def test_a_small_file_that_unpacks_to_a_large_one() -> None:
-    bomb = lzma.compress(bytes(LARGEST_FILE + (1 << 20)), preset=0)
+def test_definition_rejects_large_decompressed_file() -> None:
+    bomb = lzma.compress(bytes(MAX_FILE_SIZE + (1 << 20)), preset=0)
     tracemalloc.start()
     try:
-        with pytest.raises(FileFormatError, match=r"^camera definition has more than 16 MB"):
+        with pytest.raises(FileFormatError, match=r"^camera definition is too large: more than 16 MB"):
             parse_definition(bomb)
-        assert tracemalloc.get_traced_memory()[1] < 3 * LARGEST_FILE
+        assert tracemalloc.get_traced_memory()[1] < 3 * MAX_FILE_SIZE
     finally:
         tracemalloc.stop()
     with pytest.raises(FileFormatError, match="more than 16 MB"):
-        parse_definition(bytes(LARGEST_FILE + 1))
+        parse_definition(bytes(MAX_FILE_SIZE + 1))
 
 
-def test_a_long_condition_and_many_options_take_no_time() -> None:
+def test_long_condition_and_many_options_are_fast() -> None:
     options = "".join(f'<option name="{n}" value="{n}"/>' for n in range(10_000))
     condition = " " * 200_000 + "A=1" + " AND A=1" * 20_000
     camera = of(

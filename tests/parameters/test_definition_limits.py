@@ -1,4 +1,4 @@
-"""Definition files that somebody hostile has written hold up nobody, and say nothing wrong."""
+"""Hostile camera definition files: parsing stays fast and correct."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ import pytest
 
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters import parse_definition
-from aerokit.parameters.definition import LARGEST_DEFINITION, MOST_ELEMENTS
+from aerokit.parameters.definition import MAX_DEFINITION_SIZE, MAX_ELEMENTS
 
 
 def file_of(settings: str) -> bytes:
     return f"<mavlinkcamera><parameters>{settings}</parameters></mavlinkcamera>".encode()
 
 
-def test_a_small_file_that_unpacks_to_a_large_one_is_refused() -> None:
-    packed = lzma.compress(file_of("<!--" + "x" * LARGEST_DEFINITION + "-->"))
+def test_definition_rejects_decompression_bomb() -> None:
+    packed = lzma.compress(file_of("<!--" + "x" * MAX_DEFINITION_SIZE + "-->"))
     assert len(packed) < 10_000
     with pytest.raises(FileFormatError, match="more than 1024 kB"):
         parse_definition(packed)
 
 
 @pytest.mark.parametrize("element", ["<a/>", '<parameter name="A" type="bool"/>'])
-def test_more_elements_than_a_camera_has_are_refused(element: str) -> None:
-    with pytest.raises(FileFormatError, match=f"more than {MOST_ELEMENTS} elements"):
-        parse_definition(file_of(element * MOST_ELEMENTS))
+def test_definition_rejects_too_many_elements(element: str) -> None:
+    with pytest.raises(FileFormatError, match=f"more than {MAX_ELEMENTS} elements"):
+        parse_definition(file_of(element * MAX_ELEMENTS))
 
 
-def test_many_options_of_several_rulers_are_no_product() -> None:
-    """4,000 options under each of two rulers: by comparing each with each, it took minutes."""
+def test_options_of_several_dependencies_are_fast() -> None:
+    """4,000 options under each of two dependencies: comparing all pairs took minutes."""
     allowed = "".join(f'<roption name="o{number}" value="{number}"/>' for number in range(4000))
 
     def ruler(name: str) -> str:
@@ -48,13 +48,13 @@ def test_many_options_of_several_rulers_are_no_product() -> None:
 
 @pytest.mark.parametrize("bound", ["0x" + "f" * 400, "1e400", "nan", "inf"])
 @pytest.mark.parametrize("which", ["min", "max", "step"])
-def test_bounds_that_no_number_holds_are_none(which: str, bound: str) -> None:
+def test_definition_ignores_infinite_bounds(which: str, bound: str) -> None:
     definition = parse_definition(file_of(f'<parameter name="A" type="int32" {which}="{bound}"/>'))
     assert definition.checked("A", 5, {}) == 5
     assert definition.settings["A"].minimum is definition.settings["A"].maximum is None
 
 
-def test_names_that_cannot_be_on_the_wire_are_left_out() -> None:
+def test_definition_ignores_invalid_names() -> None:
     definition = parse_definition(
         file_of(
             f'<parameter name="{"N" * 17}" type="bool"/><parameter name="é" type="bool"/>'
@@ -66,15 +66,15 @@ def test_names_that_cannot_be_on_the_wire_are_left_out() -> None:
     assert definition.settings["A"].updates == ("B",)
 
 
-def test_options_that_are_alike_as_the_camera_stores_them_stay() -> None:
+def test_options_equal_as_stored_are_kept() -> None:
     both = '<roption name="a" value="0.1"/><roption name="b" value="0.2"/>'
     one = '<roption name="a" value="0.10000000149"/>'
-    rulers = "".join(
+    dependencies = "".join(
         f'<parameter name="{name}" type="int8"><options><option name="on" value="1"><parameterranges><parameterrange'
         f' parameter="A">{options}</parameterrange></parameterranges></option></options></parameter>'
         for name, options in (("B", both), ("C", one))
     )
-    definition = parse_definition(file_of('<parameter name="A" type="float"/>' + rulers))
+    definition = parse_definition(file_of('<parameter name="A" type="float"/>' + dependencies))
     assert [each.name for each in definition.options("A", {"B": 1, "C": 1})] == ["a"]
     with pytest.raises(InvalidArgument):
         definition.checked("A", 0.2, {"B": 1, "C": 1})

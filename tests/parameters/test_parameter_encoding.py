@@ -1,4 +1,4 @@
-"""Values in messages: ArduPilot's cast and PX4's bytes, every bit of them."""
+"""Parameter values in messages: ArduPilot's cast and PX4's bytes, bit by bit."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ TYPES = [*SMALL, ParameterType.UINT32, ParameterType.INT32, ParameterType.REAL32
 def parameters(draw: st.DrawFn) -> Parameter:
     type_ = draw(st.sampled_from(TYPES))
     value: int | float = (
-        draw(st.integers(int(type_.low), int(type_.high)))
+        draw(st.integers(int(type_.minimum), int(type_.maximum)))
         if type_.is_integer
         else draw(st.floats(width=32, allow_nan=False, allow_infinity=False))
     )
     return Parameter("SIXTEEN_LETTERS_", value, type_, None, draw(st.none() | st.integers(0, 65534)))
 
 
-def over_the_air(message: ParamValue | ParamSet) -> Frame:
+def transmitted(message: ParamValue | ParamSet) -> Frame:
     return Frame.parse(FrameEncoder(1, 1).encode(message))
 
 
@@ -41,20 +41,20 @@ def over_the_air(message: ParamValue | ParamSet) -> Frame:
 @example(Parameter("SIGNALLING", 0x7F800001, ParameterType.UINT32))
 @example(Parameter("QUIET", -1, ParameterType.INT32))
 @example(Parameter("ZERO", 0, ParameterType.INT32))
-def test_bytewise_keeps_every_bit(parameter: Parameter) -> None:
+def test_bytewise_encoding_is_exact(parameter: Parameter) -> None:
     sent = value_message(parameter, 900, bytewise=True)
-    frame = over_the_air(sent)
+    frame = transmitted(sent)
     assert parameter_of(ParamValue.decode_body(frame.body, frame), bytewise=True) == parameter
     assert parameter_of(sent, bytewise=True) == parameter
     order = set_message(1, 1, parameter.name, parameter.value, parameter.type, bytewise=True)
-    frame = over_the_air(order)
+    frame = transmitted(order)
     received = ParamSet.decode_body(frame.body, frame)
     assert value_of(received, bytewise=True) == value_of(order, bytewise=True) == parameter.value
     assert received.param_type == parameter.type
 
 
 @given(parameters())
-def test_cast_keeps_what_float32_can(parameter: Parameter) -> None:
+def test_cast_encoding_keeps_float32_precision(parameter: Parameter) -> None:
     wire = to_wire(parameter.value, parameter.type, bytewise=False)
     assert wire == struct.unpack("<f", struct.pack("<f", parameter.value))[0]
     back = from_wire(wire, parameter.type, bytewise=False)
@@ -64,29 +64,29 @@ def test_cast_keeps_what_float32_can(parameter: Parameter) -> None:
 
 
 @given(parameters())
-def test_bytes_are_those_of_c(parameter: Parameter) -> None:
+def test_bytewise_encoding_matches_c(parameter: Parameter) -> None:
     format_ = dict(zip(TYPES, "BbHhIif", strict=True))[parameter.type]
     payload = value_message(parameter, 900, bytewise=True).encode()
     assert struct.unpack_from("<" + format_, payload) == (parameter.value,)
 
 
-def test_a_float_is_enough_but_for_signalling_nans() -> None:
+def test_float_is_exact_except_signalling_nan() -> None:
     for value in (0, 1, -1, 2**31 - 1, -(2**31)):
         type_ = ParameterType.INT32
         assert from_wire(to_wire(value, type_, True), type_, True) == value
     assert type(set_message(1, 1, "A", 5, ParameterType.INT32, True)) is ParamSet
 
 
-def test_nonsense_off_the_air_is_returned_as_it_is() -> None:
+def test_invalid_received_value_is_returned() -> None:
     assert math.isnan(from_wire(math.nan, ParameterType.INT8, False))
     assert from_wire(1.5, ParameterType.INT8, False) == 1.5
     assert from_wire(math.inf, ParameterType.REAL32, True) == math.inf
-    message = ParamValue("X", math.nan, 0, 1, 65535)  # no such type
+    message = ParamValue("X", math.nan, 0, 1, 65535)  # an unknown type
     assert parameter_of(message, True).type is ParameterType.REAL32
     assert parameter_of(message, True).index is None
 
 
-def test_eight_bytes_do_not_fit() -> None:
+def test_eight_byte_type_is_rejected() -> None:
     value = checked_value("X", 5, ParameterType.INT64)
     with pytest.raises(InvalidArgument, match="INT64"):
         to_wire(value, ParameterType.INT64, bytewise=True)

@@ -1,4 +1,4 @@
-"""Metadata files of both autopilots, in the four forms they come in, and PX4's hash."""
+"""Metadata files of both autopilots in four formats, and PX4's hash."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ PX4_JSON: dict[str, Any] = {
 }
 
 
-def test_ardupilot() -> None:
+def test_ardupilot_metadata_files() -> None:
     metadata = parse_metadata(ARDUPILOT_XML.encode())
     assert list(metadata) == ["RTL_CONE_SLOPE", "LOG_BACKEND_TYPE", "BARO1_GND_PRESS"]
     assert repr(metadata) == "<Metadata of 3 parameters>"
@@ -180,7 +180,7 @@ def test_ardupilot() -> None:
     assert dict(parse_metadata(json.dumps(ARDUPILOT_JSON).encode())) == dict(metadata)
 
 
-def test_px4(tmp_path: Path) -> None:
+def test_px4_metadata_files(tmp_path: Path) -> None:
     data = json.dumps(PX4_JSON).encode()
     metadata = parse_metadata(data)
     assert metadata.volatile == {"COM_FLIGHT_UUID"}
@@ -193,7 +193,7 @@ def test_px4(tmp_path: Path) -> None:
     assert dict(load_metadata(path)) == dict(load_metadata(str(path))) == dict(metadata)
 
 
-def test_values_in_words() -> None:
+def test_metadata_describes_values() -> None:
     metadata = {**parse_metadata(json.dumps(PX4_JSON).encode()), **parse_metadata(ARDUPILOT_XML.encode())}
     cruise, checks = metadata["MPC_XY_CRUISE"], metadata["COM_ARM_CHK"]
     assert cruise.describe(-1) == "As fast as it can"
@@ -202,7 +202,7 @@ def test_values_in_words() -> None:
     assert metadata["RTL_CONE_SLOPE"].describe(3.0) == "Steep"
 
 
-def test_ranges() -> None:
+def test_metadata_checks_ranges() -> None:
     metadata = parse_metadata(json.dumps(PX4_JSON).encode())
     for name, value in {
         "MPC_XY_CRUISE": 20,
@@ -211,7 +211,7 @@ def test_ranges() -> None:
         "COM_ARM_CHK": 99,
     }.items():
         metadata.check(name, value)
-    metadata.check("MPC_XY_CRUISE", -1)  # it has a name
+    metadata.check("MPC_XY_CRUISE", -1)  # a named value below the minimum
     with pytest.raises(InvalidArgument, match=r"MPC_XY_CRUISE = 25 is not in 3\.\.20 m/s"):
         metadata.check("MPC_XY_CRUISE", 25)
     with pytest.raises(InvalidArgument, match=r"COM_FLIGHT_UUID = -1 is not in 0\.\."):
@@ -242,7 +242,7 @@ def test_ranges() -> None:
         lzma.compress(b"[]"),
     ],
 )
-def test_files_of_another_kind(data: bytes, tmp_path: Path) -> None:
+def test_other_files_are_rejected_as_metadata(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "some.json"
     path.write_bytes(data)
     with pytest.raises(FileFormatError, match=r"some\.json"):
@@ -250,12 +250,12 @@ def test_files_of_another_kind(data: bytes, tmp_path: Path) -> None:
 
 
 @given(st.binary(max_size=60))
-def test_noise(data: bytes) -> None:
+def test_metadata_parses_noise_or_raises(data: bytes) -> None:
     with pytest.raises(FileFormatError):
         parse_metadata(data)
 
 
-def test_metadata_of_other_sources() -> None:
+def test_metadata_from_other_sources() -> None:
     metadata = Metadata([ParameterMetadata("A", maximum=3), ParameterMetadata("A", maximum=9)])
     assert metadata["A"].maximum == 3
     assert len({metadata["A"], ParameterMetadata("A", maximum=3)}) == 1
@@ -265,7 +265,7 @@ def test_metadata_of_other_sources() -> None:
 
 
 def crc32part(data: bytes, crc: int) -> int:
-    """The definition, bit by bit."""
+    """Compute the hash bit by bit from its definition."""
     for byte in data:
         crc ^= byte
         for _ in range(8):
@@ -275,7 +275,7 @@ def crc32part(data: bytes, crc: int) -> int:
 
 @settings(max_examples=20)
 @given(st.dictionaries(st.text("ABC_", min_size=1, max_size=16), st.integers(-(2**31), 2**31 - 1)))
-def test_hash_is_the_crc_of_names_and_values(values: dict[str, int]) -> None:
+def test_px4_hash_is_crc_of_parameters(values: dict[str, int]) -> None:
     table = ParameterTable.from_values(values, dict.fromkeys(values, ParameterType.INT32))
     expected = 0
     for name in sorted(values):
@@ -283,7 +283,7 @@ def test_hash_is_the_crc_of_names_and_values(values: dict[str, int]) -> None:
     assert px4_hash(table) == expected
 
 
-def test_hash_leaves_volatile_parameters_out() -> None:
+def test_px4_hash_ignores_volatile_parameters() -> None:
     kept = Parameter("MPC_XY_CRUISE", 5.0, ParameterType.REAL32)
     table = ParameterTable([kept, Parameter("COM_FLIGHT_UUID", 7, ParameterType.INT32)])
     volatile = parse_metadata(json.dumps(PX4_JSON).encode()).volatile

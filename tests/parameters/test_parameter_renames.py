@@ -1,4 +1,4 @@
-"""Names and units of ArduPilot 4.6 and 4.7."""
+"""Parameter names and units of ArduPilot 4.6 and 4.7."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from aerokit.parameters import (
     find_rename,
     other_names,
     replacement_of,
-    to_known,
+    resolve_rename,
     translate_values,
 )
 from aerokit.parameters.parameter import check_name, to_float32
@@ -26,9 +26,9 @@ INT16, INT32, REAL32 = ParameterType.INT16, ParameterType.INT32, ParameterType.R
 
 
 def known(asked: str, name: str) -> Renamed:
-    found = to_known(asked, {name})
+    found = resolve_rename(asked, {name})
     assert found is not None
-    assert (found.asked, found.name) == (asked, name)
+    assert (found.requested, found.name) == (asked, name)
     return found
 
 
@@ -54,17 +54,17 @@ def known(asked: str, name: str) -> Renamed:
         ("GLIDE_SLOPE_THR", "ALT_SLOPE_MAXHGT", 15, 15),
     ],
 )
-def test_pairs(old: str, new: str, old_value: float, new_value: float) -> None:
+def test_renamed_values_convert(old: str, new: str, old_value: float, new_value: float) -> None:
     up, down = known(old, new), known(new, old)
-    assert up.to_vehicle(old_value) == down.to_asked(old_value) == new_value
-    assert down.to_vehicle(new_value) == up.to_asked(new_value) == old_value
+    assert up.to_vehicle(old_value) == down.to_requested(old_value) == new_value
+    assert down.to_vehicle(new_value) == up.to_requested(new_value) == old_value
     for renamed in (up, down):
         assert new in renamed.warning
         assert old in renamed.warning
     assert find_rename(old) is find_rename(new)
 
 
-def test_the_table_is_sound() -> None:
+def test_rename_table_is_consistent() -> None:
     pairs = [pair.split(">") for _, _, text in GROUPS for pair in text.split()]
     assert len(pairs) == 258
     assert len({name for pair in pairs for name in pair}) == 2 * len(pairs)
@@ -73,25 +73,25 @@ def test_the_table_is_sound() -> None:
     assert not {old for old, _ in pairs} & {new for _, new in pairs}
 
 
-def test_the_vehicles_own_name_needs_no_translation() -> None:
-    assert to_known("WP_SPD", {"WP_SPD"}) is None
-    assert to_known("WPNAV_SPEED", {"WPNAV_SPEED", "WP_SPD"}) is None
-    assert to_known("WPNAV_SPEED", set()) is None
-    assert to_known("PILOT_SPEED_UP", {"PILOT_SPEED_UP"}) is None  # Sub keeps it
-    assert to_known("NO_SUCH", {"WP_SPD"}) is None
+def test_known_name_is_not_renamed() -> None:
+    assert resolve_rename("WP_SPD", {"WP_SPD"}) is None
+    assert resolve_rename("WPNAV_SPEED", {"WPNAV_SPEED", "WP_SPD"}) is None
+    assert resolve_rename("WPNAV_SPEED", set()) is None
+    assert resolve_rename("PILOT_SPEED_UP", {"PILOT_SPEED_UP"}) is None  # Sub keeps the old name
+    assert resolve_rename("NO_SUCH", {"WP_SPD"}) is None
     assert find_rename("NO_SUCH") is None
     assert other_names("NO_SUCH") == ()
     assert other_names("SYSID_THISMAV") == ("MAV_SYSID",)
 
 
-def test_names_between_two_versions() -> None:
+def test_intermediate_names_are_resolved() -> None:
     assert other_names("PSC_JERK_XY") == ("PSC_NE_JERK", "PSC_JERK_NE")
     assert known("PSC_JERK_XY", "PSC_JERK_NE").to_vehicle(5.0) == 5.0
     renamed = known("PSC_NE_JERK", "PSC_JERK_NE")
-    assert renamed.to_vehicle(5.0) == renamed.to_asked(5.0) == 5.0
+    assert renamed.to_vehicle(5.0) == renamed.to_requested(5.0) == 5.0
 
 
-def test_whole_numbers_are_rounded_and_decimals_are_exact() -> None:
+def test_conversion_rounds_integers_and_is_decimal() -> None:
     down = known("PILOT_SPD_UP", "PILOT_SPEED_UP")
     assert down.to_vehicle(0.29, INT16) == 29  # 0.29 × 100 is 28.999999999999996
     assert down.to_vehicle(to_float32(0.29)) == 29.0
@@ -99,72 +99,68 @@ def test_whole_numbers_are_rounded_and_decimals_are_exact() -> None:
     assert type(down.to_vehicle(2.505, INT16)) is int
     up = known("PILOT_SPEED_UP", "PILOT_SPD_UP")
     assert up.to_vehicle(29) == 0.29
-    assert up.to_asked(to_float32(0.29)) == 29.0
-    assert up.to_asked(float("inf")) == float("inf")
-    assert up.to_asked(float("nan")) != up.to_asked(float("nan"))
+    assert up.to_requested(to_float32(0.29)) == 29.0
+    assert up.to_requested(float("inf")) == float("inf")
+    assert up.to_requested(float("nan")) != up.to_requested(float("nan"))
 
 
 @given(st.integers(-(2**15), 2**15 - 1))
-def test_every_integer_comes_back(value: int) -> None:
+def test_converted_integer_round_trip(value: int) -> None:
     up = known("PILOT_SPEED_UP", "PILOT_SPD_UP")
-    assert up.to_asked(to_float32(up.to_vehicle(value))) == value
+    assert up.to_requested(to_float32(up.to_vehicle(value))) == value
 
 
 @pytest.mark.parametrize(
     ("checks", "skipped"),
     [
-        (1, 0),  # all
-        (0, -1),  # none, those of future versions neither
+        (1, 0),  # all checks
+        (0, -1),  # no checks, nor those of future versions
         (72, 0x1FFFFE - 72),  # GPS and RC only
         (0x1FFFFE, 0),
-        (3, 0),  # "all" counts whatever else is set
+        (3, 0),  # "all" overrides the other bits
     ],
 )
-def test_arming_checks_are_inverted(checks: int, skipped: int) -> None:
+def test_arming_checks_convert_inverted(checks: int, skipped: int) -> None:
     up, down = known("ARMING_CHECK", "ARMING_SKIPCHK"), known("ARMING_SKIPCHK", "ARMING_CHECK")
-    assert up.to_vehicle(float(checks), INT32) == down.to_asked(checks) == skipped
+    assert up.to_vehicle(float(checks), INT32) == down.to_requested(checks) == skipped
     back = {3: 1, 0x1FFFFE: 1}.get(checks, checks)
-    assert up.to_asked(skipped) == down.to_vehicle(skipped) == back
+    assert up.to_requested(skipped) == down.to_vehicle(skipped) == back
     assert "inverted" in up.warning
 
 
 @given(st.integers(0, 0x1FFFFF))
-def test_skipped_checks_come_back(skipped: int) -> None:
+def test_skipped_checks_round_trip(skipped: int) -> None:
     rename = find_rename("ARMING_SKIPCHK")
     assert rename is not None
     wanted = skipped & 0x1FFFFE
-    assert rename.to_new(rename.to_old(skipped)) == (
-        0 if skipped == 0 else -1 if wanted == 0x1FFFFE else wanted
-    )
+    assert rename.to_new(rename.to_old(skipped)) == (0 if skipped == 0 else -1 if wanted == 0x1FFFFE else wanted)
 
 
-def test_a_parameter_under_the_asked_name() -> None:
+def test_parameter_under_requested_name() -> None:
     vehicles = Parameter("WP_SPD", to_float32(2.3), REAL32, 5.0, 7)
     asked = known("WPNAV_SPEED", "WP_SPD").parameter(vehicles)
     assert asked == Parameter("WPNAV_SPEED", 230.0, REAL32, 500.0, 7)
     vehicles = Parameter("PILOT_SPEED_UP", 250, INT16)
-    assert known("PILOT_SPD_UP", "PILOT_SPEED_UP").parameter(vehicles) == Parameter(
-        "PILOT_SPD_UP", 2.5, REAL32
-    )
+    assert known("PILOT_SPD_UP", "PILOT_SPEED_UP").parameter(vehicles) == Parameter("PILOT_SPD_UP", 2.5, REAL32)
     vehicles = Parameter("MAV_SYSID", 3, INT16, 1, 0)
     assert known("SYSID_THISMAV", "MAV_SYSID").parameter(vehicles) == vehicles.replace(name="SYSID_THISMAV")
     vehicles = Parameter("ARMING_SKIPCHK", 0, INT32, 0, 0)
     assert known("ARMING_CHECK", "ARMING_SKIPCHK").parameter(vehicles).value == 1
 
 
-def test_a_whole_file() -> None:
+def test_translate_values_of_whole_file() -> None:
     old = {"WPNAV_SPEED": 500, "RTL_ALT": 1500, "LOG_BITMASK": 65535, "WPNAV_RADIUS": 200, "UNKNOWN": 1}
-    vehicle = {"WP_SPD", "RTL_ALT_M", "LOG_BITMASK", "WPNAV_RADIUS"}  # a version between the two
+    vehicle = {"WP_SPD", "RTL_ALT_M", "LOG_BITMASK", "WPNAV_RADIUS"}  # between the two versions
     values, renamed = translate_values(old, vehicle)
     assert values == {"WP_SPD": 5, "RTL_ALT_M": 15, "LOG_BITMASK": 65535, "WPNAV_RADIUS": 200, "UNKNOWN": 1}
-    assert [each.asked for each in renamed] == ["WPNAV_SPEED", "RTL_ALT"]
+    assert [each.requested for each in renamed] == ["WPNAV_SPEED", "RTL_ALT"]
     back, _ = translate_values(values, set(old), {"RTL_ALT": INT32})
     assert back == old
     both, renamed = translate_values({"WPNAV_SPEED": 100, "WP_SPD": 7}, {"WP_SPD"})
     assert (both, renamed) == ({"WP_SPD": 7}, ())
 
 
-def test_the_warning_can_be_told_from_others() -> None:
+def test_rename_warning_has_own_category() -> None:
     text = known("WPNAV_SPEED", "WP_SPD").warning
     with pytest.warns(ParameterRenamedWarning, match=r"Use WP_SPD, its name since ArduPilot 4\.7"):
         warnings.warn(text, ParameterRenamedWarning, stacklevel=1)
@@ -203,24 +199,24 @@ def test_the_warning_can_be_told_from_others() -> None:
         ("TURN_MAX_G", "ATC_TURN_MAX_G", 0.6, 0.6),
     ],
 )
-def test_pairs_from_before(old: str, new: str, old_value: float, new_value: float) -> None:
+def test_older_renamed_values_convert(old: str, new: str, old_value: float, new_value: float) -> None:
     up, down = known(old, new), known(new, old)
-    assert up.to_vehicle(old_value) == down.to_asked(old_value) == new_value
-    assert down.to_vehicle(new_value) == up.to_asked(new_value) == old_value
+    assert up.to_vehicle(old_value) == down.to_requested(old_value) == new_value
+    assert down.to_vehicle(new_value) == up.to_requested(new_value) == old_value
     assert old in up.warning
     assert new in up.warning
     assert ("converted" in up.warning) == (old_value != new_value)
 
 
-def test_a_name_that_others_use_otherwise_is_found_one_way_only() -> None:
+def test_ambiguous_old_name_converts_one_way() -> None:
     """ArduPlane's THR_MIN is in percent."""
     assert known("THR_MIN", "MOT_SPIN_MIN").to_vehicle(130) == 0.13
     assert known("THR_MIN", "MOT_THR_MIN").to_vehicle(5) == 5
-    assert to_known("MOT_SPIN_MIN", {"THR_MIN"}) is None
-    assert to_known("THR_MIN", {"THR_MIN", "MOT_SPIN_MIN"}) is None
+    assert resolve_rename("MOT_SPIN_MIN", {"THR_MIN"}) is None
+    assert resolve_rename("THR_MIN", {"THR_MIN", "MOT_SPIN_MIN"}) is None
 
 
-def test_the_older_names_are_sound() -> None:
+def test_older_rename_table_is_consistent() -> None:
     rows = [pair for _, _, _, text in (*OLDER, *ONE_WAY) for pair in text.split()]
     assert len(rows) == len({*rows})
     old, new = ({pair.split(">")[place] for pair in rows} for place in (0, 1))
@@ -233,7 +229,7 @@ def test_the_older_names_are_sound() -> None:
         assert name not in other_names(name)
 
 
-def test_what_has_no_successor_says_what_replaced_it() -> None:
+def test_replaced_parameter_names_replacement() -> None:
     assert replacement_of("FLOW_ENABLE").startswith("FLOW_TYPE")
     assert replacement_of("RATE_RLL_P").startswith("ATC_RAT_RLL_P")
     assert replacement_of("MNT_RC_IN_TILT").startswith("RCn_OPTION")

@@ -1,4 +1,4 @@
-"""Names, values and types; tables."""
+"""Parameter names, values, types and tables."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from aerokit.parameters.parameter import same_value
 INT8, INT32, REAL32 = ParameterType.INT8, ParameterType.INT32, ParameterType.REAL32
 
 
-def test_types_are_the_standards() -> None:
+def test_parameter_types_match_standard() -> None:
     assert {t.name: t.value for t in ParameterType} == {t.name: t.value for t in MavParamType}
     assert ParameterType.from_wire(6) is INT32
     assert ParameterType.from_wire(0) is ParameterType.from_wire(77) is REAL32
 
 
 @pytest.mark.parametrize(("type_", "format_"), list(zip(ParameterType, "BbHhIiQqfd", strict=True)))
-def test_ranges_are_those_of_the_bytes(type_: ParameterType, format_: str) -> None:
-    for value in (type_.low, type_.high):
+def test_parameter_type_ranges(type_: ParameterType, format_: str) -> None:
+    for value in (type_.minimum, type_.maximum):
         assert struct.unpack("<" + format_, struct.pack("<" + format_, value)) == (value,)
         beyond = value + (1 if value > 0 else -1) if type_.is_integer else value * 1.1
         with pytest.raises((struct.error, OverflowError)):
@@ -35,15 +35,13 @@ def test_ranges_are_those_of_the_bytes(type_: ParameterType, format_: str) -> No
             raise OverflowError
 
 
-@pytest.mark.parametrize(
-    "name", ["", "SEVENTEEN_LETTERS", "WP SPD", "WP_SPD\n", "GESCHWINDIGKEIT\N{DEGREE SIGN}", 5]
-)
-def test_names_that_cannot_be_sent(name: Any) -> None:
+@pytest.mark.parametrize("name", ["", "SEVENTEEN_LETTERS", "WP SPD", "WP_SPD\n", "GESCHWINDIGKEIT\N{DEGREE SIGN}", 5])
+def test_check_name_rejects_invalid_names(name: Any) -> None:
     with pytest.raises(InvalidArgument, match="parameter name = "):
         check_name(name)
 
 
-def test_names_that_can() -> None:
+def test_check_name_accepts_valid_names() -> None:
     assert [check_name(name) for name in ("A", "_HASH_CHECK", "SIXTEEN_LETTERS_")]
 
 
@@ -58,17 +56,17 @@ def test_names_that_can() -> None:
         (1.5, INT8, "whole"),
         (128, INT8, r"-128\.\.127"),
         (-1, ParameterType.UINT32, r"0\.\.4294967295"),
-        ("5", INT8, "no number"),
-        (None, REAL32, "no number"),
-        (1j, REAL32, "no number"),
+        ("5", INT8, "not a number"),
+        (None, REAL32, "not a number"),
+        (1j, REAL32, "not a number"),
     ],
 )
-def test_values_that_cannot_be_sent(value: Any, type_: ParameterType, text: str) -> None:
+def test_checked_value_rejects_invalid_values(value: Any, type_: ParameterType, text: str) -> None:
     with pytest.raises(InvalidArgument, match=rf"^X = .*{text}"):
         checked_value("X", value, type_)
 
 
-def test_values_that_can() -> None:
+def test_checked_value_converts_valid_values() -> None:
     assert checked_value("X", True, INT8) == 1
     assert type(checked_value("X", 3.0, INT8)) is int
     assert checked_value("X", 0.1, REAL32) == struct.unpack("<f", struct.pack("<f", 0.1))[0] != 0.1
@@ -79,14 +77,14 @@ def test_values_that_can() -> None:
 
 @settings(max_examples=50)
 @given(st.floats(width=32), st.floats(width=32))
-def test_same_value_is_equality_of_float32(one: float, other: float) -> None:
+def test_same_value_compares_as_float32(one: float, other: float) -> None:
     assert same_value(one, other) == (one == other or (one != one and other != other))
     assert same_value(one, one)
 
 
-def test_same_value_of_numbers_that_float32_cannot_tell_apart() -> None:
+def test_same_value_of_numbers_equal_as_float32() -> None:
     assert same_value(0.1, struct.unpack("<f", struct.pack("<f", 0.1))[0])
-    assert not same_value(2**24, 2**24 + 1)  # whole numbers are exact
+    assert not same_value(2**24, 2**24 + 1)  # whole numbers are compared exactly
     assert not same_value(1e300, 1.0)
 
 
@@ -99,7 +97,7 @@ TABLE = ParameterTable(
 )
 
 
-def test_a_table_is_a_mapping_in_the_vehicles_order() -> None:
+def test_table_is_mapping_in_vehicle_order() -> None:
     assert list(TABLE) == ["B", "A", "C"]
     assert len(TABLE) == 3
     assert TABLE.values_by_name() == {"B": 1, "A": 0.1, "C": 7}
@@ -113,7 +111,7 @@ def test_a_table_is_a_mapping_in_the_vehicles_order() -> None:
         TABLE["D"]
 
 
-def test_changed_from_default() -> None:
+def test_table_changed_from_default() -> None:
     assert list(TABLE.changed_from_default()) == ["B"]
     assert not TABLE.has_defaults
     assert TABLE.without(["C"]).has_defaults
@@ -122,18 +120,16 @@ def test_changed_from_default() -> None:
         TABLE.without("AB").changed_from_default()
 
 
-def test_updates_keep_what_they_do_not_tell() -> None:
-    table = TABLE.with_([Parameter("B", 5, INT8), Parameter("D", 1.0, REAL32, None, 3)])
+def test_table_update_keeps_default_and_index() -> None:
+    table = TABLE.updated_with([Parameter("B", 5, INT8), Parameter("D", 1.0, REAL32, None, 3)])
     assert list(table) == ["B", "A", "C", "D"]
     assert table["B"] == Parameter("B", 5, INT8, 0, 0)
     assert TABLE["B"].value == 1
 
 
-def test_choosing() -> None:
+def test_table_selection() -> None:
     assert list(TABLE.matching("[ab]")) == ["B", "A"]
     assert TABLE.by_index()[2].name == "C"
     shuffled = ParameterTable([Parameter("X", 1, INT8), TABLE["C"], TABLE["B"], TABLE["A"]])
     assert list(shuffled.in_order_of_index()) == ["B", "A", "C", "X"]
-    assert ParameterTable.from_values({"X": 1, "Y": 2}, {"X": INT8})["Y"] == Parameter(
-        "Y", 2, REAL32, None, 1
-    )
+    assert ParameterTable.from_values({"X": 1, "Y": 2}, {"X": INT8})["Y"] == Parameter("Y", 2, REAL32, None, 1)

@@ -1,4 +1,4 @@
-"""A small MAVFTP server of either kind, and a channel that loses, repeats and reorders, on made-up time."""
+"""A small MAVFTP server of either autopilot, and a channel with loss, duplicates and reordering, in simulated time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def make_client(first_sequence: int = 0) -> FtpClient:
 def reply_to(
     request: FtpMessage, data: bytes = b"", *, code: int | None = None, offset: int = 0, ahead: int = 1
 ) -> FtpMessage:
-    """An ACK with data, or a NAK with a code; ``ahead`` counts the replies of a burst."""
+    """Return an ACK with data, or a NAK with a code; ``ahead`` numbers the replies of a burst."""
     content = data if code is None else bytes([code])
     return FtpMessage(
         (request.sequence + ahead) % 0x10000,
@@ -46,8 +46,10 @@ def requests_in(messages: list[Message]) -> list[FtpMessage]:
 
 @dataclass
 class FileServer:
-    """One open file. ``burst_blocks`` blocks make a burst, ``queue`` requests wait while it goes on (as ArduPilot), or
-    all are answered at once (``queue`` None, as PX4). ``exact_end``: the NAK of a burst has the offset of the end.
+    """A server with one open file and bursts of ``burst_blocks`` blocks.
+
+    ``queue`` requests wait during a burst (ArduPilot); None: all are answered at once (PX4).
+    ``exact_end``: the NAK of a burst has the offset of the end.
     """
 
     content: bytearray
@@ -62,7 +64,7 @@ class FileServer:
     _busy_until: float = 0.0
 
     def receive(self, request: FtpMessage, now: float) -> list[tuple[float, FtpMessage]]:
-        """What is answered, and when it is sent."""
+        """Return replies and the times they are sent at."""
         if self.queue is not None and now < self._busy_until:
             if len(self._waiting) >= self.queue:
                 return []
@@ -111,7 +113,7 @@ class FileServer:
 
 @dataclass
 class Run:
-    """What came of an exchange over a bad channel."""
+    """Result of an exchange over a bad channel."""
 
     messages: int
     seconds: float
@@ -128,7 +130,7 @@ def run(
     seed: int = 0,
     longest_s: float = 1000.0,
 ) -> Run:
-    """Let them talk until the exchange is done; frames overtake each other by the jitter."""
+    """Run client and server until the exchange is done; jitter reorders frames."""
     chance = random.Random(seed)
     air: list[tuple[float, int, bool, FtpMessage]] = []
     sent = number = 0

@@ -1,4 +1,4 @@
-"""A vehicle with flight logs, and a channel that loses, on made-up time."""
+"""A vehicle with flight logs, and a channel with loss, in simulated time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def content(size: int) -> bytes:
 
 @dataclass
 class LogVehicle:
-    """Logs with ids from ``first_id`` on. ``latest_wins``: a request replaces the one under way, else it is ignored."""
+    """Logs with ids from ``first_id`` on. ``latest_wins``: a request replaces the current one, else it is ignored."""
 
     logs: list[bytes]
     first_id: int = 1
@@ -66,7 +66,7 @@ def run(
     seed: int = 0,
     longest_s: float = 300.0,
 ) -> int:
-    """Let them talk until it is done; how many messages were sent."""
+    """Run exchange and vehicle until done; return the number of messages sent."""
     chance = random.Random(seed)
     air: list[tuple[float, int, bool, Message]] = []
     now = next_at = 0.0

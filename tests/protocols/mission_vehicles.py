@@ -1,4 +1,4 @@
-"""Small models of how autopilots answer the mission protocol, and a bad radio to them, on a clock of their own."""
+"""Models of the autopilots' mission protocols, and a lossy radio link, in simulated time."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def items(number: int, *, seed: int = 0) -> list[MissionItem]:
 
 
 class Store:
-    """What both have: a list of items, refusals of a test's choice, what was sent to them."""
+    """Base of both models: items, refusals chosen by the test, and received messages."""
 
     repeat_s = 1.0
-    patience_s = 8.0
+    idle_timeout_s = 8.0
 
     def __init__(self, stored: Sequence[MissionItem] = (), *, refuses: int | None = None) -> None:
         self.stored = list(stored)
@@ -63,7 +63,7 @@ class Store:
         self.out.append(item)
 
     def expire(self, now: float) -> None:
-        if self.is_receiving and now - self.heard_at < self.patience_s:
+        if self.is_receiving and now - self.heard_at < self.idle_timeout_s:
             self.ask(now)
         else:
             self.stop()
@@ -73,7 +73,7 @@ class Store:
 
 
 class ArduPilotModel(Store):
-    """Takes the next item whenever it comes, writes it at once; answers any request; refuses others meanwhile."""
+    """ArduPilot: stores each next item at once; answers any request, refuses other senders."""
 
     def on_mission_count(self, message: m.MissionCount, now: float, sender: tuple[int, int]) -> None:
         if self.partner not in (None, sender):
@@ -121,9 +121,7 @@ class ArduPilotModel(Store):
         else:
             self.out.append(m.MissionCount(*sender, len(self.stored)))
 
-    def on_mission_request_int(
-        self, message: m.MissionRequestInt, now: float, sender: tuple[int, int]
-    ) -> None:
+    def on_mission_request_int(self, message: m.MissionRequestInt, now: float, sender: tuple[int, int]) -> None:
         if self.is_receiving:
             self.ack(Result.DENIED, sender)
         elif message.seq < len(self.stored):
@@ -145,10 +143,10 @@ class ArduPilotModel(Store):
 
 
 class Px4Model(Store):
-    """Keeps the old items until it has all of the new ones; gives items in sequence only."""
+    """PX4: keeps the old items until all new ones have arrived; sends items in sequence only."""
 
     repeat_s = 0.25
-    patience_s = 5.0
+    idle_timeout_s = 5.0
 
     def __init__(self, stored: Sequence[MissionItem] = (), *, refuses: int | None = None) -> None:
         super().__init__(stored, refuses=refuses)
@@ -202,9 +200,7 @@ class Px4Model(Store):
         self.out.append(m.MissionCount(*sender, len(self.stored)))
         self.deadline = now + self.repeat_s
 
-    def on_mission_request_int(
-        self, message: m.MissionRequestInt, now: float, sender: tuple[int, int]
-    ) -> None:
+    def on_mission_request_int(self, message: m.MissionRequestInt, now: float, sender: tuple[int, int]) -> None:
         if self.giving_to is None:
             return
         self.heard_at = now
@@ -225,7 +221,7 @@ class Px4Model(Store):
     def expire(self, now: float) -> None:
         if self.giving_to is None:
             super().expire(now)
-        elif now - self.heard_at >= self.patience_s:
+        elif now - self.heard_at >= self.idle_timeout_s:
             self.giving_to = self.deadline = None
         else:
             if self.expected == 0:
@@ -235,7 +231,7 @@ class Px4Model(Store):
 
 @dataclass
 class Radio:
-    """Both ways: loss, doubling, delays that differ (so that messages overtake each other), silence at times."""
+    """A link with loss, duplicates, reordering by varying delays, and outages in both directions."""
 
     seed: int = 0
     loss: float = 0.0
@@ -260,7 +256,7 @@ class Radio:
 
 @dataclass
 class Run:
-    """How it went: when it ended, what was sent."""
+    """Time of the end, and messages sent."""
 
     seconds: float
     sent: list[Message]
@@ -276,7 +272,7 @@ def run(
     others: Sequence[tuple[float, Message, tuple[int, int]]] = (),
     limit_s: float = 600.0,
 ) -> Run:
-    """Let the two talk until the exchange has ended. ``others``: what somebody else sends to the vehicle, and when."""
+    """Run exchange and vehicle until the exchange ends. ``others``: messages of another station, and their times."""
     order, queue = count(), list[tuple[float, int, str, Message, tuple[int, int]]]()
     for at, message, sender in others:
         heapq.heappush(queue, (began + at, next(order), "up", message, sender))

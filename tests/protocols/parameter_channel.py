@@ -1,4 +1,4 @@
-"""A vehicle with parameters at the end of a bad channel, and an exchange at the other end: no loop, no clock."""
+"""A vehicle with parameters, a bad channel and an exchange, without event loop or clock."""
 
 from __future__ import annotations
 
@@ -25,21 +25,18 @@ HASH = Parameter("_HASH_CHECK", 0xFFC00001, ParameterType.UINT32)
 
 
 def framed(message: Message, *, system_id: int = 1, component_id: int = 1) -> Message:
-    """As it comes off the wire."""
+    """Encode and decode a message, as transmission does."""
     raw = FrameEncoder(system_id, component_id).encode(message)
     return STANDARD.decode(Framer().receive(raw, 0.0)[0])
 
 
 def table_of(count: int) -> list[Parameter]:
     kinds = (ParameterType.INT8, ParameterType.REAL32, ParameterType.INT32)
-    return [
-        Parameter(f"PARAM_{i:04}", i % 100 if i % 3 != 1 else i / 2, kinds[i % 3], None, i)
-        for i in range(count)
-    ]
+    return [Parameter(f"PARAM_{i:04}", i % 100 if i % 3 != 1 else i / 2, kinds[i % 3], None, i) for i in range(count)]
 
 
 class FakeVehicle:
-    """Answers as ArduPilot does, or, ``bytewise``, as PX4. Subclass it for what goes wrong."""
+    """Answers as ArduPilot does, or, with ``bytewise``, as PX4. Subclasses add faults."""
 
     tick_s = 0.01
     burst = 5
@@ -95,7 +92,7 @@ class FakeVehicle:
 
 
 class Channel:
-    """Both directions: each message is lost with the same probability, and takes ``delay_s``."""
+    """Each message, in either direction, is lost with the same probability and delayed by ``delay_s``."""
 
     def __init__(
         self,
@@ -120,14 +117,14 @@ class Channel:
         heapq.heappush(self._events, (when, next(self._numbers), action))
 
     def from_vehicle(self, message: Message, after: float = 0.0, *, component_id: int = 1) -> None:
-        """The vehicle says this, or another component does."""
+        """Deliver a message from the vehicle or another component."""
         if not self.is_lost(message):
             arrived = framed(message, component_id=component_id)
             delay = self.delay_s + self.random.random() * self.jitter_s
             self.at(self.now + after + delay, lambda: self._arrive(arrived))
 
     def run(self, exchange: Exchange[ResultT], *, limit_s: float = 600.0) -> ResultT:
-        """The result; raises what it ended with."""
+        """Return the result, or raise the exchange's error."""
         self._exchange = exchange
         exchange.start(self.now)
         self._send()

@@ -1,4 +1,4 @@
-"""The command protocol without IO: every case by its name, and any sequence of acks by hypothesis."""
+"""The command protocol without IO: each case by name, and arbitrary sequences of acks by hypothesis."""
 
 from __future__ import annotations
 
@@ -28,9 +28,7 @@ def exchange(attempts: int = 4, progress: list[int | None] | None = None) -> Com
     )
 
 
-def ack(
-    result: int, command: int = ARM, *, progress: int = 0, system: int = 255, component: int = 190
-) -> CommandAck:
+def ack(result: int, command: int = ARM, *, progress: int = 0, system: int = 255, component: int = 190) -> CommandAck:
     return CommandAck(command, result, progress, 0, system, component)
 
 
@@ -38,7 +36,7 @@ def confirmations(machine: CommandExchange) -> list[int]:
     return [each.confirmation for each in machine.take_outbox() if isinstance(each, CommandLong)]
 
 
-def test_ends_with_the_accepting_ack() -> None:
+def test_command_ends_with_accepted_ack() -> None:
     machine = exchange()
     machine.start(0.0)
     assert confirmations(machine) == [0]
@@ -48,7 +46,7 @@ def test_ends_with_the_accepting_ack() -> None:
     assert machine.deadline is None
 
 
-def test_resends_with_a_rising_confirmation_and_gives_up() -> None:
+def test_command_retries_with_rising_confirmation_then_fails() -> None:
     machine = exchange(attempts=3)
     machine.start(0.0)
     seen = confirmations(machine)
@@ -62,7 +60,7 @@ def test_resends_with_a_rising_confirmation_and_gives_up() -> None:
         machine.result()
 
 
-def test_an_early_expiry_changes_nothing() -> None:
+def test_command_ignores_early_expiry() -> None:
     machine = exchange()
     machine.start(0.0)
     machine.take_outbox()
@@ -71,7 +69,7 @@ def test_an_early_expiry_changes_nothing() -> None:
     assert machine.deadline == 1.0
 
 
-def test_progress_extends_the_deadline_and_is_no_result() -> None:
+def test_command_progress_extends_deadline() -> None:
     progress: list[int | None] = []
     machine = exchange(progress=progress)
     machine.start(0.0)
@@ -84,7 +82,7 @@ def test_progress_extends_the_deadline_and_is_no_result() -> None:
     assert machine.done
 
 
-def test_progress_that_stops_is_a_timeout_and_is_not_sent_again() -> None:
+def test_command_stopped_progress_times_out() -> None:
     machine = exchange()
     machine.start(0.0)
     machine.take_outbox()
@@ -95,10 +93,8 @@ def test_progress_that_stops_is_a_timeout_and_is_not_sent_again() -> None:
         machine.result()
 
 
-@pytest.mark.parametrize(
-    "result", [r for r in MavResult if r not in (MavResult.ACCEPTED, MavResult.IN_PROGRESS)]
-)
-def test_every_other_result_is_a_typed_error(result: MavResult) -> None:
+@pytest.mark.parametrize("result", [r for r in MavResult if r not in (MavResult.ACCEPTED, MavResult.IN_PROGRESS)])
+def test_command_result_becomes_error(result: MavResult) -> None:
     machine = exchange()
     machine.start(0.0)
     machine.receive(ack(result), 0.1)
@@ -117,21 +113,21 @@ def test_every_other_result_is_a_typed_error(result: MavResult) -> None:
     ],
     ids=["other command", "other ground station", "other component of ours", "no ack at all"],
 )
-def test_strays_are_ignored(stray: CommandAck | Heartbeat) -> None:
+def test_command_ignores_unrelated_acks(stray: CommandAck | Heartbeat) -> None:
     machine = exchange()
     machine.start(0.0)
     machine.receive(stray, 0.1)
     assert not machine.done
 
 
-def test_acks_without_a_target_are_ours() -> None:
+def test_command_accepts_ack_without_target() -> None:
     machine = exchange()
     machine.start(0.0)
     machine.receive(ack(MavResult.ACCEPTED, system=0, component=0), 0.1)
     assert machine.done
 
 
-def test_the_first_end_counts() -> None:
+def test_command_first_result_counts() -> None:
     machine = exchange()
     machine.start(0.0)
     machine.receive(ack(MavResult.ACCEPTED), 0.1)
@@ -140,7 +136,7 @@ def test_the_first_end_counts() -> None:
     assert machine.result().result == MavResult.ACCEPTED
 
 
-def test_abort_ends_it() -> None:
+def test_command_abort() -> None:
     machine = exchange()
     machine.start(0.0)
     machine.abort(ConnectionClosed("gone"))
@@ -160,9 +156,7 @@ def test_abort_ends_it() -> None:
     ),
     st.integers(1, 6),
 )
-def test_any_traffic_sends_at_most_the_attempts_and_ends_once(
-    steps: list[tuple[str, MavResult, int, float]], attempts: int
-) -> None:
+def test_command_any_traffic_ends_once(steps: list[tuple[str, MavResult, int, float]], attempts: int) -> None:
     machine = exchange(attempts=attempts)
     machine.start(0.0)
     now, sent, ends = 0.0, len(machine.take_outbox()), 0
@@ -177,10 +171,8 @@ def test_any_traffic_sends_at_most_the_attempts_and_ends_once(
     assert ends <= 1
 
 
-@given(
-    st.integers(1, 255), st.integers(0, 255), st.lists(st.floats(width=32, allow_infinity=False), max_size=7)
-)
-def test_parameters_are_carried_unchanged(system: int, component: int, params: list[float]) -> None:
+@given(st.integers(1, 255), st.integers(0, 255), st.lists(st.floats(width=32, allow_infinity=False), max_size=7))
+def test_command_params_are_unchanged(system: int, component: int, params: list[float]) -> None:
     message = command_long(system, component, ARM, tuple(params))
     decoded = CommandLong.decode(message.encode())
     values = [getattr(decoded, f"param{i}") for i in range(1, 8)]
@@ -188,7 +180,7 @@ def test_parameters_are_carried_unchanged(system: int, component: int, params: l
     assert all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(values, expected, strict=True))
 
 
-def test_the_int_form_is_resent_unchanged() -> None:
+def test_command_int_is_resent_unchanged() -> None:
     message = command_int(1, 1, MavCmd.DO_REPOSITION, (-1, 1), frame=6, x=473977420, y=85455940, z=20.0)
     machine = CommandExchange(message, own_system=255, own_component=190)
     machine.start(0.0)
@@ -206,17 +198,17 @@ def test_the_int_form_is_resent_unchanged() -> None:
         (tuple(range(8)), "at most 7 parameters"),
     ],
 )
-def test_nonsense_is_refused(params: tuple[float, ...], text: str) -> None:
+def test_command_rejects_invalid_params(params: tuple[float, ...], text: str) -> None:
     with pytest.raises(InvalidArgument, match=text):
         command_long(1, 1, ARM, params)
 
 
-def test_a_broadcast_by_accident_is_refused() -> None:
+def test_command_rejects_broadcast_target() -> None:
     with pytest.raises(InvalidArgument, match="target_system = 0"):
         command_long(0, 0, ARM, (1.0,))
 
 
-def test_integers_of_the_int_form_must_fit() -> None:
+def test_command_int_rejects_large_integers() -> None:
     with pytest.raises(InvalidArgument, match="x = 2147483648"):
         command_int(1, 1, MavCmd.DO_REPOSITION, frame=6, x=2**31, y=0, z=0.0)
     with pytest.raises(InvalidArgument, match="at most 4"):
@@ -225,7 +217,7 @@ def test_integers_of_the_int_form_must_fit() -> None:
 
 @pytest.mark.parametrize("field", ["attempt_timeout", "progress_timeout"])
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan")])
-def test_a_timeout_that_is_no_time_is_refused(field: str, seconds: float) -> None:
+def test_command_rejects_invalid_timeout(field: str, seconds: float) -> None:
     arguments: dict[str, float] = {field: seconds}
     with pytest.raises(InvalidArgument, match=field):
         CommandExchange(

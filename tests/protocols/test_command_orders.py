@@ -1,4 +1,4 @@
-"""Orders: sent again only right after the vehicle has told what it does; the limits of commands to the last one."""
+"""Orders: they are repeated only right after a status report of the vehicle; command limits include the last one."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandLong
 from aerokit.protocols.command import (
-    ATTEMPTS,
     FLOAT32_MAX,
-    SENT_ONCE,
+    MAX_ATTEMPTS,
+    UNREPEATABLE_COMMANDS,
     CommandExchange,
-    attempts_of,
     command_int,
     command_long,
     command_name,
+    max_attempts,
     result_name,
 )
 
@@ -27,18 +27,18 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 ACCEPTED, DENIED, IN_PROGRESS = 0, 2, 5
 
 
-class Told:
-    """What has been heard of the order, at the test's word."""
+class Status:
+    """An order's status, set by the test."""
 
-    def __init__(self, end: str = "", told_at: float = -1.0) -> None:
-        self.end, self.told_at = end, told_at
+    def __init__(self, end: str = "", heartbeat_at: float = -1.0) -> None:
+        self.end, self.heartbeat_at = end, heartbeat_at
 
 
 def order(
-    standing: Told | None = None, *, component: int = 1, arm: float = 0.0, **options: Any
+    order_status: Status | None = None, *, component: int = 1, arm: float = 0.0, **options: Any
 ) -> CommandExchange:
     message = command_long(1, component, ARM, (arm,))
-    machine = CommandExchange(message, own_system=255, own_component=190, standing=standing, **options)
+    machine = CommandExchange(message, own_system=255, own_component=190, order_status=order_status, **options)
     machine.start(0.0)
     return machine
 
@@ -57,28 +57,28 @@ def text_of(machine: CommandExchange) -> str:
     return str(caught.value)
 
 
-# ------------------------------------------------------------------------------- sent again
+# ------------------------------------------------------------------------- repeated sending
 
 
-def test_it_is_sent_again_when_the_vehicle_has_told_what_it_does_for_three_quarters_of_a_second() -> None:
-    standing = Told()
-    machine = order(standing)
+def test_order_is_resent_after_heartbeat() -> None:
+    order_status = Status()
+    machine = order(order_status)
     assert confirmations(machine) == [0]
     assert machine.deadline == 0.75
-    standing.told_at = 0.74
+    order_status.heartbeat_at = 0.74
     machine.expire(0.75)
     assert confirmations(machine) == []
     assert machine.deadline == pytest.approx(0.8)
-    standing.told_at = 0.75
+    order_status.heartbeat_at = 0.75
     machine.expire(0.8)
     assert confirmations(machine) == [1]
     assert machine.deadline == pytest.approx(1.55)
-    machine.expire(1.55)  # what was told before the last sending counts no more
+    machine.expire(1.55)  # reports from before the last sending no longer count
     assert confirmations(machine) == []
 
 
-def test_it_is_not_sent_again_when_it_stands_no_more_whatever_was_told() -> None:
-    machine = order(Told("the pilot took over", told_at=5.0))
+def test_ended_order_is_not_resent() -> None:
+    machine = order(Status("the pilot took over", heartbeat_at=5.0))
     assert confirmations(machine) == [0]
     machine.expire(0.75)
     assert machine.done
@@ -86,8 +86,8 @@ def test_it_is_not_sent_again_when_it_stands_no_more_whatever_was_told() -> None
     assert text_of(machine).endswith("sent once within 0.8 s; not sent again: the pilot took over")
 
 
-def test_into_a_silence_it_is_sent_once_and_ends_in_its_time() -> None:
-    machine, looked, now = order(Told(), attempts=3), 0, 0.0
+def test_order_without_heartbeat_is_sent_once() -> None:
+    machine, looked, now = order(Status(), attempts=3), 0, 0.0
     while not machine.done:
         assert machine.deadline is not None
         assert machine.deadline <= 3.0
@@ -97,60 +97,60 @@ def test_into_a_silence_it_is_sent_once_and_ends_in_its_time() -> None:
     assert now == 3.0
     assert looked <= 50
     assert confirmations(machine) == [0]
-    assert "sent once within 3.0 s; not sent again: the vehicle has not told since" in text_of(machine)
+    assert "sent once within 3.0 s; not sent again: no HEARTBEAT received since" in text_of(machine)
 
 
-def test_last_sending_is_waited_for_while_the_order_stands() -> None:
-    standing = Told(told_at=0.75)
-    machine = order(standing, attempts=2)
+def test_order_waits_for_last_sending() -> None:
+    order_status = Status(heartbeat_at=0.75)
+    machine = order(order_status, attempts=2)
     machine.expire(0.75)
     assert confirmations(machine) == [0, 1]
     assert machine.deadline == 1.5
-    standing.told_at = 1.75
+    order_status.heartbeat_at = 1.75
     machine.expire(1.75)
     assert not machine.done
-    standing.end = "the pilot took over"
+    order_status.end = "the pilot took over"
     machine.expire(1.8)
     assert confirmations(machine) == []
     assert text_of(machine).endswith("sent 2 times within 1.8 s; not sent again: the pilot took over")
 
 
-@pytest.mark.parametrize("command", SENT_ONCE)
-def test_order_that_would_be_done_twice_is_sent_once(command: int) -> None:
-    what, where = SENT_ONCE[command]
+@pytest.mark.parametrize("command", UNREPEATABLE_COMMANDS)
+def test_unrepeatable_order_is_sent_once(command: int) -> None:
+    what, where = UNREPEATABLE_COMMANDS[command]
     params = [0.0] * 7 if where is None else [1.0 - where[1]] * 7
     if where is not None:
-        assert attempts_of(command, params) == ATTEMPTS
+        assert max_attempts(command, params) == MAX_ATTEMPTS
         params[where[0]] = where[1]
-    standing, now = Told(), 0.0
+    order_status, now = Status(), 0.0
     message = command_long(1, 1, command, tuple(params))
-    machine = CommandExchange(message, own_system=255, own_component=190, standing=standing)
+    machine = CommandExchange(message, own_system=255, own_component=190, order_status=order_status)
     machine.start(now)
     while not machine.done:
         assert machine.deadline is not None
-        now = standing.told_at = machine.deadline
+        now = order_status.heartbeat_at = machine.deadline
         machine.expire(now)
     assert now == 4.0
     assert confirmations(machine) == [0]
     assert text_of(machine).endswith(f"within 4.0 s; never sent again: a second one {what}")
 
 
-def test_order_sent_once_ends_as_soon_as_its_effect_was_told() -> None:
-    standing = Told()
-    machine = order(standing, arm=1.0)
-    standing.end = "its effect was told"
+def test_unrepeatable_order_ends_with_its_effect() -> None:
+    order_status = Status()
+    machine = order(order_status, arm=1.0)
+    order_status.end = "its effect was reported"
     machine.expire(1.0)
     assert machine.done
 
 
-def test_what_was_sent_already_is_not_sent_by_the_start() -> None:
+def test_already_sent_order_is_not_sent_on_start() -> None:
     machine = order(is_sent=True)
     assert machine.take_outbox() == []
     machine.expire(1.0)
     assert confirmations(machine) == [1]
 
 
-def test_confirmation_stays_at_its_greatest_value() -> None:
+def test_command_confirmation_is_capped() -> None:
     machine = order(attempts=258)
     for now in range(1, 258):
         machine.expire(float(now))
@@ -160,20 +160,20 @@ def test_confirmation_stays_at_its_greatest_value() -> None:
 # ---------------------------------------------------------------------------------- answers
 
 
-def test_answers_to_an_earlier_command_of_the_same_number_are_not_ours() -> None:
-    machine = order(answers_before_ours=1)
-    machine.receive(ack(IN_PROGRESS), 0.1)  # no answer yet
+def test_answers_to_earlier_command_are_ignored() -> None:
+    machine = order(earlier_answers=1)
+    machine.receive(ack(IN_PROGRESS), 0.1)  # not a final answer
     assert machine.deadline == 1.0
     machine.receive(ack(DENIED), 0.2)
     assert not machine.done
-    assert machine.answers_to_come == 1
+    assert machine.pending_answers == 1
     machine.receive(ack(ACCEPTED), 0.3)
     assert machine.result().result == ACCEPTED
 
 
 @pytest.mark.parametrize("attempts", [1, 2])
-def test_every_answer_counts_after_the_command_was_sent_again_or_if_it_never_is(attempts: int) -> None:
-    machine = order(answers_before_ours=3, attempts=attempts)
+def test_every_answer_counts_after_resend(attempts: int) -> None:
+    machine = order(earlier_answers=3, attempts=attempts)
     for now in range(1, attempts):
         machine.expire(float(now))
     machine.receive(ack(DENIED), 2.1)
@@ -181,33 +181,33 @@ def test_every_answer_counts_after_the_command_was_sent_again_or_if_it_never_is(
         machine.result()
 
 
-def test_answers_to_come_are_those_to_what_was_sent() -> None:
+def test_pending_answers_count_sendings() -> None:
     machine = order(attempts=3)
-    assert machine.answers_to_come == 1
+    assert machine.pending_answers == 1
     machine.expire(1.0)
-    assert machine.answers_to_come == 2
+    assert machine.pending_answers == 2
     machine.receive(ack(IN_PROGRESS), 1.1)
-    assert machine.answers_to_come == 2
+    assert machine.pending_answers == 2
     machine.receive(ack(ACCEPTED), 1.2)
-    assert machine.answers_to_come == 1
+    assert machine.pending_answers == 1
 
 
-def test_answers_to_come_are_counted_beside_those_before_ours() -> None:
-    machine = order(answers_before_ours=2, answers_to_each=2)
+def test_pending_answers_exclude_earlier_ones() -> None:
+    machine = order(earlier_answers=2, acks_per_sending=2)
     for answers, to_come in [(1, 2), (2, 2), (3, 1)]:
         machine.receive(ack(ACCEPTED), 0.1)
-        assert (machine.answers, machine.answers_to_come) == (answers, to_come)
+        assert (machine.answers, machine.pending_answers) == (answers, to_come)
     assert machine.done
 
 
 @pytest.mark.parametrize(("target", "sender", "is_ours"), [(1, 1, True), (1, 154, False), (0, 154, True)])
-def test_only_the_component_that_was_asked_answers(target: int, sender: int, is_ours: bool) -> None:
+def test_ack_of_other_component_is_ignored(target: int, sender: int, is_ours: bool) -> None:
     machine = order(component=target)
     machine.receive(framed(ack(ACCEPTED), component_id=sender), 0.1)
     assert machine.done is is_ours
 
 
-def test_progress_is_a_percentage_or_not_told() -> None:
+def test_progress_is_percentage_or_none() -> None:
     told: list[int | None] = []
     machine = order(on_progress=told.append, progress_timeout=3.0)
     for percent in (0, 1, 100, 101):
@@ -216,13 +216,13 @@ def test_progress_is_a_percentage_or_not_told() -> None:
     machine.expire(3.4)
     assert not machine.done
     machine.expire(3.5)
-    assert text_of(machine).endswith("was in progress, then nothing came for 3 s")
+    assert text_of(machine).endswith("was in progress, then no COMMAND_ACK for 3 s")
 
 
-def test_a_refusal_says_what_helps() -> None:
+def test_rejection_text_has_hint() -> None:
     machine = order()
     machine.receive(ack(8), 0.1)
-    with pytest.raises(CommandRejected, match="it has to be sent as COMMAND_INT"):
+    with pytest.raises(CommandRejected, match="it must be sent as COMMAND_INT"):
         machine.result()
     assert (command_name(54321), result_name(99)) == ("MAV_CMD 54321", "MAV_RESULT 99")
 
@@ -230,7 +230,7 @@ def test_a_refusal_says_what_helps() -> None:
 # ----------------------------------------------------------------------------------- limits
 
 
-def test_the_last_allowed_values_are_allowed() -> None:
+def test_command_accepts_boundary_values() -> None:
     assert command_long(255, 0, ARM, (FLOAT32_MAX, -FLOAT32_MAX)).target_system == 255
     for x, y in ((-(2**31), 2**31 - 1), (2**31 - 1, -(2**31))):
         made: Message = command_int(1, 1, 192, (1, 2, 3, 4), frame=6, x=x, y=y, z=FLOAT32_MAX)
@@ -247,13 +247,13 @@ def test_the_last_allowed_values_are_allowed() -> None:
         ({"z": float("inf")}, "z = inf"),
     ],
 )
-def test_places_beyond_their_type_are_refused(place: dict[str, Any], text: str) -> None:
+def test_command_int_rejects_places_beyond_type(place: dict[str, Any], text: str) -> None:
     with pytest.raises(InvalidArgument, match=text):
         command_int(1, 1, 192, frame=6, **({"x": 0, "y": 0, "z": 0.0} | place))
 
 
 @pytest.mark.parametrize("system", [0, 256])
-def test_a_target_is_a_single_system(system: int) -> None:
+def test_command_target_must_be_one_system(system: int) -> None:
     for make in (
         lambda: command_long(system, 0, ARM),
         lambda: command_int(system, 0, 192, frame=6, x=0, y=0, z=0),
@@ -262,7 +262,7 @@ def test_a_target_is_a_single_system(system: int) -> None:
             make()
 
 
-def test_a_command_is_sent_at_least_once() -> None:
+def test_command_needs_at_least_one_attempt() -> None:
     with pytest.raises(InvalidArgument, match="attempts = 0"):
         order(attempts=0)
     assert order(attempts=1).deadline == 1.0

@@ -1,4 +1,4 @@
-"""Settings by PARAM_EXT: the list, reads and writes over bad channels, refusals, progress, rounding, other stations."""
+"""PARAM_EXT settings: list, reads and writes over bad channels, refusals, progress, rounding, other stations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamExtType as T
 from aerokit.mavlink.enums import ParamAck
 from aerokit.mavlink.message import Message
-from aerokit.parameters.setting import Setting, SettingValue, setting_bytes, setting_value
+from aerokit.parameters.parameter import Setting, SettingValue, setting_bytes, setting_value
 from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.extended_parameters import SettingAnswer, SettingList, SettingReads, SettingWrite
 
@@ -29,7 +29,7 @@ def table_of(count: int) -> list[Setting]:
 
 
 class FakeCamera(FakeVehicle):
-    """Answers as the standard says. Subclass it for what goes wrong."""
+    """Answers as the standard says. Subclasses add faults."""
 
     tick_s = 0.02
 
@@ -38,7 +38,7 @@ class FakeCamera(FakeVehicle):
         self.table = {each.name: each for each in table}
         self.writes: list[SettingValue] = []
 
-    def told(self, name: str) -> m.ParamExtValue:
+    def ext_value(self, name: str) -> m.ParamExtValue:
         setting = self.table[name]
         data = setting_bytes(setting.value, setting.type)
         return m.ParamExtValue(name, data, setting.type, len(self.table), list(self.table).index(name))
@@ -46,12 +46,12 @@ class FakeCamera(FakeVehicle):
     def receive(self, message: Message) -> None:
         if isinstance(message, m.ParamExtRequestList):
             for index, name in enumerate(self.table):
-                self.say(self.told(name), self.tick_s * index)
+                self.say(self.ext_value(name), self.tick_s * index)
         elif isinstance(message, m.ParamExtRequestRead):
             names = list(self.table)
             name = names[message.param_index] if 0 <= message.param_index < len(names) else message.param_id
             if name in self.table:
-                self.say(self.told(name))
+                self.say(self.ext_value(name))
         elif isinstance(message, m.ParamExtSet):
             self.on_ext_set(message.param_id, setting_value(message.param_value, message.param_type))
 
@@ -94,14 +94,14 @@ def value(answer: SettingAnswer) -> SettingValue:
 # ------------------------------------------------------------------------------------- the list
 
 
-def test_one_request_brings_the_list() -> None:
+def test_setting_list_needs_one_request() -> None:
     channel = Channel(FakeCamera(table_of(12)))
     found: dict[str, Setting] = channel.run(listing())
     assert list(found.values()) == table_of(12)
     assert channel.kinds() == {"PARAM_EXT_REQUEST_LIST": 1}
 
 
-def test_a_hole_is_asked_for_by_its_index() -> None:
+def test_setting_list_requests_gap_by_index() -> None:
     channel = Channel(FakeCamera(table_of(12)))
     lost = iter([5, 8, 11])
     waiting = next(lost)
@@ -119,10 +119,10 @@ def test_a_hole_is_asked_for_by_its_index() -> None:
     assert [each.param_index for each in channel.all(m.ParamExtRequestRead)] == [5, 8, 11]
     assert channel.kinds()["PARAM_EXT_REQUEST_LIST"] == 1
     first = next(at for at, each in channel.sent if isinstance(each, m.ParamExtRequestRead))
-    assert first == pytest.approx(RTT_S + 6 * FakeCamera.tick_s)  # when the next one came, not at the end
+    assert first == pytest.approx(RTT_S + 6 * FakeCamera.tick_s)  # when the next one arrived, not at the end
 
 
-def test_a_list_that_did_not_begin_is_asked_for_again() -> None:
+def test_setting_list_retries_unstarted_list() -> None:
     channel = Channel(FakeCamera(table_of(3)))
     asked = 0
 
@@ -136,22 +136,22 @@ def test_a_list_that_did_not_begin_is_asked_for_again() -> None:
     assert channel.kinds() == {"PARAM_EXT_REQUEST_LIST": 2}
 
 
-def test_a_component_without_settings_says_nothing() -> None:
+def test_setting_list_without_settings_times_out() -> None:
     channel = Channel(FakeCamera([]))
     with pytest.raises(ParameterTimeout, match="PARAM_EXT_REQUEST_LIST was not answered"):
-        channel.run(listing(patience_s=5.0))
+        channel.run(listing(idle_timeout_s=5.0))
     assert channel.now == pytest.approx(5.0)
 
 
-def test_what_did_not_come_is_named() -> None:
+def test_setting_list_timeout_names_missing() -> None:
     channel = Channel(FakeCamera(table_of(6)))
     channel.is_lost = lambda message: isinstance(message, m.ParamExtValue) and message.param_index in (2, 4)
     with pytest.raises(ParameterTimeout, match=r"2 of 6 settings did not come: .* missing 2, 4") as caught:
-        channel.run(listing(patience_s=3.0))
+        channel.run(listing(idle_timeout_s=3.0))
     assert caught.value.missing == (2, 4)
 
 
-def test_values_of_other_components_and_without_index_are_no_part_of_it() -> None:
+def test_setting_list_ignores_unrelated_values() -> None:
     channel = Channel(FakeCamera(table_of(3)))
     stranger = m.ParamExtValue("OTHER", b"", T.UINT8, 9, 7)
     channel.at(0.0, lambda: channel.from_vehicle(stranger, component_id=2))
@@ -161,7 +161,7 @@ def test_values_of_other_components_and_without_index_are_no_part_of_it() -> Non
     assert channel.kinds() == {"PARAM_EXT_REQUEST_LIST": 1}
 
 
-def test_settings_that_shift_are_asked_for_again() -> None:
+def test_setting_list_reloads_shifted_settings() -> None:
     camera = FakeCamera(table_of(8))
     channel = Channel(camera)
 
@@ -183,11 +183,9 @@ def test_settings_that_shift_are_asked_for_again() -> None:
     jitter_s=st.sampled_from([0.0, 0.2]),
     count=st.integers(1, 60),
 )
-def test_the_list_is_whole_whatever_is_lost_or_late(
-    seed: int, loss: float, jitter_s: float, count: int
-) -> None:
+def test_setting_list_is_complete_despite_losses(seed: int, loss: float, jitter_s: float, count: int) -> None:
     channel = Channel(FakeCamera(table_of(count)), loss=loss, jitter_s=jitter_s, seed=seed)
-    assert sorted(channel.run(listing(patience_s=60.0)).values(), key=by_index) == table_of(count)
+    assert sorted(channel.run(listing(idle_timeout_s=60.0)).values(), key=by_index) == table_of(count)
     assert len(channel.sent) < 40 + 12 * count
 
 
@@ -199,7 +197,7 @@ def by_index(setting: Setting) -> int:
 # -------------------------------------------------------------------------------------- reading
 
 
-def test_some_are_read_in_the_order_asked() -> None:
+def test_setting_reads_keep_request_order() -> None:
     channel = Channel(FakeCamera(table_of(20)))
     names = [f"CAM_{i:03}" for i in range(19, -1, -1)]
     answers = channel.run(reads(*names))
@@ -208,12 +206,12 @@ def test_some_are_read_in_the_order_asked() -> None:
     assert channel.kinds() == {"PARAM_EXT_REQUEST_READ": 20}
 
 
-def test_nothing_to_read() -> None:
+def test_setting_reads_of_nothing() -> None:
     answers: dict[str, SettingAnswer] = Channel(FakeCamera([])).run(reads())
     assert not answers
 
 
-def test_an_unknown_name_is_told_by_silence_about_it_alone() -> None:
+def test_setting_read_of_unknown_name_is_rejected() -> None:
     channel = Channel(FakeCamera(table_of(4)))
     answers = channel.run(reads("NOPE", "CAM_001"))
     assert isinstance(answers["NOPE"], ParameterRejected)
@@ -222,9 +220,9 @@ def test_an_unknown_name_is_told_by_silence_about_it_alone() -> None:
     assert channel.now < 3.0
 
 
-def test_silence_of_the_component_is_a_timeout() -> None:
+def test_setting_read_of_silent_component_times_out() -> None:
     channel = Channel(FakeCamera(table_of(4)), loss=1.0)
-    answer = channel.run(reads("CAM_001", patience_s=5.0))["CAM_001"]
+    answer = channel.run(reads("CAM_001", idle_timeout_s=5.0))["CAM_001"]
     assert isinstance(answer, ParameterTimeout)
     assert answer.missing == ("CAM_001",)
     assert channel.now == pytest.approx(5.0)
@@ -233,10 +231,10 @@ def test_silence_of_the_component_is_a_timeout() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.1, 0.3, 0.5]), count=st.integers(1, 30))
-def test_reads_are_exact_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+def test_setting_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(30)
     channel = Channel(FakeCamera(table), loss=loss, jitter_s=0.05, seed=seed)
-    answers = channel.run(reads(*(each.name for each in table[:count]), patience_s=60.0))
+    answers = channel.run(reads(*(each.name for each in table[:count]), idle_timeout_s=60.0))
     assert list(answers.values()) == table[:count]
 
 
@@ -247,15 +245,15 @@ def test_reads_are_exact_whatever_is_lost(seed: int, loss: float, count: int) ->
     ("wanted", "kind"),
     [(9, T.UINT32), (-5, T.INT8), (1 << 63, T.UINT64), (0.1, T.REAL64), (1.5, T.REAL32), ("Tür", T.CUSTOM)],
 )
-def test_a_write_is_confirmed_by_its_acknowledgement(wanted: SettingValue, kind: int) -> None:
+def test_setting_write_is_confirmed_by_ack(wanted: SettingValue, kind: int) -> None:
     channel = Channel(FakeCamera([Setting("A", 0 if kind != T.CUSTOM else "", kind, 0)]))
-    told = channel.run(write(wanted, "A", kind, before=0))
-    assert (told.name, told.value, told.type) == ("A", wanted, kind)
+    ext_value = channel.run(write(wanted, "A", kind, before=0))
+    assert (ext_value.name, ext_value.value, ext_value.type) == ("A", wanted, kind)
     assert channel.kinds() == {"PARAM_EXT_SET": 1}
 
 
 @pytest.mark.parametrize("result", [ParamAck.VALUE_UNSUPPORTED, ParamAck.FAILED, 77])
-def test_a_refusal_is_the_answer(result: int) -> None:
+def test_setting_write_refusal(result: int) -> None:
     class Refusing(FakeCamera):
         def on_ext_set(self, name: str, value: SettingValue) -> None:
             self.acknowledge(name, 7, T.UINT32, result)
@@ -276,7 +274,7 @@ class Slow(FakeCamera):
         self.channel.at(self.channel.now + self.seconds, lambda: FakeCamera.on_ext_set(self, name, value))
 
 
-def test_what_is_in_progress_is_waited_for() -> None:
+def test_setting_write_waits_for_progress() -> None:
     camera = Slow(table_of(1))
     channel = Channel(camera)
     assert channel.run(write(9)).value == 9
@@ -284,49 +282,49 @@ def test_what_is_in_progress_is_waited_for() -> None:
     assert channel.kinds() == {"PARAM_EXT_SET": 1}
 
 
-def test_values_under_way_are_no_answer_to_a_write() -> None:
-    """Somebody else reads meanwhile."""
+def test_setting_write_ignores_values_in_flight() -> None:
+    """Another station reads meanwhile."""
     camera = Slow(table_of(1))
     channel = Channel(camera)
     for tenth in range(5, 35):
-        channel.at(tenth / 10, lambda: camera.say(camera.told("CAM_000")))
+        channel.at(tenth / 10, lambda: camera.say(camera.ext_value("CAM_000")))
     assert channel.run(write(9)).value == 9
     assert channel.kinds() == {"PARAM_EXT_SET": 1}
 
 
-def test_progress_is_a_reason_to_be_patient() -> None:
-    class Telling(Slow):
+def test_setting_write_progress_extends_timeout() -> None:
+    class SlowWithProgress(Slow):
         seconds = 8.0
 
-    camera = Telling(table_of(1))
+    camera = SlowWithProgress(table_of(1))
     channel = Channel(camera)
     for second in (2, 4, 6):
         channel.at(second, lambda: camera.acknowledge("CAM_000", 7, T.UINT32, ParamAck.IN_PROGRESS))
-    assert channel.run(write(9, patience_s=3.0)).value == 9
+    assert channel.run(write(9, idle_timeout_s=3.0)).value == 9
     assert channel.kinds() == {"PARAM_EXT_SET": 1}
 
 
-def test_progress_that_is_told_anew_when_it_is_asked_for_may_take_longer_than_patience() -> None:
+def test_setting_write_repeated_progress_extends_timeout() -> None:
     class VerySlow(Slow):
         seconds = 12.0
 
     channel = Channel(VerySlow(table_of(1)))
-    assert channel.run(write(9, patience_s=10.0)).value == 9
+    assert channel.run(write(9, idle_timeout_s=10.0)).value == 9
     assert channel.now > 12.0
 
 
-def test_progress_without_an_end_is_asked_for_and_ends() -> None:
-    class Stuck(Slow):
+def test_setting_write_endless_progress_ends() -> None:
+    class NeverDone(Slow):
         seconds = 1e6
 
-    channel = Channel(Stuck(table_of(1)))
+    channel = Channel(NeverDone(table_of(1)))
     with pytest.raises((ParameterRejected, ParameterTimeout)):
         channel.run(write(9))
     assert channel.now < 90.0
     assert len(channel.sent) <= 20
 
 
-def test_a_lost_acknowledgement_is_read_and_not_written_again() -> None:
+def test_setting_write_lost_ack_is_read_back() -> None:
     camera = FakeCamera(table_of(1))
     channel = Channel(camera)
     channel.is_lost = lambda message: isinstance(message, m.ParamExtAck)
@@ -335,7 +333,7 @@ def test_a_lost_acknowledgement_is_read_and_not_written_again() -> None:
     assert [type(each) for _, each in channel.sent] == [m.ParamExtSet, m.ParamExtRequestRead]
 
 
-def test_a_lost_write_is_written_again_after_it_was_read() -> None:
+def test_lost_setting_write_is_repeated_after_read() -> None:
     camera = FakeCamera(table_of(1))
     channel = Channel(camera)
     channel.is_lost = lambda message: isinstance(message, m.ParamExtSet) and channel.now < 0.05
@@ -347,8 +345,8 @@ def test_a_lost_write_is_written_again_after_it_was_read() -> None:
     ]
 
 
-def test_a_component_that_has_become_faster_is_believed() -> None:
-    """It was busy when its round trip was measured, and the first write was lost: each answer seems too early."""
+def test_setting_write_accepts_faster_component() -> None:
+    """The round trip was measured on a busy camera, and the first write was lost: answers seem too early."""
     camera = FakeCamera(table_of(1))
     channel = Channel(camera, delay_s=0.005)
     channel.is_lost = lambda message: channel.now < 3.0
@@ -356,15 +354,15 @@ def test_a_component_that_has_become_faster_is_believed() -> None:
     assert channel.kinds()["PARAM_EXT_SET"] == 2
 
 
-def test_nothing_is_set_into_a_silence() -> None:
+def test_setting_write_is_not_repeated_in_silence() -> None:
     channel = Channel(FakeCamera(table_of(1)), loss=1.0)
     with pytest.raises(ParameterTimeout, match="PARAM_EXT_SET of CAM_000 was not confirmed, sent 1 times"):
-        channel.run(write(9, patience_s=5.0))
+        channel.run(write(9, idle_timeout_s=5.0))
     assert channel.kinds()["PARAM_EXT_SET"] == 1
     assert channel.now == pytest.approx(5.0)
 
 
-def test_another_value_is_the_components_own_when_it_is_read_twice() -> None:
+def test_setting_write_accepts_other_value_read_twice() -> None:
     class Clamping(FakeCamera):
         def keep(self, name: str, value: SettingValue) -> None:
             assert isinstance(value, int)
@@ -377,20 +375,20 @@ def test_another_value_is_the_components_own_when_it_is_read_twice() -> None:
     assert channel.kinds() == {"PARAM_EXT_SET": 1, "PARAM_EXT_REQUEST_READ": 2}
 
 
-def test_a_component_that_says_nothing_and_keeps_its_value_has_refused() -> None:
-    class Stubborn(FakeCamera):
+def test_setting_write_unchanged_value_is_refusal() -> None:
+    class KeepsValue(FakeCamera):
         def on_ext_set(self, name: str, value: SettingValue) -> None:
             self.writes.append(value)
 
-    camera = Stubborn(table_of(1))
+    camera = KeepsValue(table_of(1))
     channel = Channel(camera)
     with pytest.raises(ParameterRejected, match="CAM_000 was refused: the component keeps 7"):
         channel.run(write(9))
     assert len(camera.writes) == 8
 
 
-def test_a_later_value_of_another_station_is_left_alone() -> None:
-    """It is set between our write, whose acknowledgement is lost, and our question."""
+def test_setting_write_keeps_later_value_of_other_station() -> None:
+    """Another station writes between our write, whose acknowledgement is lost, and our query."""
     camera = FakeCamera(table_of(1))
     channel = Channel(camera)
     channel.is_lost = lambda message: isinstance(message, m.ParamExtAck)
@@ -399,7 +397,7 @@ def test_a_later_value_of_another_station_is_left_alone() -> None:
     assert camera.writes == [9]
 
 
-def test_refusals_for_something_before_come_too_soon() -> None:
+def test_setting_write_ignores_early_refusals() -> None:
     channel = Channel(FakeCamera(table_of(1)))
     late = m.ParamExtAck("CAM_000", setting_bytes(7, T.UINT32), T.UINT32, ParamAck.FAILED)
     channel.at(0.0, lambda: channel._arrive(late))
@@ -413,10 +411,8 @@ def test_refusals_for_something_before_come_too_soon() -> None:
     jitter_s=st.sampled_from([0.0, 0.2]),
     copies=st.integers(1, 3),
 )
-def test_a_write_ends_with_what_the_component_has(
-    seed: int, loss: float, jitter_s: float, copies: int
-) -> None:
-    """Lost, repeated and reordered messages: nothing else is ever written, and the end is the truth."""
+def test_setting_write_result_matches_component(seed: int, loss: float, jitter_s: float, copies: int) -> None:
+    """With loss, duplicates and reordering nothing else is ever written, and the result is correct."""
 
     class Repeating(FakeCamera):
         def say(self, message: Message, after: float = 0.0) -> None:
@@ -426,10 +422,10 @@ def test_a_write_ends_with_what_the_component_has(
     camera = Repeating(table_of(5))
     channel = Channel(camera, loss=loss, jitter_s=jitter_s, seed=seed)
     try:
-        told = channel.run(write(9, patience_s=60.0))
+        ext_value = channel.run(write(9, idle_timeout_s=60.0))
     except ParameterRejected:
-        assert loss >= 0.3  # eight answers with the value from before: eight writes in a row were lost
+        assert loss >= 0.3  # eight answers with the old value: eight writes in a row were lost
         return
-    assert told.value == 9
+    assert ext_value.value == 9
     assert set(camera.writes) == {9}
     assert camera.table["CAM_000"].value == 9

@@ -1,4 +1,4 @@
-"""MAVFTP: the payload, and one request until its answer."""
+"""MAVFTP: the payload, and single requests."""
 
 from __future__ import annotations
 
@@ -21,16 +21,14 @@ Op = MavFtpOpcode
 bytes_of_data = st.binary(max_size=239)
 
 
-def make_request(
-    opcode: MavFtpOpcode = Op.OPENFILERO, *, patience_s: float = 10.0, **options: Any
-) -> FtpRequest:
+def make_request(opcode: MavFtpOpcode = Op.OPENFILERO, *, idle_timeout_s: float = 10.0, **options: Any) -> FtpRequest:
     return FtpRequest(
         make_client(7),
         opcode,
         path="/a",
         data=b"/a",
         round_trip=RoundTrip(0.1),
-        patience_s=patience_s,
+        idle_timeout_s=idle_timeout_s,
         **options,
     )
 
@@ -53,7 +51,7 @@ def started(request: FtpRequest) -> FtpMessage:
     st.integers(0, 0xFFFFFFFF),
     bytes_of_data,
 )
-def test_what_is_encoded_is_decoded(
+def test_ftp_message_round_trip(
     sequence: int, opcode: int, session: int, asked: int, complete: bool, offset: int, data: bytes
 ) -> None:
     message = FtpMessage(sequence, opcode, session, len(data), asked, complete, offset, data)
@@ -64,19 +62,19 @@ def test_what_is_encoded_is_decoded(
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_some_message(payload: bytes) -> None:
+def test_ftp_message_decodes_any_bytes(payload: bytes) -> None:
     message = FtpMessage.decode(payload)
     assert len(message.data) <= 239
     assert 0 <= message.error_code <= 255
 
 
 @pytest.mark.parametrize("path", ["", "a\0b", "x" * 239, "ä" * 120, "\ud800"])
-def test_paths_that_cannot_be_sent(path: str) -> None:
+def test_ftp_rejects_invalid_paths(path: str) -> None:
     with pytest.raises(InvalidArgument, match="path"):
         path_bytes(path)
 
 
-def test_paths_that_can() -> None:
+def test_ftp_accepts_valid_paths() -> None:
     assert path_bytes("@PARAM/param.pck?withdefaults=1") == b"@PARAM/param.pck?withdefaults=1"
     assert len(path_bytes("x" * 238)) == 238
     assert path_bytes("ä" * 119) == "ä".encode() * 119
@@ -85,7 +83,7 @@ def test_paths_that_can() -> None:
 # -------------------------------------------------------------------------------- the request
 
 
-def test_the_answer_is_the_result_and_measures() -> None:
+def test_ftp_request_result_and_round_trip() -> None:
     request = make_request()
     sent = started(request)
     assert (sent.sequence, sent.opcode, sent.data, sent.size) == (7, Op.OPENFILERO, b"/a", 2)
@@ -95,8 +93,8 @@ def test_the_answer_is_the_result_and_measures() -> None:
     assert request.round_trip.smoothed_s == pytest.approx(0.1 + 0.1 / 8)
 
 
-def test_it_is_sent_again_under_the_same_number_until_patience_ends() -> None:
-    request = make_request(patience_s=3.0)
+def test_ftp_request_retries_with_same_sequence() -> None:
+    request = make_request(idle_timeout_s=3.0)
     sent, times = started(request), []
     while not request.done:
         assert request.deadline is not None
@@ -112,20 +110,18 @@ def test_it_is_sent_again_under_the_same_number_until_patience_ends() -> None:
     assert request.take_outbox() == []
 
 
-def test_a_refusal_says_what_and_why() -> None:
+def test_ftp_refusal_names_operation_and_reason() -> None:
     request = make_request()
     sent = started(request)
     refusal = reply_to(sent, code=MavFtpErr.FAILERRNO)
     request.receive(as_message(refusal.replace(size=2, data=bytes([MavFtpErr.FAILERRNO, 28]))), 0.1)
-    with pytest.raises(
-        FileError, match=r"open for reading /a: no space left \(FAILERRNO, ENOSPC\)"
-    ) as raised:
+    with pytest.raises(FileError, match=r"open for reading /a: no space left \(FAILERRNO, ENOSPC\)") as raised:
         request.result()
     assert (raised.value.path, raised.value.code, raised.value.errno) == ("/a", MavFtpErr.FAILERRNO, 28)
 
 
 @pytest.mark.parametrize("code", [*MavFtpErr, 99])
-def test_every_code_has_its_words(code: int) -> None:
+def test_ftp_error_codes_have_texts(code: int) -> None:
     request = make_request()
     request.receive(as_message(reply_to(started(request), code=code)), 0.1)
     with pytest.raises(FileError, match="/a: "):
@@ -137,27 +133,27 @@ NEWLIB = {
     "ENODEV": 19, "ENOTDIR": 20, "EISDIR": 21, "EINVAL": 22, "ENFILE": 23, "EMFILE": 24, "EFBIG": 27, "ENOSPC": 28,
     "EROFS": 30, "ENOSYS": 88, "ENOTEMPTY": 90, "ENAMETOOLONG": 91, "EOPNOTSUPP": 95,
 }  # fmt: skip
-"""sys/errno.h of newlib, which ArduPilot is built with."""
+"""errno.h of newlib, which ArduPilot is built with."""
 LINUX = {"ENAMETOOLONG": 36, "ENOSYS": 38, "ENOTEMPTY": 39}
-"""Where Linux and NuttX, which PX4 runs on, differ from it."""
+"""Differences in Linux and NuttX, which PX4 runs on."""
 
 
-def test_numbers_of_errors_are_those_of_the_systems() -> None:
+def test_ftp_errno_names_match_systems() -> None:
     assert {(name, number) for number, (name, _) in ERRNOS.items()} == {*NEWLIB.items(), *LINUX.items()}
 
 
 @for_each("name, number", [*NEWLIB.items(), *LINUX.items()])
-def test_every_number_of_an_error_is_told_by_its_name(name: str, number: int) -> None:
+def test_ftp_errno_is_named(name: str, number: int) -> None:
     error = file_error(MavFtpOpcode.REMOVEFILE, "/a", MavFtpErr.FAILERRNO, number)
     assert str(error) == f"remove /a: {ERRNOS[number][1]} (FAILERRNO, {name})"
 
 
-def test_an_error_that_no_system_has_is_told_by_its_number() -> None:
+def test_ftp_unknown_errno_is_shown_as_number() -> None:
     error = file_error(99, "/a", MavFtpErr.FAILERRNO, 200)
-    assert str(error) == "operation 99 /a: it failed (FAILERRNO, errno 200)"
+    assert str(error) == "operation 99 /a: the operation failed (FAILERRNO, errno 200)"
 
 
-def test_what_is_not_ours_is_ignored() -> None:
+def test_ftp_ignores_unrelated_replies() -> None:
     request = make_request()
     sent = started(request)
     answer = reply_to(sent)
@@ -170,33 +166,31 @@ def test_what_is_not_ours_is_ignored() -> None:
     assert request.done
 
 
-def test_an_answer_to_an_older_request_of_this_number_gets_a_new_number() -> None:
+def test_ftp_request_is_renumbered_after_old_reply() -> None:
     request = make_request()
     sent = started(request)
     stale = reply_to(sent).replace(request_opcode=Op.LISTDIRECTORY)
     for attempt in range(5):
         request.receive(as_message(stale), 0.1)
         again = requests_in(request.take_outbox())
-        assert len(again) == (attempt < 3)  # a server that always does that is left alone
+        assert len(again) == (attempt < 3)  # a server that always does that is given up
         if again:
             assert again[0].sequence == sent.sequence + 1
             sent, stale = again[0], stale.replace(sequence=again[0].sequence + 1)
     request.receive(as_message(reply_to(sent)), 0.25)
     assert request.done
-    assert request.round_trip.smoothed_s == pytest.approx(
-        0.1 + 0.05 / 8
-    )  # from the sending that was answered
+    assert request.round_trip.smoothed_s == pytest.approx(0.1 + 0.05 / 8)  # from the sending that was answered
 
 
-def test_closing_what_is_closed_is_no_failure() -> None:
+def test_ftp_close_of_closed_session_succeeds() -> None:
     request = make_request(Op.TERMINATESESSION, session=3)
     sent = started(request)
     request.receive(as_message(reply_to(sent, code=MavFtpErr.INVALIDSESSION)), 0.1)
     assert request.is_answered
 
 
-def test_closing_waits_for_the_end_of_a_burst() -> None:
-    request = make_request(Op.TERMINATESESSION, session=3, patience_s=2.0)
+def test_ftp_close_waits_for_burst() -> None:
+    request = make_request(Op.TERMINATESESSION, session=3, idle_timeout_s=2.0)
     sent = started(request)
     burst = reply_to(sent, b"x").replace(request_opcode=Op.BURSTREADFILE, sequence=500)
     for tenth in range(1, 100):
@@ -216,7 +210,7 @@ def test_closing_waits_for_the_end_of_a_burst() -> None:
         (Op.CREATEDIRECTORY, MavFtpErr.FILEEXISTS),
     ],
 )
-def test_what_an_earlier_sending_has_done_is_done(opcode: MavFtpOpcode, code: int) -> None:
+def test_ftp_retry_accepts_earlier_success(opcode: MavFtpOpcode, code: int) -> None:
     request = make_request(opcode)
     sent = started(request)
     request.expire(0.5)
@@ -227,7 +221,7 @@ def test_what_an_earlier_sending_has_done_is_done(opcode: MavFtpOpcode, code: in
     assert not first.is_answered
 
 
-def test_what_was_sent_before_is_not_sent_at_once() -> None:
+def test_ftp_already_sent_request_is_not_sent() -> None:
     request = FtpRequest(make_client(), Op.TERMINATESESSION, path="/a", is_sent=True)
     request.start(0.0)
     assert request.take_outbox() == []
@@ -236,6 +230,6 @@ def test_what_was_sent_before_is_not_sent_at_once() -> None:
     assert len(request.take_outbox()) == 1
 
 
-def test_sessions_are_numbered_from_1_to_255() -> None:
+def test_ftp_session_numbers_wrap() -> None:
     client = make_client(254)
     assert [client.next_session() for _ in range(3)] == [255, 1, 2]

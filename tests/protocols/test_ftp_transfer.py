@@ -1,4 +1,4 @@
-"""Downloads and uploads over a channel that loses, repeats and reorders, against servers of both kinds."""
+"""FTP downloads and uploads over a bad channel, with servers of both autopilots."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from aerokit.errors import FileError, FileTimeout
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.blocks import Reassembly
-from aerokit.protocols.exchange import Progress, RoundTrip
+from aerokit.protocols.exchange import RoundTrip, TransferProgress
 from aerokit.protocols.ftp import DATA_SIZE, FtpSessionLost
-from aerokit.protocols.ftp_transfer import MOST_GAPS, MOST_REPEATED, FtpDownload, FtpUpload, is_virtual
+from aerokit.protocols.ftp_transfer import MAX_GAPS, MAX_REPEATED_BURSTS, FtpDownload, FtpUpload, is_virtual
 
 Op = MavFtpOpcode
 SIZES = [0, 1, DATA_SIZE - 1, DATA_SIZE, DATA_SIZE + 1, 2 * DATA_SIZE, 5000, 20 * DATA_SIZE]
@@ -26,7 +26,7 @@ def content(size: int) -> bytes:
 
 
 class Download:
-    """One, with what it wrote."""
+    """A download and the content it has written."""
 
     def __init__(self, size: int | None, *, path: str = "/a", start: int = 0, **options: Any) -> None:
         self.content = bytearray()
@@ -42,7 +42,7 @@ class Download:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("exact_end", [False, True])
 @pytest.mark.parametrize("path", ["/a", "@SYS/a"])
-def test_a_file_without_loss(size: int, exact_end: bool, path: str) -> None:
+def test_download_without_loss(size: int, exact_end: bool, path: str) -> None:
     download = Download(size, path=path)
     outcome = run(download.exchange, FileServer(bytearray(content(size)), exact_end=exact_end))
     assert download.exchange.result() == size
@@ -50,28 +50,28 @@ def test_a_file_without_loss(size: int, exact_end: bool, path: str) -> None:
     assert outcome.messages == 1
 
 
-def test_the_size_of_a_virtual_file_is_a_guess() -> None:
+def test_download_ignores_size_of_virtual_file() -> None:
     for guess in (10, 1_000_000):
         download = Download(guess, path="@PARAM/param.pck")
         run(download.exchange, FileServer(bytearray(content(5000))))
         assert download.content == content(5000)
 
 
-def test_bursts_follow_each_other() -> None:
+def test_download_requests_consecutive_bursts() -> None:
     download = Download(5000)
     outcome = run(download.exchange, FileServer(bytearray(content(5000)), burst_blocks=6))
     assert download.content == content(5000)
     assert outcome.messages == 4
 
 
-def test_a_server_without_bursts_is_read_block_by_block() -> None:
+def test_download_without_bursts_reads_blocks() -> None:
     for path in ("/a", "@SYS/a"):
         download = Download(5000, path=path)
         run(download.exchange, FileServer(bytearray(content(5000)), has_burst=False, queue=None), loss=0.1)
         assert download.content == content(5000)
 
 
-def test_it_goes_on_where_it_was_left() -> None:
+def test_download_resumes() -> None:
     download = Download(5000, start=1234)
     run(download.exchange, FileServer(bytearray(content(5000))), loss=0.1)
     assert download.content == content(5000)[1234:]
@@ -90,7 +90,7 @@ def test_it_goes_on_where_it_was_left() -> None:
     st.integers(0, 2**32),
 )
 @settings(max_examples=60, deadline=None)
-def test_every_file_arrives(
+def test_download_arrives_despite_losses(
     size: int,
     loss: float,
     duplicates: float,
@@ -118,7 +118,7 @@ def test_every_file_arrives(
     assert outcome.messages <= 40 + 6 * (size // DATA_SIZE + 1)
 
 
-def test_a_hole_is_asked_for_as_soon_as_it_is_seen_and_while_the_burst_goes_on() -> None:
+def test_download_requests_gap_during_burst() -> None:
     download = Download(10_000)
     exchange = download.exchange
     exchange.start(0.0)
@@ -129,14 +129,12 @@ def test_a_hole_is_asked_for_as_soon_as_it_is_seen_and_while_the_burst_goes_on()
     reads = requests_in(exchange.take_outbox())
     assert [(each.opcode, each.offset) for each in reads] == [(Op.READFILE, 239 * n) for n in (1, 2, 3, 4)]
     sequences = {each.sequence for each in reads}
-    assert not sequences & set(
-        range(burst.sequence, burst.sequence + 500)
-    )  # those may be replies of the burst
+    assert not sequences & set(range(burst.sequence, burst.sequence + 500))  # may be replies of the burst
     exchange.receive(as_message(reply_to(reads[0], content(239), offset=239)), 0.2)
     assert [each.offset for each in requests_in(exchange.take_outbox())] == [239 * 5]
 
 
-def test_blocks_of_another_burst_are_not_taken() -> None:
+def test_download_ignores_blocks_of_other_bursts() -> None:
     download = Download(10_000)
     exchange = download.exchange
     exchange.start(0.0)
@@ -147,12 +145,12 @@ def test_blocks_of_another_burst_are_not_taken() -> None:
 
 
 def bursts_in(download: Download) -> list[int]:
-    """The offsets of the bursts that it asked for since."""
+    """Return the offsets of the bursts requested since."""
     requests = requests_in(download.exchange.take_outbox())
     return [each.offset for each in requests if each.opcode == Op.BURSTREADFILE]
 
 
-def test_after_the_last_block_of_a_burst_the_next_one_is_asked_for_at_once() -> None:
+def test_download_requests_next_burst_at_once() -> None:
     download = Download(10_000)
     download.exchange.start(0.0)
     (burst,) = requests_in(download.exchange.take_outbox())
@@ -163,8 +161,8 @@ def test_after_the_last_block_of_a_burst_the_next_one_is_asked_for_at_once() -> 
     assert bursts_in(download) == [478]
 
 
-@pytest.mark.parametrize(("missing", "asked"), [(MOST_GAPS - 1, 1), (MOST_GAPS, 0)])
-def test_with_too_many_gaps_the_burst_does_not_go_on(missing: int, asked: int) -> None:
+@pytest.mark.parametrize(("missing", "asked"), [(MAX_GAPS - 1, 1), (MAX_GAPS, 0)])
+def test_download_with_many_gaps_pauses_bursts(missing: int, asked: int) -> None:
     download = Download(10_000_000)
     download.exchange.start(0.0)
     (burst,) = requests_in(download.exchange.take_outbox())
@@ -173,7 +171,7 @@ def test_with_too_many_gaps_the_burst_does_not_go_on(missing: int, asked: int) -
     assert len(bursts_in(download)) == asked
 
 
-def test_a_burst_in_vain_is_asked_for_again_twice_before_it_is_waited_longer() -> None:
+def test_download_backs_off_after_two_failed_bursts() -> None:
     download = Download(1000)
     exchange = download.exchange
     round_trip = exchange.round_trip
@@ -190,7 +188,7 @@ def test_a_burst_in_vain_is_asked_for_again_twice_before_it_is_waited_longer() -
     assert waits[2] > 1.4 * waits[1]
 
 
-def test_the_first_block_of_the_first_burst_measures_the_round_trip_and_no_other_does() -> None:
+def test_download_measures_round_trip_by_first_block() -> None:
     for ahead, measured in ((1, 0.3), (2, None)):
         into = Reassembly(bytearray().extend, block_size=DATA_SIZE)
         exchange = FtpDownload(make_client(), "/a", into, session=1, size=5000)
@@ -201,7 +199,7 @@ def test_the_first_block_of_the_first_burst_measures_the_round_trip_and_no_other
         assert exchange.round_trip.smoothed_s == measured
 
 
-def test_a_file_that_has_grown_is_read_as_far_as_it_was_there() -> None:
+def test_download_of_grown_file_ends_at_old_size() -> None:
     download = Download(300)
     download.exchange.start(0.0)
     (burst,) = requests_in(download.exchange.take_outbox())
@@ -212,9 +210,9 @@ def test_a_file_that_has_grown_is_read_as_far_as_it_was_there() -> None:
     assert download.content == content(600)[:300]
 
 
-def test_a_server_that_sends_empty_blocks_does_not_keep_it_waiting() -> None:
-    """Three such bursts are taken for life; then only what is new is."""
-    download = Download(1000, patience_s=2.0)
+def test_download_of_empty_blocks_times_out() -> None:
+    """After three such bursts only newly arrived data counts as progress."""
+    download = Download(1000, idle_timeout_s=2.0)
     exchange = download.exchange
     exchange.start(0.0)
     now = heard_at = believed_until = 0.0
@@ -226,13 +224,13 @@ def test_a_server_that_sends_empty_blocks_does_not_keep_it_waiting() -> None:
         assert exchange.deadline is not None
         now = exchange.deadline
         exchange.expire(now)
-        if answered == MOST_REPEATED:
+        if answered == MAX_REPEATED_BURSTS:
             believed_until = heard_at + 2.0
     assert now == pytest.approx(believed_until)
 
 
-def test_it_gives_up_and_says_what_is_missing() -> None:
-    download = Download(1000, patience_s=2.0)
+def test_download_timeout_names_missing() -> None:
+    download = Download(1000, idle_timeout_s=2.0)
     exchange = download.exchange
     exchange.start(0.0)
     (burst,) = requests_in(exchange.take_outbox())
@@ -243,20 +241,20 @@ def test_it_gives_up_and_says_what_is_missing() -> None:
         assert exchange.deadline is not None
         exchange.expire(exchange.deadline)
         messages += len(exchange.take_outbox())
-    with pytest.raises(FileTimeout, match="read /a: nothing has come for 2 s") as raised:
+    with pytest.raises(FileTimeout, match="read /a: no data received for 2 s") as raised:
         exchange.result()
     assert raised.value.missing == ((239, 239), (717, 283))
     assert messages < 40
 
 
-def test_a_session_that_is_lost_is_told_apart() -> None:
+def test_download_reports_lost_session() -> None:
     download = Download(1000)
     run(download.exchange, FileServer(bytearray(content(1000)), is_open=False))
     with pytest.raises(FtpSessionLost):
         download.exchange.result()
 
 
-def test_a_read_error_ends_it() -> None:
+def test_download_ends_on_read_error() -> None:
     download = Download(1000)
     download.exchange.start(0.0)
     (burst,) = requests_in(download.exchange.take_outbox())
@@ -265,8 +263,8 @@ def test_a_read_error_ends_it() -> None:
         download.exchange.result()
 
 
-def test_progress_is_told() -> None:
-    told: list[Progress] = []
+def test_download_reports_progress() -> None:
+    told: list[TransferProgress] = []
     download = Download(1000, on_progress=told.append)
     run(download.exchange, FileServer(bytearray(content(1000))))
     assert [each.done for each in told] == [239, 478, 717, 956, 1000]
@@ -284,19 +282,17 @@ def test_progress_is_told() -> None:
     st.integers(0, 2**32),
 )
 @settings(max_examples=40, deadline=None)
-def test_every_upload_arrives(size: int, loss: float, duplicates: float, jitter_s: float, seed: int) -> None:
+def test_upload_arrives_despite_losses(size: int, loss: float, duplicates: float, jitter_s: float, seed: int) -> None:
     server = FileServer(bytearray())
     upload = FtpUpload(make_client(65530), "/a", content(size), session=1, round_trip=RoundTrip(0.1))
-    outcome = run(
-        upload, server, loss=loss, duplicates=duplicates, jitter_s=jitter_s, seed=seed, longest_s=120
-    )
+    outcome = run(upload, server, loss=loss, duplicates=duplicates, jitter_s=jitter_s, seed=seed, longest_s=120)
     assert upload.done
     upload.result()
     assert server.content == content(size)
     assert outcome.messages <= 40 + 6 * (size // DATA_SIZE + 1)
 
 
-def test_no_more_than_a_queue_holds_is_sent_at_once() -> None:
+def test_upload_respects_server_queue() -> None:
     upload = FtpUpload(make_client(), "/a", content(5000), session=1, round_trip=RoundTrip(0.1))
     upload.start(0.0)
     writes = requests_in(upload.take_outbox())
@@ -305,7 +301,7 @@ def test_no_more_than_a_queue_holds_is_sent_at_once() -> None:
     ]
 
 
-def test_an_upload_that_is_refused() -> None:
+def test_upload_refusal() -> None:
     for code, kind in ((MavFtpErr.FAIL, FileError), (MavFtpErr.INVALIDSESSION, FtpSessionLost)):
         upload = FtpUpload(make_client(), "/a", content(500), session=1)
         upload.start(0.0)
@@ -315,14 +311,14 @@ def test_an_upload_that_is_refused() -> None:
             upload.result()
 
 
-def test_an_upload_that_gets_no_answer() -> None:
-    upload = FtpUpload(make_client(), "/a", content(500), session=1, patience_s=1.0)
+def test_upload_without_answer_times_out() -> None:
+    upload = FtpUpload(make_client(), "/a", content(500), session=1, idle_timeout_s=1.0)
     run(upload, FileServer(bytearray()), loss=1.0)
     with pytest.raises(FileTimeout, match="3 of 3 blocks") as raised:
         upload.result()
     assert raised.value.missing == ((0, 239), (239, 239), (478, 22))
 
 
-def test_virtual_files_begin_with_an_at() -> None:
+def test_virtual_files_begin_with_at_sign() -> None:
     assert is_virtual("@PARAM/param.pck")
     assert not is_virtual("/APM/LOGS")

@@ -1,4 +1,4 @@
-"""Flight logs by LOG_* messages, from a vehicle that serves one request at a time or the latest one, over bad links."""
+"""Flight logs by LOG_* messages over bad links; the vehicle serves one request at a time or only the latest."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.messages import LogData, LogEntry, LogRequestData, LogRequestEnd
 from aerokit.protocols.blocks import Reassembly
 from aerokit.protocols.exchange import RoundTrip
-from aerokit.protocols.logs import LOG_BLOCK, SPACING_S, LogDownload, LogEnd, LogList
+from aerokit.protocols.logs import LOG_BLOCK, SPACING_S, LogDownload, LogList, LogStop
 
 
 def make_list(first_id: int = 1, **options: Any) -> LogList:
     return LogList(1, 1, first_id=first_id, round_trip=RoundTrip(0.1), **options)
 
 
-def make_download(
-    size: int, log_id: int = 1, *, start: int = 0, **options: Any
-) -> tuple[LogDownload, bytearray]:
+def make_download(size: int, log_id: int = 1, *, start: int = 0, **options: Any) -> tuple[LogDownload, bytearray]:
     written = bytearray()
     into = Reassembly(written.extend, block_size=LOG_BLOCK, start=start)
     return LogDownload(1, 1, log_id, size, into, round_trip=RoundTrip(0.1), **options), written
@@ -41,7 +39,7 @@ def make_download(
     st.integers(0, 99),
 )
 @settings(max_examples=40, deadline=None)
-def test_every_entry_arrives(count: int, first_id: int, latest_wins: bool, loss: float, seed: int) -> None:
+def test_log_list_is_complete(count: int, first_id: int, latest_wins: bool, loss: float, seed: int) -> None:
     vehicle = LogVehicle([content(number) for number in range(count)], first_id, latest_wins)
     exchange = make_list(first_id)
     sent = run(exchange, vehicle, loss=loss, seed=seed)
@@ -51,36 +49,36 @@ def test_every_entry_arrives(count: int, first_id: int, latest_wins: bool, loss:
     assert sent < 100
 
 
-def test_a_vehicle_without_logs() -> None:
+def test_log_list_without_logs() -> None:
     exchange = make_list()
     run(exchange, LogVehicle([]))
     assert exchange.result() == ()
 
 
-def test_one_entry_only() -> None:
+def test_log_list_of_one_entry() -> None:
     exchange = make_list(start=2, end=2)
     run(exchange, LogVehicle([content(5), content(6), content(7)]))
     assert [each.size for each in exchange.result()] == [6]
 
 
-def test_a_list_that_does_not_come() -> None:
-    exchange = make_list(patience_s=3.0)
+def test_log_list_without_answer_times_out() -> None:
+    exchange = make_list(idle_timeout_s=3.0)
     assert run(exchange, LogVehicle([b"a"]), loss=1.0) < 20
     with pytest.raises(FileTimeout, match="does not answer") as raised:
         exchange.result()
-    assert raised.value.missing == ((1, 0),)  # from there to an end that nobody knows
-    exchange = make_list(most_unanswered=4)
+    assert raised.value.missing == ((1, 0),)  # from there to an unknown end
+    exchange = make_list(max_unanswered=4)
     assert run(exchange, LogVehicle([b"a"]), loss=1.0) == 5
 
 
-def test_entries_that_do_not_come_are_named() -> None:
-    exchange = make_list(patience_s=1.0)
+def test_log_list_timeout_names_missing() -> None:
+    exchange = make_list(idle_timeout_s=1.0)
     exchange.start(0.0)
     exchange.receive(LogEntry(2, 4, 4, 0, 7), 0.1)
     while not exchange.done:
         assert exchange.deadline is not None
         exchange.expire(exchange.deadline)
-    with pytest.raises(FileTimeout, match="entries of 1, 3–4") as raised:
+    with pytest.raises(FileTimeout, match="entries of logs 1, 3–4") as raised:
         exchange.result()
     assert raised.value.missing == ((1, 1), (3, 1), (4, 1))
     assert isinstance(exchange.take_outbox()[-1], LogRequestEnd)
@@ -91,7 +89,7 @@ def test_entries_that_do_not_come_are_named() -> None:
 
 @pytest.mark.parametrize("size", [1, 89, 90, 91, 180, 5000, 512 * LOG_BLOCK + 1])
 @pytest.mark.parametrize("latest_wins", [False, True])
-def test_a_log_without_loss(size: int, latest_wins: bool) -> None:
+def test_log_download_without_loss(size: int, latest_wins: bool) -> None:
     exchange, written = make_download(size)
     sent = run(exchange, LogVehicle([content(size)], latest_wins=latest_wins))
     assert exchange.result() == size
@@ -99,7 +97,7 @@ def test_a_log_without_loss(size: int, latest_wins: bool) -> None:
     assert sent <= 3
 
 
-def test_an_empty_log_needs_no_messages_but_the_end() -> None:
+def test_empty_log_sends_only_end() -> None:
     exchange, written = make_download(0)
     assert run(exchange, LogVehicle([b""])) == 1
     assert written == b""
@@ -107,7 +105,7 @@ def test_an_empty_log_needs_no_messages_but_the_end() -> None:
 
 @given(st.integers(1, 90_000), st.booleans(), st.sampled_from([0.0, 0.05, 0.3]), st.integers(0, 99))
 @settings(max_examples=25, deadline=None)
-def test_every_log_arrives(size: int, latest_wins: bool, loss: float, seed: int) -> None:
+def test_log_download_arrives_despite_losses(size: int, latest_wins: bool, loss: float, seed: int) -> None:
     exchange, written = make_download(size)
     sent = run(exchange, LogVehicle([content(size)], latest_wins=latest_wins), loss=loss, seed=seed)
     assert exchange.done
@@ -116,32 +114,32 @@ def test_every_log_arrives(size: int, latest_wins: bool, loss: float, seed: int)
     assert sent < 60 + 30 * (size // LOG_BLOCK + 1) * loss + size / 4000
 
 
-def test_it_goes_on_where_it_was_left() -> None:
+def test_log_download_resumes() -> None:
     exchange, written = make_download(5000, start=1234)
     run(exchange, LogVehicle([content(5000)]), loss=0.1)
     assert written == content(5000)[1234:]
 
 
-def test_it_gives_up_and_tells_the_vehicle() -> None:
-    exchange, _ = make_download(1000, patience_s=2.0)
+def test_log_download_timeout_sends_end() -> None:
+    exchange, _ = make_download(1000, idle_timeout_s=2.0)
     exchange.start(0.0)
     exchange.receive(LogData(1, 0, 90, bytes(90)), 0.1)
     exchange.receive(LogData(1, 180, 90, bytes(90)), 0.1)
     exchange.receive(LogData(1, 450, 90, bytes(90)), 0.1)
-    exchange.receive(LogData(2, 270, 90, bytes(90)), 0.1)  # of another log
+    exchange.receive(LogData(2, 270, 90, bytes(90)), 0.1)  # another log
     messages = exchange.take_outbox()
     while not exchange.done:
         assert exchange.deadline is not None
         exchange.expire(exchange.deadline)
         messages += exchange.take_outbox()
-    with pytest.raises(FileTimeout, match="log 1: nothing has come for 2 s") as raised:
+    with pytest.raises(FileTimeout, match="log 1: no data received for 2 s") as raised:
         exchange.result()
     assert raised.value.missing == ((90, 90), (270, 180), (540, 460))
     assert isinstance(messages[-1], LogRequestEnd)
     assert len(messages) < 40
 
 
-def test_what_is_missing_of_a_range_is_asked_for_two_at_once_and_then_apart() -> None:
+def test_log_download_spaces_single_block_requests() -> None:
     exchange, _ = make_download(5 * LOG_BLOCK)
     exchange.start(0.0)
     exchange.take_outbox()
@@ -152,12 +150,12 @@ def test_what_is_missing_of_a_range_is_asked_for_two_at_once_and_then_apart() ->
     assert exchange.deadline == pytest.approx(0.1 + SPACING_S)
 
 
-def test_a_log_that_ends_before_its_end() -> None:
+def test_log_download_of_short_log_fails() -> None:
     vehicle = LogVehicle([content(500)])
     exchange, _ = make_download(1000)
     exchange.start(0.0)
     for _ in range(3):
-        (request,) = exchange.take_outbox()  # at once: it may read its log the next time
+        (request,) = exchange.take_outbox()  # immediately: the next read may be of this log
         assert isinstance(request, LogRequestData)
         exchange.receive(LogData(1, 450, 50, bytes(90)), 0.1)
     with pytest.raises(RemoteProtocolError, match="ends after 500 bytes"):
@@ -169,8 +167,8 @@ def test_a_log_that_ends_before_its_end() -> None:
 # ---------------------------------------------------------------------------------------- end
 
 
-def test_the_end_is_repeated_while_the_vehicle_goes_on() -> None:
-    exchange = LogEnd(1, 1, round_trip=RoundTrip(0.1))
+def test_log_stop_repeats_while_vehicle_sends() -> None:
+    exchange = LogStop(1, 1, round_trip=RoundTrip(0.1))
     exchange.start(0.0)
     assert len(exchange.take_outbox()) == 1
     exchange.receive(LogData(1, 0, 90, bytes(90)), 0.1)
@@ -181,14 +179,14 @@ def test_the_end_is_repeated_while_the_vehicle_goes_on() -> None:
     assert exchange.take_outbox() == []
 
 
-def test_an_end_that_was_sent_is_not_sent_again() -> None:
-    exchange = LogEnd(1, 1, is_sent=True)
+def test_already_sent_log_stop_is_not_sent() -> None:
+    exchange = LogStop(1, 1, is_sent=True)
     exchange.start(0.0)
     assert exchange.take_outbox() == []
 
 
-def test_a_block_far_behind_all_others_is_not_believed() -> None:
-    """It would make 47 million gaps, 3 GB."""
+def test_log_download_ignores_distant_block() -> None:
+    """Storing each gap would take 47 million entries (3 GB)."""
     content = bytearray()
     exchange = LogDownload(1, 1, 1, 0xFFFF_FFFF, Reassembly(content.extend, block_size=LOG_BLOCK))
     exchange.start(0.0)
@@ -203,8 +201,8 @@ def test_a_block_far_behind_all_others_is_not_believed() -> None:
     assert len(content) == LOG_BLOCK
 
 
-def test_many_entries_that_do_not_come_are_named_shortly() -> None:
-    exchange = make_list(patience_s=1.0)
+def test_log_list_timeout_shortens_many_missing() -> None:
+    exchange = make_list(idle_timeout_s=1.0)
     exchange.start(0.0)
     for number in range(2, 60_000, 1000):
         exchange.receive(LogEntry(number, 65_535, 65_535, 0, 7), 0.1)
@@ -218,9 +216,7 @@ def test_many_entries_that_do_not_come_are_named_shortly() -> None:
 
 
 @pytest.mark.parametrize(("blocks_ahead", "is_taken"), [(0, True), (39_999, True), (40_000, False)])
-def test_blocks_far_behind_all_others_are_not_taken_wherever_those_are(
-    blocks_ahead: int, is_taken: bool
-) -> None:
+def test_log_download_ignores_distant_blocks_anywhere(blocks_ahead: int, is_taken: bool) -> None:
     start = 30_000 * LOG_BLOCK
     into = Reassembly(lambda data: None, block_size=LOG_BLOCK, start=start)
     exchange = LogDownload(1, 1, 1, 100_000 * LOG_BLOCK, into)

@@ -1,4 +1,4 @@
-"""Downloads: all items exactly, or an error that names what is missing. And clearing, and setting the current item."""
+"""Mission downloads return all items or name the missing ones; clearing; setting the current item."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from aerokit.errors import MissionRejected, MissionTimeout, OperationTimeout
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import MissionItem
 from aerokit.missions.wire import to_wire, to_wire_float
-from aerokit.protocols.exchange import Progress, RoundTrip
+from aerokit.protocols.exchange import RoundTrip, TransferProgress
 from aerokit.protocols.mission_download import MissionDownload
-from aerokit.protocols.missions import MissionClear, MissionSetCurrent
+from aerokit.protocols.missions import MissionClear, SetCurrentItem
 
 MAX_RESTARTS = 8
 
@@ -29,7 +29,7 @@ def download(window: int = 10, **options: Any) -> MissionDownload:
 
 
 @pytest.mark.parametrize(("model", "window"), WINDOWS)
-def test_over_a_good_link_nothing_is_asked_twice(model: type[Store], window: int) -> None:
+def test_mission_download_requests_once(model: type[Store], window: int) -> None:
     vehicle, exchange = model(HELD), download(window)
     result = run(exchange, vehicle, Radio())
     assert list(exchange.result().items) == HELD
@@ -38,7 +38,7 @@ def test_over_a_good_link_nothing_is_asked_twice(model: type[Store], window: int
     assert isinstance(result.sent[-1], m.MissionAck)
 
 
-def test_a_vehicle_that_gives_up_is_asked_anew_eight_times() -> None:
+def test_mission_download_restarts_eight_times() -> None:
     exchange, now = download(round_trip=RoundTrip(0.1)), 0.0
     exchange.start(now)
     lists = 0
@@ -56,27 +56,25 @@ def test_a_vehicle_that_gives_up_is_asked_anew_eight_times() -> None:
     ("window", "opaque_id", "asked"),
     [(10, 7, [1, 2]), (10, 8, [0, 1, 2]), (10, 0, [0, 1, 2]), (1, 7, [0]), (1, 8, [0])],
 )
-def test_asked_anew_what_is_there_is_kept_and_asked_for_again_only_in_sequence(
-    window: int, opaque_id: int, asked: list[int]
-) -> None:
-    """PX4, which is asked one by one, wants to be asked in sequence; another opaque_id is another mission."""
-    told: list[Progress] = []
+def test_mission_download_restart_keeps_items(window: int, opaque_id: int, asked: list[int]) -> None:
+    """PX4's items are requested one by one and in sequence; another opaque_id means another mission."""
+    told: list[TransferProgress] = []
     exchange, held = download(window, round_trip=RoundTrip(0.1), on_progress=told.append), HELD[:3]
 
-    def tell(message: m.MissionCount | m.MissionItemInt | m.MissionAck, now: float) -> list[int]:
+    def answer(message: m.MissionCount | m.MissionItemInt | m.MissionAck, now: float) -> list[int]:
         exchange.take_outbox()
         exchange.receive(message, now)
         return [each.seq for each in exchange.take_outbox() if isinstance(each, m.MissionRequestInt)]
 
     exchange.start(100.0)
-    tell(m.MissionCount(*GCS, 3, 0, 7 if opaque_id else 0), 101.0)
-    tell(to_wire(held[0], 0, target_system=GCS[0], target_component=GCS[1], mission_type=0), 102.0)
-    assert tell(m.MissionAck(*GCS, Result.ERROR), 103.0) == []
+    answer(m.MissionCount(*GCS, 3, 0, 7 if opaque_id else 0), 101.0)
+    answer(to_wire(held[0], 0, target_system=GCS[0], target_component=GCS[1], mission_type=0), 102.0)
+    assert answer(m.MissionAck(*GCS, Result.ERROR), 103.0) == []
     kept = int(opaque_id == 7)
-    assert tell(m.MissionCount(*GCS, 3, 0, opaque_id), 104.0) == asked
+    assert answer(m.MissionCount(*GCS, 3, 0, opaque_id), 104.0) == asked
     assert [each.done for each in told] == [0, 1, kept]
     for seq in range(3):
-        tell(to_wire(held[seq], seq, target_system=GCS[0], target_component=GCS[1], mission_type=0), 105.0)
+        answer(to_wire(held[seq], seq, target_system=GCS[0], target_component=GCS[1], mission_type=0), 105.0)
     assert list(exchange.result().items) == held
     assert exchange.result().opaque_id == opaque_id
 
@@ -90,7 +88,7 @@ def test_asked_anew_what_is_there_is_kept_and_asked_for_again_only_in_sequence(
     jitter_s=st.sampled_from([0.0, 0.03, 0.2]),
     number=st.integers(0, 40),
 )
-def test_exactly_what_is_held(
+def test_mission_download_is_exact_despite_losses(
     model_and_window: tuple[type[Store], int],
     seed: int,
     loss: float,
@@ -104,7 +102,7 @@ def test_exactly_what_is_held(
     result = run(exchange, vehicle, Radio(seed, loss, doubling, jitter_s=jitter_s))
     if result.error is None:
         assert list(exchange.result().items) == held
-    else:  # PX4 gives up whenever requests overtake each other
+    else:  # PX4 gives up whenever requests are reordered
         assert jitter_s or doubling
         assert isinstance(result.error, (MissionTimeout, MissionRejected))
     assert len(result.sent) <= 60 + 30 * number
@@ -112,8 +110,8 @@ def test_exactly_what_is_held(
 
 @pytest.mark.parametrize(("model", "window"), WINDOWS)
 @pytest.mark.parametrize(("loss", "times"), [(0.05, 2.0), (0.2, 4.0)])
-def test_time_over_a_bad_radio(model: type[Store], window: int, loss: float, times: float) -> None:
-    """Compared with what this vehicle takes when nothing is lost."""
+def test_mission_download_time_over_bad_radio(model: type[Store], window: int, loss: float, times: float) -> None:
+    """Compared with the time this vehicle needs without loss."""
     for seed in range(8):
         exchange = download(window, round_trip=RoundTrip(0.1))
         result = run(exchange, model(HELD), Radio(seed, loss))
@@ -121,7 +119,7 @@ def test_time_over_a_bad_radio(model: type[Store], window: int, loss: float, tim
         assert result.seconds < times * max(0.1 * (2 + len(HELD) / window), 0.8)
 
 
-def test_only_some() -> None:
+def test_mission_download_of_some_items() -> None:
     exchange = download(only=(3, 4, 20, 77))
     result = run(exchange, ArduPilotModel(HELD), Radio(seed=5, loss=0.2))
     assert result.error is None
@@ -129,7 +127,7 @@ def test_only_some() -> None:
     assert exchange.result().count == 50
 
 
-def test_silence_names_what_is_missing() -> None:
+def test_mission_download_timeout_names_missing() -> None:
     exchange = download(window=1, offset=1)
     result = run(exchange, ArduPilotModel(HELD), Radio(silences=[(1.05, 100.0)]))
     assert isinstance(result.error, MissionTimeout)
@@ -137,15 +135,15 @@ def test_silence_names_what_is_missing() -> None:
     assert result.seconds < 14.0
 
 
-def test_a_mission_that_changes_meanwhile_is_read_anew() -> None:
+def test_mission_download_restarts_after_change() -> None:
     vehicle, exchange = ArduPilotModel(HELD), download(window=1)
     others = [(0.5, m.MissionClearAll(1, 1), (254, 190))]
     run(exchange, vehicle, Radio(), others=others)
     assert exchange.result().items == ()
 
 
-def test_an_upload_that_was_given_up_is_waited_for() -> None:
-    """ArduPilot gives nothing away for 8 s."""
+def test_mission_download_waits_for_abandoned_upload() -> None:
+    """ArduPilot sends nothing for 8 s."""
     vehicle, exchange = ArduPilotModel(HELD), download()
     vehicle.receive(m.MissionCount(1, 1, 50), 0.0)
     vehicle.out.clear()
@@ -154,7 +152,7 @@ def test_an_upload_that_was_given_up_is_waited_for() -> None:
     assert 8.0 < result.seconds < 10.0
 
 
-def test_a_vehicle_that_has_none_of_these() -> None:
+def test_mission_download_of_unsupported_type() -> None:
     exchange = download(mission_type=2)
     exchange.start(0.0)
     exchange.receive(m.MissionAck(*GCS, Result.UNSUPPORTED, 2), 0.1)
@@ -162,7 +160,7 @@ def test_a_vehicle_that_has_none_of_these() -> None:
         exchange.result()
 
 
-def test_the_float_form() -> None:
+def test_mission_download_in_float_form() -> None:
     exchange = download(gives_int=False)
     exchange.start(0.0)
     exchange.receive(m.MissionCount(*GCS, 1), 0.1)
@@ -175,7 +173,7 @@ def test_the_float_form() -> None:
 @pytest.mark.parametrize("model", [ArduPilotModel, Px4Model])
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 1 << 30))
-def test_clearing(model: type[Store], seed: int) -> None:
+def test_mission_clear(model: type[Store], seed: int) -> None:
     vehicle, exchange = model(HELD), MissionClear(1, 1)
     result = run(exchange, vehicle, Radio(seed, 0.3))
     assert result.error is None
@@ -183,7 +181,7 @@ def test_clearing(model: type[Store], seed: int) -> None:
     assert len(result.sent) < 20
 
 
-def test_clearing_refused() -> None:
+def test_mission_clear_refused() -> None:
     exchange = MissionClear(1, 1)
     exchange.start(0.0)
     exchange.receive(m.MissionAck(*GCS, Result.ERROR), 0.1)
@@ -191,14 +189,14 @@ def test_clearing_refused() -> None:
         exchange.result()
 
 
-def test_clearing_unanswered() -> None:
+def test_mission_clear_unanswered() -> None:
     result = run(MissionClear(1, 1), ArduPilotModel(HELD), Radio(loss=1.0))
     assert isinstance(result.error, MissionTimeout)
-    assert "not known" in str(result.error)
+    assert "may or may not" in str(result.error)
 
 
-def test_setting_the_current_item() -> None:
-    exchange = MissionSetCurrent(1, 1, 4, patience_s=5.0)
+def test_set_current_item() -> None:
+    exchange = SetCurrentItem(1, 1, 4, idle_timeout_s=5.0)
     exchange.start(0.0)
     assert exchange.take_outbox() == [m.MissionSetCurrent(1, 1, 4)]
     exchange.receive(m.MissionCurrent(2), 0.1)
@@ -210,19 +208,19 @@ def test_setting_the_current_item() -> None:
     exchange.result()
 
 
-def test_a_current_item_that_is_run_through_at_once() -> None:
-    exchange = MissionSetCurrent(1, 1, 4)
+def test_set_current_of_item_passed_at_once() -> None:
+    exchange = SetCurrentItem(1, 1, 4)
     exchange.start(0.0)
     exchange.receive(m.MissionCurrent(2), 0.1)
     exchange.receive(m.MissionCurrent(5), 0.2)
     exchange.result()
 
 
-def test_a_current_item_that_is_not_taken() -> None:
-    exchange = MissionSetCurrent(1, 1, 4, patience_s=3.0)
+def test_set_current_not_accepted_times_out() -> None:
+    exchange = SetCurrentItem(1, 1, 4, idle_timeout_s=3.0)
     exchange.start(0.0)
     exchange.receive(m.MissionCurrent(2), 0.1)
     for at in (1.0, 2.0, 3.0):
         exchange.expire(at)
-    with pytest.raises(OperationTimeout, match="told item 2"):
+    with pytest.raises(OperationTimeout, match="reported item 2"):
         exchange.result()

@@ -1,4 +1,4 @@
-"""What another component, or another system, says is no answer; nor is what an exchange did not ask for."""
+"""Messages of other components or systems, and unrequested ones, are not taken as answers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aerokit.protocols.exchange import Exchange
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.missions import MissionClear, MissionSetCurrent
+from aerokit.protocols.missions import MissionClear, SetCurrentItem
 from aerokit.protocols.parameter_list import ParameterList
 from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 
@@ -36,7 +36,7 @@ EXCHANGES: dict[str, tuple[Callable[[], Exchange[Any]], Message]] = {
     "mission_download": (lambda: MissionDownload(1, 1, window=4), m.MissionCount(255, 190, 0)),
     "mission_upload": (lambda: MissionUpload(1, 1, [ITEM], window=4), m.MissionRequestInt(255, 190, 0)),
     "mission_clear": (lambda: MissionClear(1, 1), m.MissionAck(255, 190, ACCEPTED)),
-    "mission_current": (lambda: MissionSetCurrent(1, 1, 2), m.MissionCurrent(2)),
+    "mission_current": (lambda: SetCurrentItem(1, 1, 2), m.MissionCurrent(2)),
     "parameter_list": (lambda: ParameterList(1, 1, bytewise=False), VALUE),
     "parameter_reads": (lambda: ParameterReads(1, 1, ["A"], bytewise=False), VALUE),
     "parameter_writes": (lambda: ParameterWrites(1, 1, [WANTED], bytewise=False), VALUE),
@@ -59,7 +59,7 @@ def state(exchange: Exchange[Any]) -> tuple[bool, float | None, list[Message]]:
 
 @pytest.mark.parametrize("name", EXCHANGES)
 @pytest.mark.parametrize(("system_id", "component_id"), [(1, 2), (2, 1)])
-def test_only_the_target_answers(name: str, system_id: int, component_id: int) -> None:
+def test_exchange_ignores_other_components(name: str, system_id: int, component_id: int) -> None:
     exchange, answer = started(name)
     before = state(exchange)
     exchange.receive(framed(answer, system_id=system_id, component_id=component_id), 0.5)
@@ -69,17 +69,15 @@ def test_only_the_target_answers(name: str, system_id: int, component_id: int) -
 
 
 @pytest.mark.parametrize("name", EXCHANGES)
-def test_what_was_not_asked_for_is_no_answer(name: str) -> None:
+def test_exchange_ignores_unrequested_messages(name: str) -> None:
     exchange, _ = started(name)
     before = state(exchange)
     exchange.receive(framed(m.Heartbeat(2, 3, 81, 4, 3)), 0.5)
     assert state(exchange) == before
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in EXCHANGES if name.startswith("mission") and "current" not in name]
-)
-def test_what_is_about_another_plan_is_no_answer(name: str) -> None:
+@pytest.mark.parametrize("name", [name for name in EXCHANGES if name.startswith("mission") and "current" not in name])
+def test_mission_exchange_ignores_other_mission_types(name: str) -> None:
     exchange, answer = started(name)
     before = state(exchange)
     fields = {field.name: getattr(answer, field.name) for field in answer.FIELDS}
@@ -88,7 +86,7 @@ def test_what_is_about_another_plan_is_no_answer(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", EXCHANGES)
-def test_before_its_end_there_is_no_result(name: str) -> None:
+def test_result_before_end_raises(name: str) -> None:
     exchange, _ = started(name)
     with pytest.raises(RuntimeError, match="has not ended yet"):
         exchange.result()

@@ -1,4 +1,4 @@
-"""The list of parameters: holes, changes while it comes, and every degree of loss."""
+"""The parameter list: gaps, changes during the download, and any degree of loss."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aerokit.errors import InvalidArgument, ParameterTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterTable, ParameterType
-from aerokit.protocols.exchange import Progress, RoundTrip
+from aerokit.protocols.exchange import RoundTrip, TransferProgress
 from aerokit.protocols.parameter_list import ParameterList
 
 RTT_S = 0.1
@@ -30,7 +30,7 @@ def is_value(message: Message, *indices: int) -> bool:
 
 
 def lose_once(channel: Channel, *indices: int) -> None:
-    """These values of the list get lost, and come when they are asked for again."""
+    """Loses these values of the list, and sends them when requested again."""
     left = set(indices)
 
     def is_lost(message: Message) -> bool:
@@ -43,7 +43,7 @@ def lose_once(channel: Channel, *indices: int) -> None:
     channel.is_lost = is_lost
 
 
-def asked_again(channel: Channel) -> list[int]:
+def repeated_requests(channel: Channel) -> list[int]:
     return [each.param_index for each in channel.all(m.ParamRequestRead)]
 
 
@@ -51,59 +51,59 @@ def asked_again(channel: Channel) -> list[int]:
 
 
 @pytest.mark.parametrize("bytewise", [False, True])
-def test_one_request_brings_all(bytewise: bool) -> None:
+def test_parameter_list_needs_one_request(bytewise: bool) -> None:
     table = table_of(300)
     channel = Channel(FakeVehicle(table, bytewise=bytewise))
     assert list(channel.run(listing(bytewise)).values()) == table
     assert channel.kinds() == {"PARAM_REQUEST_LIST": 1}
 
 
-def test_it_ends_with_the_last_value_and_not_later() -> None:
+def test_parameter_list_ends_with_last_value() -> None:
     channel = Channel(FakeVehicle(table_of(300)))
     channel.run(listing())
     assert channel.now == pytest.approx(2 * channel.delay_s + FakeVehicle.tick_s * 59)
 
 
-def test_without_a_known_round_trip_one_value_is_asked_for_beside() -> None:
+def test_parameter_list_measures_round_trip_by_one_read() -> None:
     channel = Channel(FakeVehicle(table_of(20)))
     round_trip = RoundTrip()
     channel.run(listing(round_trip=round_trip))
-    assert asked_again(channel) == [0]
+    assert repeated_requests(channel) == [0]
     assert round_trip.smoothed_s == pytest.approx(RTT_S)
 
 
-def test_the_hash_is_no_parameter() -> None:
+def test_parameter_list_ignores_hash() -> None:
     vehicle = FakeVehicle(table_of(50), bytewise=True)
     vehicle.hash_first = True
     assert list(Channel(vehicle).run(listing(True)).values()) == table_of(50)
 
 
-def test_progress_is_told() -> None:
-    seen: list[Progress] = []
+def test_parameter_list_reports_progress() -> None:
+    seen: list[TransferProgress] = []
     Channel(FakeVehicle(table_of(30))).run(listing(on_progress=seen.append))
     assert [each.done for each in seen] == list(range(1, 31))
     assert {each.total for each in seen} == {30}
     assert seen[-1].fraction == 1.0
 
 
-def test_patience_is_above_zero() -> None:
-    with pytest.raises(InvalidArgument, match="patience_s"):
-        listing(patience_s=0.0)
+def test_idle_timeout_must_be_positive() -> None:
+    with pytest.raises(InvalidArgument, match="idle_timeout_s"):
+        listing(idle_timeout_s=0.0)
 
 
-# ---------------------------------------------------------------------------------------- holes
+# ----------------------------------------------------------------------------------------- gaps
 
 
-def test_only_holes_are_asked_for_again_and_at_once() -> None:
+def test_parameter_list_requests_gaps_at_once() -> None:
     channel = Channel(FakeVehicle(table_of(300)))
     lose_once(channel, 20, 21, 150)
     channel.run(listing())
-    assert asked_again(channel) == [20, 21, 150]
+    assert repeated_requests(channel) == [20, 21, 150]
     times = [at for at, each in channel.sent if isinstance(each, m.ParamRequestRead)]
     assert times[0] == pytest.approx(2 * channel.delay_s + FakeVehicle.tick_s * 4)  # with the value behind it
 
 
-def test_a_request_is_not_repeated_before_its_answer_is_overdue() -> None:
+def test_parameter_list_waits_for_answer_before_retry() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     lost = {50: 2}
 
@@ -120,15 +120,15 @@ def test_a_request_is_not_repeated_before_its_answer_is_overdue() -> None:
     assert times[1] - times[0] >= RTT_S
 
 
-def test_a_lost_end_is_asked_for_when_nothing_comes_any_more() -> None:
+def test_parameter_list_requests_lost_end() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     lose_once(channel, 97, 98, 99)
     assert len(channel.run(listing())) == 100
-    assert asked_again(channel) == [97, 98, 99]
+    assert repeated_requests(channel) == [97, 98, 99]
     assert channel.now < 2.0
 
 
-def test_a_stream_that_stops_in_the_middle_is_read_by_index() -> None:
+def test_parameter_list_reads_rest_of_stopped_stream() -> None:
     class Stopping(FakeVehicle):
         def on_list(self) -> None:
             for index, name in enumerate(list(self.parameters)[:200]):
@@ -136,21 +136,21 @@ def test_a_stream_that_stops_in_the_middle_is_read_by_index() -> None:
 
     channel = Channel(Stopping(table_of(500)))
     assert list(channel.run(listing()).values()) == table_of(500)
-    assert sorted(asked_again(channel)) == list(range(200, 500))
+    assert sorted(repeated_requests(channel)) == list(range(200, 500))
     assert channel.kinds()["PARAM_REQUEST_LIST"] == 1
 
 
-def test_a_stream_that_pauses_is_waited_for() -> None:
+def test_parameter_list_waits_for_paused_stream() -> None:
     class Pausing(FakeVehicle):
         tick_s = 1.0
         burst = 100
 
     channel = Channel(Pausing(table_of(400)))
     channel.run(listing())
-    assert asked_again(channel) == []
+    assert repeated_requests(channel) == []
 
 
-def test_a_lost_request_for_the_list_is_repeated() -> None:
+def test_parameter_list_repeats_lost_request() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     lost = [True, True]
     channel.is_lost = lambda message: isinstance(message, m.ParamRequestList) and bool(lost and lost.pop())
@@ -158,8 +158,8 @@ def test_a_lost_request_for_the_list_is_repeated() -> None:
     assert channel.kinds()["PARAM_REQUEST_LIST"] == 3
 
 
-def test_only_a_window_of_requests_is_under_way() -> None:
-    class Mute(FakeVehicle):
+def test_parameter_list_limits_requests_in_flight() -> None:
+    class SendsTwoValues(FakeVehicle):
         def on_list(self) -> None:
             self.say(self.value("PARAM_0000", 0))
             self.say(self.value("PARAM_0001", 1))
@@ -167,18 +167,18 @@ def test_only_a_window_of_requests_is_under_way() -> None:
         def on_read(self, request: m.ParamRequestRead) -> None:
             pass
 
-    channel = Channel(Mute(table_of(1000)))
+    channel = Channel(SendsTwoValues(table_of(1000)))
     with pytest.raises(ParameterTimeout) as timeout:
-        channel.run(listing(patience_s=3.0))
-    assert set(asked_again(channel)) == set(range(2, 22))
+        channel.run(listing(idle_timeout_s=3.0))
+    assert set(repeated_requests(channel)) == set(range(2, 22))
     assert len(channel.sent) < 200
     assert timeout.value.missing == tuple(range(2, 1000))
 
 
-# ---------------------------------------------------------------------------- others and repeats
+# ----------------------------------------------------------------- other messages and duplicates
 
 
-def test_values_of_another_component_do_not_count() -> None:
+def test_parameter_list_ignores_other_components() -> None:
     vehicle = FakeVehicle(table_of(30))
     channel = Channel(vehicle)
     stranger = m.ParamValue("CAM_MODE", 1.0, 9, 3, 2)
@@ -186,24 +186,24 @@ def test_values_of_another_component_do_not_count() -> None:
     assert list(channel.run(listing()).values()) == table_of(30)
 
 
-def test_values_come_twice_and_out_of_order() -> None:
-    class Twice(FakeVehicle):
+def test_parameter_list_handles_repeated_and_reordered_values() -> None:
+    class SendsTwice(FakeVehicle):
         def say(self, message: Message, after: float = 0.0) -> None:
             super().say(message, after)
             super().say(message, after)
 
-    channel = Channel(Twice(table_of(200)), jitter_s=0.05, seed=3)
+    channel = Channel(SendsTwice(table_of(200)), jitter_s=0.05, seed=3)
     assert list(channel.run(listing()).values()) == table_of(200)
 
 
-def test_a_value_set_meanwhile_is_the_one_in_the_table() -> None:
+def test_parameter_list_has_value_set_meanwhile() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     news = m.ParamValue("PARAM_0001", 42.0, 9, 100, 0xFFFF)
     channel.at(0.15, lambda: channel.from_vehicle(news))
     assert channel.run(listing())["PARAM_0001"].value == 42.0
 
 
-def test_an_index_beyond_the_count_makes_no_flood() -> None:
+def test_parameter_list_index_beyond_count_sends_nothing() -> None:
     channel = Channel(FakeVehicle(table_of(60)))
     channel.at(0.06, lambda: channel.from_vehicle(m.ParamValue("PARAM_0003", 3.0, 2, 60, 65_000)))
     assert len(channel.run(listing())) == 60
@@ -214,7 +214,7 @@ def test_an_index_beyond_the_count_makes_no_flood() -> None:
 
 
 class Growing(FakeVehicle):
-    """As ArduPilot: a group is shown after ``shown_at`` values. The stream goes on behind it, with the old count."""
+    """As ArduPilot: a group appears after ``shown_at`` values. The stream continues behind it with the old count."""
 
     shown_at = 60
     place = 80
@@ -246,7 +246,7 @@ class Growing(FakeVehicle):
 
 
 @pytest.mark.parametrize("place", [80, 20])
-def test_a_group_that_is_shown_meanwhile_is_in_the_table(place: int) -> None:
+def test_parameter_list_includes_group_enabled_meanwhile(place: int) -> None:
     vehicle = Growing(table_of(100))
     vehicle.place = place
     table = Channel(vehicle).run(listing())
@@ -255,7 +255,7 @@ def test_a_group_that_is_shown_meanwhile_is_in_the_table(place: int) -> None:
 
 
 class Px4Growing(FakeVehicle):
-    """As PX4: count and indices are those of the moment; what is inserted before the stream's place is skipped."""
+    """As PX4: count and indices are current; values inserted before the stream's position are skipped."""
 
     def on_list(self) -> None:
         names = list(self.parameters)
@@ -271,7 +271,7 @@ class Px4Growing(FakeVehicle):
         self.say(self.value(name, list(self.parameters).index(name)))
 
 
-def test_a_parameter_inserted_before_the_place_of_the_stream_is_found() -> None:
+def test_parameter_list_finds_inserted_parameter() -> None:
     vehicle = Px4Growing(table_of(100), bytewise=True)
     table = Channel(vehicle).run(listing(True))
     assert list(table) == list(vehicle.parameters)
@@ -285,48 +285,46 @@ def test_a_parameter_inserted_before_the_place_of_the_stream_is_found() -> None:
         (5, ["SAME", "PARAM_0002", "PARAM_0003"], [2, 0, 1, 3, 1, 2, 1]),
     ],
 )
-def test_a_vehicle_that_never_settles_is_believed_after_three_rounds(
-    count: int, names: list[str], asked: list[int]
-) -> None:
-    """Two of its names are one, and it tells another number of parameters with each answer."""
+def test_parameter_list_accepts_unstable_list_after_retries(count: int, names: list[str], asked: list[int]) -> None:
+    """Two of its parameters have the same name, and each answer reports another count."""
 
-    class Restless(FakeVehicle):
+    class ChangesCount(FakeVehicle):
         answers = 0
 
         def value(self, name: str, index: int | None) -> m.ParamValue:
-            told = super().value(name, index)
-            name = "SAME" if index in (0, 1) else told.param_id
-            number = told.param_count - self.answers % 2
-            return m.ParamValue(name, told.param_value, told.param_type, number, told.param_index)
+            answer = super().value(name, index)
+            name = "SAME" if index in (0, 1) else answer.param_id
+            number = answer.param_count - self.answers % 2
+            return m.ParamValue(name, answer.param_value, answer.param_type, number, answer.param_index)
 
         def on_read(self, request: m.ParamRequestRead) -> None:
             self.answers += 1
             super().on_read(request)
 
-    channel = Channel(Restless(table_of(count)))
+    channel = Channel(ChangesCount(table_of(count)))
     lose_once(channel, 2)
     table: ParameterTable = channel.run(listing())
     assert list(table) == names
-    assert asked_again(channel) == asked
+    assert repeated_requests(channel) == asked
 
 
-def test_a_parameter_that_is_shown_after_the_stream_is_asked_for() -> None:
-    """The answer to what was lost tells the new number."""
+def test_parameter_list_requests_parameter_added_late() -> None:
+    """The answer to the repeated request reports the new count."""
 
-    class Late(FakeVehicle):
+    class AddsOnRead(FakeVehicle):
         def on_read(self, request: m.ParamRequestRead) -> None:
             self.parameters.setdefault("SHOWN", Parameter("SHOWN", 1, ParameterType.INT8))
             super().on_read(request)
 
-    channel = Channel(Late(table_of(20)))
+    channel = Channel(AddsOnRead(table_of(20)))
     lose_once(channel, 19)
     table: ParameterTable = channel.run(listing())
     assert list(table)[-1] == "SHOWN"
-    assert asked_again(channel)[:2] == [19, 20]
+    assert repeated_requests(channel)[:2] == [19, 20]
     assert channel.now < 2.0
 
 
-def test_a_list_that_becomes_shorter_ends() -> None:
+def test_parameter_list_that_shrinks_ends() -> None:
     class Shrinking(FakeVehicle):
         refuses = True
 
@@ -348,7 +346,7 @@ def test_a_list_that_becomes_shorter_ends() -> None:
 # ----------------------------------------------------------------------------------------- loss
 
 
-def test_silence_is_a_timeout_that_says_so() -> None:
+def test_parameter_list_silence_times_out() -> None:
     channel = Channel(FakeVehicle(table_of(10)), loss=1.0)
     with pytest.raises(ParameterTimeout, match="PARAM_REQUEST_LIST was not answered") as timeout:
         channel.run(listing())
@@ -357,7 +355,7 @@ def test_silence_is_a_timeout_that_says_so() -> None:
     assert len(channel.sent) < 30
 
 
-def test_what_never_comes_is_named() -> None:
+def test_parameter_list_timeout_names_missing() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     channel.is_lost = lambda message: is_value(message, 7, 8, 9, 41)
     with pytest.raises(ParameterTimeout, match=r"4 of 100 .* missing 7–9, 41") as timeout:
@@ -372,21 +370,21 @@ def complete(count: int, loss: float, seed: int, **options: Any) -> tuple[Parame
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 150))
-def test_it_is_exact_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+def test_parameter_list_is_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table, channel = complete(count, loss, seed, jitter_s=0.002)
     assert list(table.values()) == table_of(count)
     assert len(channel.sent) < 50 + 3 * count
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_thousand_take_less_than_a_second_more_at_five_percent(seed: int) -> None:
+def test_parameter_list_loses_little_time_at_low_loss(seed: int) -> None:
     _, channel = complete(1000, 0.05, seed)
     clean = 2 * channel.delay_s + FakeVehicle.tick_s * 199
     assert channel.now < clean + 1.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_outage_is_waited_through(seed: int) -> None:
+def test_parameter_list_survives_outage(seed: int) -> None:
     channel = Channel(FakeVehicle(table_of(400)), seed=seed)
     channel.is_lost = lambda message: 0.3 < channel.now < 5.0
     assert list(channel.run(listing()).values()) == table_of(400)

@@ -1,4 +1,4 @@
-"""Parameters read and written by name: unknown names, confirmation, rounding, refusals, loss."""
+"""Reading and writing parameters by name: unknown names, confirmation, rounding, refusals, loss."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aerokit.mavlink.message import Message
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import to_wire
 from aerokit.protocols.exchange import RoundTrip
-from aerokit.protocols.parameter_requests import Answer, ParameterReads, ParameterWrites, rejection
+from aerokit.protocols.parameter_requests import ParameterAnswer, ParameterReads, ParameterWrites, rejection
 
 RTT_S = 0.1
 INT32, INT8, REAL32 = ParameterType.INT32, ParameterType.INT8, ParameterType.REAL32
@@ -31,7 +31,7 @@ def writes(*wanted: Parameter, bytewise: bool = False, **options: Any) -> Parame
     return ParameterWrites(1, 1, wanted, bytewise=bytewise, own_system=255, **options)
 
 
-def value(answer: Answer) -> float:
+def value(answer: ParameterAnswer) -> float:
     assert isinstance(answer, Parameter)
     return answer.value
 
@@ -39,14 +39,14 @@ def value(answer: Answer) -> float:
 # -------------------------------------------------------------------------------------- reading
 
 
-def test_one_request_reads_one() -> None:
+def test_parameter_read_needs_one_request() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
     answers = channel.run(reads("PARAM_0004"))
     assert answers == {"PARAM_0004": Parameter("PARAM_0004", 2.0, REAL32)}
     assert channel.kinds() == {"PARAM_REQUEST_READ": 1}
 
 
-def test_many_are_read_in_a_window_in_the_order_asked() -> None:
+def test_parameter_reads_use_window_and_keep_order() -> None:
     channel = Channel(FakeVehicle(table_of(100)))
     names = [f"PARAM_{i:04}" for i in range(99, -1, -1)]
     answers = channel.run(reads(*names))
@@ -55,12 +55,12 @@ def test_many_are_read_in_a_window_in_the_order_asked() -> None:
     assert channel.kinds() == {"PARAM_REQUEST_READ": 100}
 
 
-def test_nothing_to_read() -> None:
-    answers: dict[str, Answer] = Channel(FakeVehicle(table_of(1))).run(reads())
+def test_parameter_reads_of_nothing() -> None:
+    answers: dict[str, ParameterAnswer] = Channel(FakeVehicle(table_of(1))).run(reads())
     assert not answers
 
 
-def test_an_unknown_name_is_rejected_by_param_error() -> None:
+def test_unknown_parameter_is_rejected_by_param_error() -> None:
     vehicle = FakeVehicle(table_of(10))
     vehicle.refuses = True
     answer = Channel(vehicle).run(reads("NOPE"))["NOPE"]
@@ -69,10 +69,10 @@ def test_an_unknown_name_is_rejected_by_param_error() -> None:
     assert "no such parameter" in str(answer)
 
 
-def test_a_single_error_may_mean_that_there_was_no_room_to_answer() -> None:
-    """PX4 says DOES_NOT_EXIST also when its buffer is full."""
+def test_single_param_error_is_retried() -> None:
+    """PX4 answers DOES_NOT_EXIST also when its buffer is full."""
 
-    class Full(FakeVehicle):
+    class BufferFull(FakeVehicle):
         refused = 0
 
         def on_read(self, request: m.ParamRequestRead) -> None:
@@ -82,19 +82,19 @@ def test_a_single_error_may_mean_that_there_was_no_room_to_answer() -> None:
             else:
                 super().on_read(request)
 
-    assert value(Channel(Full(table_of(10))).run(reads("PARAM_0004"))["PARAM_0004"]) == 2.0
+    assert value(Channel(BufferFull(table_of(10))).run(reads("PARAM_0004"))["PARAM_0004"]) == 2.0
 
 
-def test_errors_for_another_ground_station_do_not_count() -> None:
+def test_param_error_for_other_station_is_ignored() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
     for at in (0.01, 0.02):
         channel.at(at, lambda: channel.from_vehicle(m.ParamError(254, 190, "PARAM_0004", -1, 1)))
     assert value(channel.run(reads("PARAM_0004"))["PARAM_0004"]) == 2.0
 
 
-def test_silence_about_one_name_alone_is_an_answer() -> None:
+def test_unanswered_name_is_rejected_by_probe() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
-    answers = channel.run(reads("NOPE", "PARAM_0004", are_doubtful=True))
+    answers = channel.run(reads("NOPE", "PARAM_0004", probe=True))
     answer = answers["NOPE"]
     assert isinstance(answer, ParameterRejected)
     assert answer.code is None
@@ -103,35 +103,35 @@ def test_silence_about_one_name_alone_is_an_answer() -> None:
     assert channel.now < 1.5
 
 
-def test_many_unknown_names_cost_few_messages_each() -> None:
+def test_many_unknown_names_need_few_messages() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
-    answers = channel.run(reads(*(f"NOPE_{i}" for i in range(100)), are_doubtful=True))
+    answers = channel.run(reads(*(f"NOPE_{i}" for i in range(100)), probe=True))
     assert all(isinstance(each, ParameterRejected) for each in answers.values())
     assert len(channel.sent) < 600
 
 
-def test_silence_of_the_vehicle_is_a_timeout() -> None:
+def test_parameter_reads_of_silent_vehicle_time_out() -> None:
     channel = Channel(FakeVehicle(table_of(10)), loss=1.0)
-    answer = channel.run(reads("PARAM_0004", patience_s=5.0))["PARAM_0004"]
+    answer = channel.run(reads("PARAM_0004", idle_timeout_s=5.0))["PARAM_0004"]
     assert isinstance(answer, ParameterTimeout)
     assert answer.missing == ("PARAM_0004",)
     assert channel.now == pytest.approx(5.0)
     assert len(channel.sent) < 60
 
 
-def test_a_distrusted_value_is_believed_the_second_time() -> None:
+def test_possibly_stale_value_is_accepted_second_time() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
-    answers = channel.run(reads("PARAM_0004", distrusted={"PARAM_0004": 2.0}))
+    answers = channel.run(reads("PARAM_0004", possibly_stale={"PARAM_0004": 2.0}))
     assert value(answers["PARAM_0004"]) == 2.0
     assert channel.kinds() == {"PARAM_REQUEST_READ": 2}
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 60))
-def test_reads_are_exact_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+def test_parameter_reads_are_exact_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(60)
     channel = Channel(FakeVehicle(table), loss=loss, seed=seed)
-    answers = channel.run(reads(*(each.name for each in table[:count]), are_doubtful=True))
+    answers = channel.run(reads(*(each.name for each in table[:count]), probe=True))
     assert [value(each) for each in answers.values()] == [each.value for each in table[:count]]
     assert len(channel.sent) < 100 + 6 * count
 
@@ -151,8 +151,8 @@ def test_reads_are_exact_whatever_is_lost(seed: int, loss: float, count: int) ->
         (2_139_095_041 // 128 * 128, INT32),
     ],
 )
-def test_a_write_is_confirmed_by_value_and_type(bytewise: bool, number: float, type_: ParameterType) -> None:
-    """-5,000,000 as bytes is a signalling NaN."""
+def test_parameter_write_is_confirmed_by_value_and_type(bytewise: bool, number: float, type_: ParameterType) -> None:
+    """The bytes of -5,000,000 are a signalling NaN as a float."""
     vehicle = FakeVehicle([Parameter("A", 0, type_)], bytewise=bytewise)
     channel = Channel(vehicle)
     answer = channel.run(writes(Parameter("A", number, type_), bytewise=bytewise))["A"]
@@ -163,7 +163,7 @@ def test_a_write_is_confirmed_by_value_and_type(bytewise: bool, number: float, t
     assert channel.kinds() == {"PARAM_SET": 1}
 
 
-def test_many_writes_are_under_way_at_once() -> None:
+def test_parameter_writes_use_window() -> None:
     table = table_of(50)
     channel = Channel(FakeVehicle(table))
     answers = channel.run(writes(*(each.replace(value=1) for each in table)))
@@ -177,7 +177,7 @@ class Clamping(FakeVehicle):
         super().store(name, min(value, 10))
 
 
-def test_a_clamped_value_is_believed_and_not_set_for_ever() -> None:
+def test_clamped_value_is_accepted() -> None:
     channel = Channel(Clamping([Parameter("A", 0, INT32)]))
     assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 0}))["A"]) == 10
     assert len(channel.sent) < 6
@@ -188,13 +188,13 @@ class ReadOnly(FakeVehicle):
         pass
 
 
-def test_a_value_that_the_vehicle_keeps_is_told() -> None:
+def test_unchanged_value_is_reported() -> None:
     channel = Channel(ReadOnly([Parameter("A", 7, INT32)]))
     assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 7}))["A"]) == 7
     assert len(channel.sent) < 20
 
 
-def test_an_old_value_under_way_is_not_the_answer() -> None:
+def test_old_value_in_flight_is_ignored() -> None:
     vehicle = FakeVehicle([Parameter("A", 1, INT32)])
     channel = Channel(vehicle)
     channel.is_lost = lambda message: isinstance(message, m.ParamSet) and channel.now < 0.01
@@ -204,7 +204,7 @@ def test_an_old_value_under_way_is_not_the_answer() -> None:
     assert vehicle.parameters["A"].value == 2
 
 
-def test_what_comes_before_the_write_was_sent_does_not_confirm_it() -> None:
+def test_value_before_write_does_not_confirm() -> None:
     table = [Parameter(f"P{i}", 0, INT32) for i in range(30)]
     vehicle = FakeVehicle(table)
     channel = Channel(vehicle, delay_s=0.05)
@@ -213,7 +213,7 @@ def test_what_comes_before_the_write_was_sent_does_not_confirm_it() -> None:
     assert {each.value for each in vehicle.parameters.values()} == {1}
 
 
-def test_an_integer_that_ardupilot_calls_a_float_is_confirmed() -> None:
+def test_integer_reported_as_float_is_confirmed() -> None:
     class DefaultAsFloat(FakeVehicle):
         def value(self, name: str, index: int | None) -> m.ParamValue:
             told = self.parameters[name]
@@ -225,7 +225,7 @@ def test_an_integer_that_ardupilot_calls_a_float_is_confirmed() -> None:
     assert channel.kinds() == {"PARAM_SET": 1}
 
 
-def test_another_type_is_told_after_it_was_read_back() -> None:
+def test_other_type_is_reported_after_read() -> None:
     class OtherType(FakeVehicle):
         def value(self, name: str, index: int | None) -> m.ParamValue:
             return m.ParamValue(name, 5.0, 9, 1, 0xFFFF)
@@ -236,13 +236,9 @@ def test_another_type_is_told_after_it_was_read_back() -> None:
     assert len(channel.sent) < 6
 
 
-@pytest.mark.parametrize(
-    ("before", "asked"), [([], 1), ([(4, 6)], 2), ([(4, 9)], 2), ([(5, 6)], 0), ([(5, 9)], 1)]
-)
-def test_another_type_is_believed_when_it_comes_twice_in_a_row(
-    before: list[tuple[int, int]], asked: int
-) -> None:
-    """Asked for is an integer of 5 (type 6); a float of 5 (9) comes; ``asked``: how often it is read back."""
+@pytest.mark.parametrize(("before", "asked"), [([], 1), ([(4, 6)], 2), ([(4, 9)], 2), ([(5, 6)], 0), ([(5, 9)], 1)])
+def test_other_type_is_accepted_when_repeated(before: list[tuple[int, int]], asked: int) -> None:
+    """An int of type 6 is requested, a float of type 9 arrives; ``asked`` counts the read-backs."""
     exchange = writes(Parameter("A", 5, INT32), bytewise=True, before={"A": 0.0})
     exchange.start(0.0)
     exchange.take_outbox()
@@ -253,8 +249,8 @@ def test_another_type_is_believed_when_it_comes_twice_in_a_row(
     assert len(exchange.take_outbox()) == asked
 
 
-def test_another_value_is_believed_when_it_comes_twice_with_nothing_else_in_between() -> None:
-    """Of a name that was written a moment ago: an echo of that write comes in between."""
+def test_other_value_is_accepted_when_repeated_consecutively() -> None:
+    """An echo of a preceding write arrives while the same name is read."""
     exchange = writes(Parameter("A", 5, INT32), bytewise=True, before={"A": 0.0}, recent=["A"])
     exchange.start(0.0)
     done = []
@@ -266,7 +262,7 @@ def test_another_value_is_believed_when_it_comes_twice_with_nothing_else_in_betw
     assert value(exchange.result()["A"]) == 4
 
 
-def test_a_refusal_is_told_in_words() -> None:
+def test_parameter_refusal_has_text() -> None:
     vehicle = FakeVehicle([])
     vehicle.refuses = True
     answer = Channel(vehicle).run(writes(Parameter("A", 5, INT32)))["A"]
@@ -274,32 +270,30 @@ def test_a_refusal_is_told_in_words() -> None:
     assert answer.code == 1
 
 
-@pytest.mark.parametrize(
-    ("code", "words"), [(2, "this value"), (5, "read-only"), (7, "another type"), (99, "99")]
-)
-def test_errors_in_words(code: int, words: str) -> None:
+@pytest.mark.parametrize(("code", "words"), [(2, "this value"), (5, "read-only"), (7, "another type"), (99, "99")])
+def test_param_error_texts(code: int, words: str) -> None:
     assert words in str(rejection("A", code))
 
 
-def test_an_unconfirmed_write_is_a_timeout() -> None:
+def test_unconfirmed_parameter_write_times_out() -> None:
     channel = Channel(FakeVehicle([]))
-    answer = channel.run(writes(Parameter("A", 5, INT32), patience_s=2.0))["A"]
+    answer = channel.run(writes(Parameter("A", 5, INT32), idle_timeout_s=2.0))["A"]
     assert isinstance(answer, ParameterTimeout)
     assert "not confirmed" in str(answer)
     assert len(channel.sent) < 30
 
 
-def test_values_of_another_component_confirm_nothing() -> None:
+def test_write_ignores_values_of_other_components() -> None:
     vehicle = FakeVehicle([])
     channel = Channel(vehicle)
     channel.at(0.01, lambda: channel.from_vehicle(m.ParamValue("A", 5.0, 6, 1, 0xFFFF), component_id=100))
-    answer = channel.run(writes(Parameter("A", 5, INT32), patience_s=1.0))["A"]
+    answer = channel.run(writes(Parameter("A", 5, INT32), idle_timeout_s=1.0))["A"]
     assert isinstance(answer, ParameterTimeout)
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.05, 0.1, 0.2, 0.3]), count=st.integers(1, 40))
-def test_writes_arrive_whatever_is_lost(seed: int, loss: float, count: int) -> None:
+def test_parameter_writes_arrive_despite_losses(seed: int, loss: float, count: int) -> None:
     table = table_of(count)
     vehicle = FakeVehicle(table)
     channel = Channel(vehicle, loss=loss, seed=seed)
@@ -312,13 +306,13 @@ def test_writes_arrive_whatever_is_lost(seed: int, loss: float, count: int) -> N
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6), loss=st.sampled_from([0.1, 0.3]))
-def test_clamping_is_told_whatever_is_lost(seed: int, loss: float) -> None:
+def test_clamping_is_reported_despite_losses(seed: int, loss: float) -> None:
     channel = Channel(Clamping([Parameter("A", 0, INT32)]), loss=loss, seed=seed)
     assert value(channel.run(writes(Parameter("A", 50, INT32), before={"A": 0}))["A"]) == 10
     assert len(channel.sent) < 80
 
 
-def test_messages_that_were_not_asked_for_are_ignored() -> None:
+def test_parameter_requests_ignore_unrequested_messages() -> None:
     exchange = reads("A")
     exchange.start(0.0)
     others: list[Message] = [m.ParamValue("B", 1.0, 6, 1, 0), m.Heartbeat(2, 3, 0, 0, 3, 3)]
@@ -327,20 +321,20 @@ def test_messages_that_were_not_asked_for_are_ignored() -> None:
     assert not exchange.done
 
 
-def test_of_an_old_and_a_new_name_only_one_is_waited_for() -> None:
+def test_alternative_name_is_rejected_by_answer() -> None:
     channel = Channel(FakeVehicle(table_of(10)))
-    rivals = {"PARAM_0004": ("OLD_NAME",), "OLD_NAME": ("PARAM_0004",)}
-    answers = channel.run(reads("OLD_NAME", "PARAM_0004", are_doubtful=True, rivals=rivals))
+    alternatives = {"PARAM_0004": ("OLD_NAME",), "OLD_NAME": ("PARAM_0004",)}
+    answers = channel.run(reads("OLD_NAME", "PARAM_0004", probe=True, alternatives=alternatives))
     assert value(answers["PARAM_0004"]) == 2.0
     assert isinstance(answers["OLD_NAME"], ParameterRejected)
     assert channel.now == pytest.approx(RTT_S)
 
 
-# ------------------------------------------------------------------------------ few PARAM_SET
+# --------------------------------------------------------------- number of PARAM_SET messages
 
 
-class Deaf(FakeVehicle):
-    """Takes what is set, and loses the first answers to anything, or all."""
+class LosesAnswers(FakeVehicle):
+    """Applies writes, and loses the first answers, or all."""
 
     lost = 10**9
 
@@ -354,15 +348,15 @@ class Deaf(FakeVehicle):
         pass
 
 
-def test_nothing_is_set_into_a_silence() -> None:
-    channel = Channel(Deaf(table_of(1)))
-    answers = channel.run(writes(Parameter("PARAM_0000", 7, INT8), patience_s=3.0))
+def test_parameter_write_is_not_repeated_in_silence() -> None:
+    channel = Channel(LosesAnswers(table_of(1)))
+    answers = channel.run(writes(Parameter("PARAM_0000", 7, INT8), idle_timeout_s=3.0))
     assert isinstance(answers["PARAM_0000"], ParameterTimeout)
     assert channel.kinds()["PARAM_SET"] == 1
     assert channel.kinds()["PARAM_REQUEST_READ"] > 1
 
 
-def test_an_answer_with_the_old_value_has_it_set_again() -> None:
+def test_old_value_repeats_parameter_write() -> None:
     class LosesSets(FakeVehicle):
         lost = 3
 
@@ -377,8 +371,8 @@ def test_an_answer_with_the_old_value_has_it_set_again() -> None:
     assert channel.kinds()["PARAM_SET"] == 4
 
 
-def test_what_another_station_has_set_meanwhile_is_not_undone() -> None:
-    """The echo of ours is lost, and another value is told: it is read back, and it is the answer."""
+def test_parameter_write_keeps_value_of_other_station() -> None:
+    """The echo is lost and another value reported: it is read back and returned."""
 
     class SetByAnother(FakeVehicle):
         def on_set(self, request: m.ParamSet) -> None:
@@ -390,8 +384,8 @@ def test_what_another_station_has_set_meanwhile_is_not_undone() -> None:
     assert channel.kinds()["PARAM_SET"] == 1
 
 
-def test_a_vehicle_that_has_become_faster_is_believed() -> None:
-    """It was busy when its round trip was measured, and the first writes were lost: each answer seems too early."""
+def test_parameter_write_accepts_faster_vehicle() -> None:
+    """The round trip was measured on a busy vehicle, and the first writes were lost: answers seem too early."""
     vehicle = FakeVehicle(table_of(1))
     channel = Channel(vehicle, delay_s=0.005)
     channel.is_lost = lambda message: channel.now < 3.0

@@ -1,4 +1,4 @@
-"""A file out of blocks that come in any order."""
+"""Reassembly of a file from blocks in any order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def blocks(start: int = 0, **options: int) -> tuple[Reassembly, bytearray]:
     return Reassembly(written.extend, block_size=4, start=start, **options), written
 
 
-def test_blocks_ahead_wait_for_those_before() -> None:
+def test_reassembly_orders_blocks() -> None:
     into, written = blocks()
     assert into.add(4, b"efgh")
     assert (into.missing(12), bytes(written)) == (((0, 4), (8, 4)), b"")
@@ -20,7 +20,7 @@ def test_blocks_ahead_wait_for_those_before() -> None:
     assert into.missing() == ((8, 0),)
 
 
-def test_a_short_block_is_the_end_and_what_is_behind_it_is_not_of_the_file() -> None:
+def test_reassembly_ends_at_short_block() -> None:
     into, written = blocks()
     into.add(12, b"mnop")
     into.add(8, b"ijkl")
@@ -33,7 +33,7 @@ def test_a_short_block_is_the_end_and_what_is_behind_it_is_not_of_the_file() -> 
     assert (bytes(written), into.missing()) == (b"abcdef", ())
 
 
-def test_of_several_ends_the_first_counts() -> None:
+def test_reassembly_first_end_counts() -> None:
     into, _ = blocks()
     into.end_at(10)
     assert into.missing() == ((0, 10),)
@@ -43,7 +43,7 @@ def test_of_several_ends_the_first_counts() -> None:
     assert (into.end, into.missing()) == (4, ((0, 4),))
 
 
-def test_it_goes_on_where_it_was_left() -> None:
+def test_reassembly_resumes() -> None:
     into, written = blocks(start=4)
     assert not into.add(0, b"abcd")
     into.add(4, b"efgh")

@@ -16,7 +16,7 @@ from parameter_channel import Channel, FakeVehicle, table_of
 from aerokit.errors import AerokitError
 from aerokit.parameters import Parameter
 from aerokit.protocols.blocks import Reassembly
-from aerokit.protocols.exchange import Progress, RoundTrip
+from aerokit.protocols.exchange import RoundTrip, TransferProgress
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
 from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList
@@ -30,7 +30,7 @@ SEEDS = range(16)
 
 @dataclass
 class Trouble:
-    """A link and a caller, drawn by a seed. Of four links one is good, one is nearly dead."""
+    """A link and a caller drawn by seed. One of four links is good, one is nearly dead."""
 
     seed: int
 
@@ -40,14 +40,18 @@ class Trouble:
         self.jitter_s = dice.choice((0.0, 0.04, 0.2))
         self.doubling = dice.choice((0.0, 0.2))
         self.round_trip = RoundTrip(dice.choice((None, 0.1, 0.4)))
-        self.patience_s = dice.choice((2.0, 10.0))
+        self.idle_timeout_s = dice.choice((2.0, 10.0))
         self.size = dice.choice((0, 1, 239, 240, 3000, 7001))
         self.is_bytewise = dice.random() < 0.5
-        self.told: list[Progress] = []
+        self.told: list[TransferProgress] = []
 
     @property
     def options(self) -> dict[str, Any]:
-        return {"round_trip": self.round_trip, "patience_s": self.patience_s, "on_progress": self.told.append}
+        return {
+            "round_trip": self.round_trip,
+            "idle_timeout_s": self.idle_timeout_s,
+            "on_progress": self.told.append,
+        }
 
     def channel(self, parameters: list[Parameter]) -> Channel:
         vehicle = FakeVehicle(parameters, bytewise=self.is_bytewise)
@@ -117,9 +121,7 @@ def list_parameters(trouble: Trouble) -> bool:
 def read_parameters(trouble: Trouble) -> bool:
     table = table_of(30)
     names = [*(each.name for each in trouble.dice.sample(table, 12)), "NOT_THERE"]
-    exchange = ParameterReads(
-        1, 1, names, bytewise=trouble.is_bytewise, are_doubtful=True, own_system=255, **trouble.options
-    )
+    exchange = ParameterReads(1, 1, names, bytewise=trouble.is_bytewise, probe=True, own_system=255, **trouble.options)
     answers = trouble.channel(table).run(exchange)
     return all(isinstance(answers[name], Parameter) or trouble.loss > 0.5 for name in names[:-1])
 
@@ -147,7 +149,7 @@ def upload_mission(trouble: Trouble) -> bool:
     result = mission_vehicles.run(exchange, vehicle, trouble.radio())
     if result.error is not None:
         raise result.error
-    return vehicle.stored == new or not exchange.result().is_sure
+    return vehicle.stored == new or not exchange.result().is_confirmed
 
 
 def download_mission(trouble: Trouble) -> bool:
@@ -174,16 +176,16 @@ TRANSFERS: list[Callable[[Trouble], bool]] = [
 
 
 @pytest.mark.parametrize("transfer", TRANSFERS, ids=lambda each: each.__name__)
-def test_transfer_over_bad_link_arrives_or_says_why(transfer: Callable[[Trouble], bool]) -> None:
+def test_transfer_over_bad_link_arrives_or_explains(transfer: Callable[[Trouble], bool]) -> None:
     faults = [f"seed {seed}: {fault}" for seed in SEEDS if (fault := fault_of(transfer, seed))]
     assert not faults, "\n".join(faults)
 
 
 def fault_of(transfer: Callable[[Trouble], bool], seed: int) -> str:
-    """What is wrong with the transfer; empty: nothing."""
+    """Return what is wrong with the transfer; empty if nothing."""
     trouble = Trouble(seed)
     try:
         return "" if transfer(trouble) else "what arrived is not what was sent"
     except AerokitError as error:
-        is_excused = trouble.loss > 0 or trouble.patience_s < 3
+        is_excused = trouble.loss > 0 or trouble.idle_timeout_s < 3
         return "" if is_excused else f"gave up over a good link: {error}"

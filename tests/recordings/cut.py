@@ -1,4 +1,4 @@
-"""Cuts the project's own recordings out of the longer ones beside it; only for when the windows below change.
+"""Cuts the project's own recordings out of longer ones. Only needed when the windows below change.
 
 PYTHONPATH=src python tests/recordings/cut.py ../shared/traces
 """
@@ -50,14 +50,14 @@ WINDOWS: dict[str, tuple[tuple[int, int], ...]] = {
         (35450, 35528),  # disarmed
     ),
 }
-"""First frame and the one behind the last, counted in the longer recording."""
+"""First frame, and the one after the last, counted in the longer recording."""
 
 RAW_BYTES = 4096
-"""Of the serial boot: the text before the first frame, and about a hundred frames."""
+"""For the serial boot: the text before the first frame, and about a hundred frames."""
 
 
 def main(source: Path) -> None:
-    """Write them all."""
+    """Write all recordings."""
     for name, windows in WINDOWS.items():
         records = list(islice(read_tlog(source / f"{name}.tlog"), windows[-1][1]))
         with TlogWriter(HERE / f"{name}.tlog") as writer:

@@ -1,4 +1,4 @@
-"""What tests of devices beside an autopilot need: a client, commands to any address, who answered."""
+"""Client for tests of component devices: commands to any address, and the senders of the answers."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from simulated_client import Client
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
-from aerokit.sim import Component, SimulatedCopter, SimulatedVehicle
+from aerokit.sim import AttachableComponent, SimulatedCopter, SimulatedVehicle
 
 M = TypeVar("M", bound=Message)
 
 
 class ComponentClient(Client):
     def ask(self, component: int, command: int, *params: float, system: int | None = None) -> list[int]:
-        """Results of the answers that come at once."""
+        """Return the results of answers that arrive at once."""
         first = len(self.heard)
         numbers = [*params, *(0.0,) * (7 - len(params))]
         system = self.vehicle.system_id if system is None else system
@@ -24,7 +24,7 @@ class ComponentClient(Client):
         return [ack.result for _, ack in self.heard[first:] if isinstance(ack, m.CommandAck)]
 
     def request(self, component: int, kind: type[M], *params: float) -> list[M]:
-        """What comes of REQUEST_MESSAGE."""
+        """Return the messages that REQUEST_MESSAGE brings."""
         first = len(self.heard)
         self.ask(component, MavCmd.REQUEST_MESSAGE, kind.ID, *params)
         return [message for _, message in self.heard[first:] if isinstance(message, kind)]
@@ -40,14 +40,14 @@ def source(message: Message) -> tuple[int, int]:
     return (frame.system_id, frame.component_id)
 
 
-def copter_with(*components: Component, **options: object) -> tuple[SimulatedCopter, ComponentClient]:
-    """Booted, with these devices."""
+def copter_with(*components: AttachableComponent, **options: object) -> tuple[SimulatedCopter, ComponentClient]:
+    """Return a booted copter with these devices."""
     copter = SimulatedCopter(boot_time_s=0.0, components=components, **options)  # type: ignore[arg-type]
     return copter, settled(copter)
 
 
 def settled(vehicle: SimulatedVehicle, **ids: int) -> ComponentClient:
-    """A client three seconds after the start."""
+    """Return a client three seconds after the start."""
     client = ComponentClient(vehicle, **ids)
     client.run(3.0)
     client.forget()

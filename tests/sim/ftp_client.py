@@ -1,4 +1,4 @@
-"""A MAVFTP client for tests of simulated vehicles: one request, and whatever it brings."""
+"""MAVFTP client for tests of simulated vehicles: sends single requests and returns their replies."""
 
 from __future__ import annotations
 
@@ -31,13 +31,11 @@ class FtpClient:
         data = data.encode() if isinstance(data, str) else data
         self.sequence = (self.sequence + 1) & 0xFFFF if sequence is None else sequence
         size = len(data) if size is None else size
-        packet = FtpPacket(
-            self.sequence, opcode, session, size, offset=offset, data=data, client=self.client.target
-        )
+        packet = FtpPacket(self.sequence, opcode, session, size, offset=offset, data=data, client=self.client.target)
         self.client.send(packet.message())
 
     def wait(self, seconds: float) -> None:
-        """Let time pass without listening."""
+        """Let time pass without receiving."""
         self.client.now += seconds
         self.client.vehicle.step(self.client.now)
         self.client.vehicle.take_outbox()
@@ -68,7 +66,7 @@ class FtpClient:
         return answer.data[: answer.size]
 
     def refusal(self, opcode: int, data: bytes | str = b"", **options: int) -> tuple[int, ...]:
-        """The error code, and the errno if there is one."""
+        """Return the error code, and the errno if there is one."""
         answer = self.ask(opcode, data, **options)
         assert answer.opcode == Op.NAK
         return tuple(answer.data[: answer.size])

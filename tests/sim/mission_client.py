@@ -21,8 +21,8 @@ VERTEX, CIRCLE, RALLY = (
     MavCmd.NAV_FENCE_CIRCLE_INCLUSION,
     MavCmd.NAV_RALLY_POINT,
 )
+# Position of the simulated copter.
 NORTH, EAST = -353_632_610, 1_491_652_299
-"""Where the simulated copter is."""
 
 
 def item(
@@ -54,7 +54,7 @@ def results(client: Client) -> list[int]:
 
 
 def upload(client: Client, items: Sequence[MissionItem], mission_type: int = 0) -> int:
-    """Give what is asked for; the result."""
+    """Send the requested items; return the result."""
     first = len(client.heard)
     client.send(m.MissionCount(1, 1, len(items), mission_type))
     for _ in range(len(items) + 1):

@@ -1,4 +1,4 @@
-"""One of our protocol machines and a simulated vehicle, with a bad radio between: no loop, no sockets, no waiting."""
+"""A client-side protocol machine and a simulated vehicle with a bad radio between them, without a loop or sockets."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ seeds = st.integers(0, 99)
 
 
 def vehicle_of(kind: str, parameter_count: int = 60) -> Vehicle:
-    """Ready soon, and of few parameters."""
+    """Return a vehicle that boots fast and has few parameters."""
     if kind == "copter":
         return SimulatedCopter(boot_time_s=0.0, parameter_count=parameter_count, logs=LOGS)
     return SimulatedPx4(boot_time_s=0.0, parameter_count=parameter_count, logs=LOGS)
 
 
 class Pair:
-    """Frames of both sides take the same bad way; what the vehicle streams by itself is switched off."""
+    """Frames of both directions take the same faulty path; the vehicle's streams are off."""
 
     def __init__(self, vehicle: Vehicle, radio: FaultModel = PERFECT, seed: int = 0) -> None:
         self.vehicle = vehicle
@@ -51,16 +51,14 @@ class Pair:
         self.now = vehicle.now + 3.0
         self._paths = FaultyPath(radio, (seed, "up")), FaultyPath(radio, (seed, "down"))
         self._encoder, self._framer = FrameEncoder(255, 190), Framer()
-        self._arrivals: list[
-            tuple[float, int, bool, bytes]
-        ] = []  # (due, number, is it for the vehicle, frame)
+        self._arrivals: list[tuple[float, int, bool, bytes]] = []  # (due, number, True for the vehicle, frame)
         self._numbers = itertools.count()
         vehicle.step(self.now)
         vehicle.take_outbox()
         vehicle.channels[0].streams = Streams()
 
     def run(self, exchange: Exchange[ResultT], *, limit_s: float = 900.0) -> ResultT:
-        """The result; raises what it ended with. Deadlines may neither lie in the past nor spin."""
+        """Return the result, or raise the error. Deadlines must neither be in the past nor repeat without progress."""
         end = self.now + limit_s
         exchange.start(self.now)
         self._send(exchange)
@@ -73,7 +71,7 @@ class Pair:
         return exchange.result()
 
     def wait(self, seconds: float) -> None:
-        """Let everything arrive that is under way; the client does not listen."""
+        """Deliver everything in transit; the client does not receive."""
         end = self.now + seconds
         while (due := min(end, self._next_due())) < end:
             self._pass_to(due)
@@ -95,7 +93,7 @@ class Pair:
         return max(self.now, min(arrival, self.vehicle.next_due))
 
     def _pass_to(self, when: float) -> list[bytes]:
-        """What arrives at the client."""
+        """Handle what arrives at the client."""
         self.now = when
         arrived = []
         while self._arrivals and self._arrivals[0][0] <= when:

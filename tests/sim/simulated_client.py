@@ -1,4 +1,4 @@
-"""A client for tests of simulated vehicles: no loop, no sockets, simulated time."""
+"""Client for tests of simulated vehicles, in simulated time without a loop or sockets."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle
 M = TypeVar("M", bound=Message)
 STEP_S = 0.05
 
+# Default home of PX4's simulation, and of its recordings.
 PX4_HOME = (47.3977432, 8.5455939, 489.4)
-"""Where PX4's own simulations begin, and the recordings of it."""
 
 
 class Client:
@@ -36,7 +36,7 @@ class Client:
         self.listen()
 
     def command(self, command: int, *params: float) -> int | None:
-        """The result; None when there is no answer at once."""
+        """Return the result; None if there is no answer at once."""
         first = len(self.heard)
         numbers = [*params, *(0.0,) * (7 - len(params))]
         self.send(m.CommandLong(*self.target, command, 0, *numbers))
@@ -57,9 +57,9 @@ class Client:
         return None
 
     def _ask_for_texts(self) -> None:
-        """PX4 tells texts where a ground station is heard; this client sends no heartbeats unless a test does."""
+        """PX4 sends texts only to ground stations, and this client sends no heartbeats unless a test does."""
         if isinstance(self.vehicle, SimulatedPx4):
-            self.vehicle.text_links.hear_station(self.vehicle.channels[0])
+            self.vehicle.text_links.on_station_heartbeat(self.vehicle.channels[0])
 
     def listen(self) -> None:
         self._ask_for_texts()
@@ -74,7 +74,7 @@ class Client:
             self.listen()
 
     def run_until(self, condition: Callable[[], bool], timeout: float = 120.0) -> float:
-        """Simulated seconds it took."""
+        """Return the simulated seconds it took."""
         start = self.now
         while not condition():
             assert self.now - start < timeout, f"not within {timeout} s; texts: {self.texts}"
@@ -96,7 +96,7 @@ class Client:
 
 
 def ready_copter(**options: object) -> tuple[SimulatedCopter, Client]:
-    """Booted, disarmed, with a position."""
+    """Return a copter that is booted, disarmed and has a position."""
     copter = SimulatedCopter(boot_time_s=0.0, **options)  # type: ignore[arg-type]
     client = Client(copter)
     client.run(3.0)
@@ -105,7 +105,7 @@ def ready_copter(**options: object) -> tuple[SimulatedCopter, Client]:
 
 
 def flying_copter(altitude_m: float = 10.0, **options: object) -> tuple[SimulatedCopter, Client]:
-    """Hovering in GUIDED."""
+    """Return a copter that hovers in GUIDED."""
     copter, client = ready_copter(**options)
     assert set_mode(client, CopterMode.GUIDED) == 0
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0

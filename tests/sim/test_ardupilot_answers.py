@@ -1,4 +1,4 @@
-"""What each kind of ArduPilot answers to each command, disarmed on the ground: as the firmware was seen to."""
+"""MAV_RESULT of each command to each kind of ArduPilot, disarmed on the ground, as recorded in SITL."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def rows() -> list[tuple[str, list[float], list[str]]]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_command_is_answered_as_by_the_firmware(kind: str) -> None:
+def test_command_result_matches_recorded_firmware(kind: str) -> None:
     vehicle = simulated(kind, boot_time_s=0.0, parameters={"MNT1_TYPE": 1.0})
     client = Client(vehicle)
     client.run(3.0)

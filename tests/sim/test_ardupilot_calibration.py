@@ -1,4 +1,4 @@
-"""Calibrations that somebody turns the vehicle for, and the origin and home that a client sets."""
+"""Calibrations for which the vehicle is turned by hand; origin and home set by a client."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ def streaming_copter() -> tuple[Any, Client]:
     return copter, client
 
 
-def test_the_compasses_tell_how_far_they_are() -> None:
+def test_compass_calibration_reports_progress() -> None:
     _, client = streaming_copter()
     assert client.command(MavCmd.DO_START_MAG_CAL, 0, 1, 0) == ACCEPTED
     assert client.command(MavCmd.DO_ACCEPT_MAG_CAL, 0) == FAILED
     client.run(16.0)
-    told = client.all(m.MagCalProgress)
-    assert {progress.compass_id for progress in told} == {0, 1, 2}
-    percents = [progress.completion_pct for progress in told]
+    reports = client.all(m.MagCalProgress)
+    assert {progress.compass_id for progress in reports} == {0, 1, 2}
+    percents = [progress.completion_pct for progress in reports]
     assert percents == sorted(percents)
     assert percents[-1] == pytest.approx(50, abs=2)
-    assert told[-1].cal_mask == 7
+    assert reports[-1].cal_mask == 7
     assert not client.all(m.MagCalReport)
     client.run(20.0)
     assert {report.cal_status for report in client.all(m.MagCalReport)} == {MagCalStatus.SUCCESS}
@@ -42,38 +42,36 @@ def test_the_compasses_tell_how_far_they_are() -> None:
     assert not client.all(m.MagCalReport)
 
 
-def test_compasses_that_nobody_turns_stay_where_they_are() -> None:
+def test_compass_calibration_without_rotation_makes_no_progress() -> None:
     copter, client = streaming_copter()
     copter.calibrations.compasses.turns_s = math.inf
     client.command(MavCmd.DO_START_MAG_CAL, 2)
     client.run(60.0)
-    assert {(each.compass_id, each.completion_pct) for each in client.all(m.MagCalProgress)} == {(1, 0)}
+    assert {(report.compass_id, report.completion_pct) for report in client.all(m.MagCalProgress)} == {(1, 0)}
     assert client.command(MavCmd.DO_CANCEL_MAG_CAL, 0) == ACCEPTED
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == ACCEPTED
 
 
-def asked(client: Client) -> list[float]:
-    return [
-        order.param1 for order in client.all(m.CommandLong) if order.command == MavCmd.ACCELCAL_VEHICLE_POS
-    ]
+def requested_positions(client: Client) -> list[float]:
+    return [order.param1 for order in client.all(m.CommandLong) if order.command == MavCmd.ACCELCAL_VEHICLE_POS]
 
 
-def test_the_accelerometers_ask_for_six_positions() -> None:
+def test_accelerometer_calibration_requests_six_positions() -> None:
     _, client = ready_copter()
     client.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 1)
     client.run(2.1)
     assert client.texts == ["Initialising ArduPilot", LEVEL_TEXT]
-    assert asked(client) == [1.0, 1.0]
+    assert requested_positions(client) == [1.0, 1.0]
     assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, 2) == FAILED
     for position in range(1, 7):
-        assert asked(client)[-1] == position
+        assert requested_positions(client)[-1] == position
         assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, position) == ACCEPTED
         client.run(1.5)
     assert client.texts[-1] == "Calibration successful"
-    assert asked(client)[-1] == AccelcalVehiclePos.SUCCESS
+    assert requested_positions(client)[-1] == AccelcalVehiclePos.SUCCESS
 
 
-def test_accelerometers_that_are_held_wrong_fail() -> None:
+def test_accelerometer_calibration_with_wrong_positions_fails() -> None:
     copter, client = ready_copter()
     copter.calibrations.accelerometers.is_held_wrong = True
     client.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 1)
@@ -82,7 +80,7 @@ def test_accelerometers_that_are_held_wrong_fail() -> None:
         assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, position) == ACCEPTED
         client.run(2.0)
     assert client.texts[-1] == "Calibration FAILED"
-    assert asked(client)[-1] == AccelcalVehiclePos.FAILED
+    assert requested_positions(client)[-1] == AccelcalVehiclePos.FAILED
     assert client.command(MavCmd.ACCELCAL_VEHICLE_POS, 3) == FAILED
 
 
@@ -106,39 +104,39 @@ def origin_at(vehicle: Any, metres_up: float) -> m.SetGpsGlobalOrigin:
 
 
 @pytest.mark.parametrize("kind", ["copter", "plane", "rover", "sub"])
-def test_the_origin_is_set_once_and_before_gps(kind: str) -> None:
+def test_origin_can_be_set_once_before_gps(kind: str) -> None:
     vehicle, client = booting(kind)
     client.send(origin_at(vehicle, 12.0))
     client.run(0.2)
-    (told,) = client.all(m.GpsGlobalOrigin)
-    assert told.latitude == vehicle.frame.origin.latitude_e7 + 1000
+    (origin,) = client.all(m.GpsGlobalOrigin)
+    assert origin.latitude == vehicle.frame.origin.latitude_e7 + 1000
     assert "EKF3 IMU0 origin set" in client.texts
     client.send(origin_at(vehicle, 30.0))
     client.run(0.2)
     assert len(client.all(m.GpsGlobalOrigin)) == 1
     client.run(40.0)
     assert client.texts.count("EKF3 IMU0 origin set") == 1
-    assert client.last(m.GpsGlobalOrigin).altitude == told.altitude
+    assert client.last(m.GpsGlobalOrigin).altitude == origin.altitude
     assert client.last(m.HomePosition).latitude == pytest.approx(vehicle.frame.origin.latitude_e7, abs=50)
 
 
 @pytest.mark.parametrize(
     ("kind", "result"), [("copter", FAILED), ("plane", ACCEPTED), ("rover", ACCEPTED), ("sub", FAILED)]
 )
-def test_home_before_there_is_an_origin(kind: str, result: int) -> None:
+def test_home_before_origin_is_accepted_by_some_kinds(kind: str, result: int) -> None:
     _, client = booting(kind)
     assert client.command(MavCmd.GET_HOME_POSITION) == FAILED
     assert client.command(MavCmd.DO_SET_HOME, 1) == FAILED
     assert client.command(MavCmd.DO_SET_HOME, 0, 0, 0, 0, 47.4, 8.5, 500) == result
     client.run(0.2)
     homes = [(home.latitude, home.longitude, home.altitude) for home in client.all(m.HomePosition)]
-    wanted = [pytest.approx((474_000_000, 85_000_000, 500_000), abs=20)]  # COMMAND_LONG has floats
-    assert homes == (wanted if result == ACCEPTED else [])
-    said = [text for text in client.texts if text.startswith("Set HOME to 47.4000")]
-    assert bool(said) == (kind == "rover")
+    expected = [pytest.approx((474_000_000, 85_000_000, 500_000), abs=20)]  # COMMAND_LONG has floats
+    assert homes == (expected if result == ACCEPTED else [])
+    texts = [text for text in client.texts if text.startswith("Set HOME to 47.4000")]
+    assert bool(texts) == (kind == "rover")
 
 
-def test_home_that_is_nowhere_is_refused() -> None:
+def test_home_at_invalid_place_is_refused() -> None:
     _, client = ready_copter()
     home = MavCmd.DO_SET_HOME
     assert client.command(home, 1) == ACCEPTED
@@ -150,7 +148,7 @@ def test_home_that_is_nowhere_is_refused() -> None:
     assert "Unknown mavlink coordinate frame 1" in client.texts
 
 
-def test_what_is_left_in_the_battery_can_be_told_it() -> None:
+def test_battery_reset_sets_remaining_charge() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.BATTERY_RESET, 1, 60) == ACCEPTED
     client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID)

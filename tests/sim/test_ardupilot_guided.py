@@ -1,4 +1,4 @@
-"""Guided set-points of aeroplanes, rovers and submarines: every frame and mask that they take, and their ends."""
+"""Guided set-points of Plane, Rover and Sub: frames, masks and time-outs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ACCEPTED, DENIED, FAILED = MavResult.ACCEPTED, MavResult.DENIED, MavResult.FAILE
 
 
 def guided(kind: str, mode: int) -> tuple[Any, Client]:
-    """Armed, its nose to the north."""
+    """Return an armed vehicle in GUIDED that points north."""
     vehicle: Any = simulated(kind, boot_time_s=0.0, heading_deg=0.0)
     client = Client(vehicle)
     client.run(3.0)
@@ -73,7 +73,7 @@ def rover() -> tuple[Any, Client]:
         (MavFrame.BODY_OFFSET_NED, (5.0, 10.0)),
     ],
 )
-def test_a_rover_goes_to_places_in_each_frame(frame: int, expected: tuple[float, float]) -> None:
+def test_rover_position_target_works_in_each_frame(frame: int, expected: tuple[float, float]) -> None:
     vehicle, client = rover()
     vehicle.motion.north, vehicle.motion.yaw = 5.0, math.pi / 2
     client.send(local(frame, VEL | ACC | YAW | RATE, (10.0, 0.0, 0.0)))
@@ -82,7 +82,7 @@ def test_a_rover_goes_to_places_in_each_frame(frame: int, expected: tuple[float,
     assert client.all(m.MissionItemReached)
 
 
-def test_a_rover_stops_three_seconds_after_the_last_velocity() -> None:
+def test_rover_velocity_target_expires_after_three_seconds() -> None:
     vehicle, client = rover()
     keep(client, local(MavFrame.LOCAL_NED, POS | ACC | YAW | RATE, velocity=(1.0, 0.0, 0.0)), 4.0)
     assert vehicle.motion.velocity_north == pytest.approx(1.0, abs=0.1)
@@ -93,7 +93,7 @@ def test_a_rover_stops_three_seconds_after_the_last_velocity() -> None:
     assert vehicle.motion.ground_speed_m_s < 0.1
 
 
-def test_a_rover_turns_to_drive_back_unless_a_heading_says_otherwise() -> None:
+def test_rover_backward_velocity_reverses_only_with_heading() -> None:
     vehicle, client = rover()
     keep(client, local(MavFrame.BODY_NED, POS | ACC | RATE, velocity=(-1.0, 0.0, 0.0)), 4.0)
     assert vehicle.motion.speed_m_s == pytest.approx(-1.0, abs=0.1)
@@ -103,14 +103,14 @@ def test_a_rover_turns_to_drive_back_unless_a_heading_says_otherwise() -> None:
     assert vehicle.motion.speed_m_s > 0.5
 
 
-def test_a_rover_drives_no_faster_than_usual() -> None:
+def test_rover_velocity_target_is_limited_to_waypoint_speed() -> None:
     vehicle, client = rover()
     keep(client, local(MavFrame.LOCAL_NED, POS | ACC | YAW | RATE, velocity=(50.0, 0.0, 0.0)), 12.0)
-    usual = vehicle.parameters["WP_SPEED"] or vehicle.parameters["CRUISE_SPEED"]
-    assert vehicle.motion.speed_m_s == pytest.approx(usual, rel=0.05)
+    limit = vehicle.parameters["WP_SPEED"] or vehicle.parameters["CRUISE_SPEED"]
+    assert vehicle.motion.speed_m_s == pytest.approx(limit, rel=0.05)
 
 
-def test_a_rover_takes_no_accelerations() -> None:
+def test_rover_acceleration_target_is_refused() -> None:
     vehicle, client = rover()
     client.send(local(MavFrame.LOCAL_NED, POS | YAW | RATE, velocity=(1.0, 0.0, 0.0)))
     client.run(1.0)
@@ -118,12 +118,12 @@ def test_a_rover_takes_no_accelerations() -> None:
     assert vehicle.motion.ground_speed_m_s == 0.0
 
 
-def test_a_rover_drives_by_attitude_and_thrust() -> None:
+def test_rover_attitude_target_sets_heading_and_speed() -> None:
     vehicle, client = rover()
     keep(client, attitude(RATES, (0.0, 0.0, 45.0), thrust=0.4), 6.0)
-    usual = vehicle.parameters["WP_SPEED"] or vehicle.parameters["CRUISE_SPEED"]
+    limit = vehicle.parameters["WP_SPEED"] or vehicle.parameters["CRUISE_SPEED"]
     assert math.degrees(vehicle.motion.yaw) == pytest.approx(45.0, abs=3.0)
-    assert vehicle.motion.speed_m_s == pytest.approx(0.4 * usual, rel=0.1)
+    assert vehicle.motion.speed_m_s == pytest.approx(0.4 * limit, rel=0.1)
     before = vehicle.motion.yaw
     keep(client, attitude(RATES & ~Attitude.BODY_YAW_RATE_IGNORE, rate=0.2, thrust=0.4), 3.0)
     assert vehicle.motion.yaw - before == pytest.approx(0.6, abs=0.2)
@@ -138,7 +138,7 @@ def sub() -> tuple[Any, Client]:
     return guided("sub", SubMode.GUIDED)
 
 
-def test_a_submarine_goes_to_a_depth_and_a_place() -> None:
+def test_sub_position_target_sets_place_and_depth() -> None:
     vehicle, client = sub()
     client.send(local(MavFrame.LOCAL_NED, VEL | ACC | YAW | RATE, (3.0, 0.0, 4.0)))
     client.run(20.0)
@@ -146,7 +146,7 @@ def test_a_submarine_goes_to_a_depth_and_a_place() -> None:
     assert place == pytest.approx((3.0, 0.0, 4.0), abs=0.5)
 
 
-def test_a_submarine_s_yaw_is_relative_in_one_frame_only() -> None:
+def test_sub_yaw_is_relative_in_one_frame_only() -> None:
     vehicle, client = sub()
     vehicle.motion.yaw = 1.0
     keep(client, local(MavFrame.BODY_NED, POS | ACC | RATE, velocity=(0.3, 0.0, 0.2), yaw=0.5), 4.0)
@@ -156,7 +156,7 @@ def test_a_submarine_s_yaw_is_relative_in_one_frame_only() -> None:
     assert vehicle.motion.yaw == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_submarine_ignores_accelerations_without_a_word() -> None:
+def test_sub_acceleration_target_is_ignored_silently() -> None:
     vehicle, client = sub()
     client.send(local(MavFrame.LOCAL_NED, VEL | YAW | RATE, (3.0, 0.0, 4.0)))
     client.run(5.0)
@@ -164,7 +164,7 @@ def test_a_submarine_ignores_accelerations_without_a_word() -> None:
     assert abs(vehicle.motion.north) < 0.2
 
 
-def test_a_submarine_s_thrust_is_a_climb_for_one_second() -> None:
+def test_sub_thrust_is_climb_rate_for_one_second() -> None:
     vehicle, client = sub()
     keep(client, attitude(RATES, (0.0, 0.0, 90.0), thrust=0.0), 4.0)
     assert vehicle.motion.velocity_down > 0.3
@@ -180,7 +180,7 @@ def plane() -> tuple[Any, Client]:
     return guided("plane", PlaneMode.GUIDED)
 
 
-def test_an_aeroplane_takes_heights_and_nothing_else() -> None:
+def test_plane_position_target_changes_altitude_only() -> None:
     vehicle, client = plane()
     start = vehicle.altitude_m
     client.send(local(MavFrame.LOCAL_OFFSET_NED, 0, (500.0, 500.0, -20.0)))
@@ -201,7 +201,7 @@ def test_an_aeroplane_takes_heights_and_nothing_else() -> None:
     assert "Unknown mavlink coordinate frame 99" in client.texts
 
 
-def test_an_aeroplane_leans_for_three_seconds() -> None:
+def test_plane_attitude_target_expires_after_three_seconds() -> None:
     vehicle, client = plane()
     vehicle.guided.change_course(0.0)
     keep(client, attitude(RATES, (25.0, 5.0, 0.0), thrust=0.6), 3.0)
@@ -213,7 +213,7 @@ def test_an_aeroplane_leans_for_three_seconds() -> None:
     assert abs(math.degrees(vehicle.motion.roll)) < 5.0
 
 
-def test_an_aeroplane_changes_course_speed_and_height() -> None:
+def test_plane_guided_commands_change_course_speed_altitude() -> None:
     vehicle, client = plane()
     assert client.command(MavCmd.GUIDED_CHANGE_HEADING, 0, 90, 2) == ACCEPTED
     assert client.command(MavCmd.GUIDED_CHANGE_SPEED, 0, 15, 0) == ACCEPTED
@@ -243,6 +243,6 @@ def test_an_aeroplane_changes_course_speed_and_height() -> None:
         (MavCmd.DO_CHANGE_ALTITUDE, (80, 99), DENIED),
     ],
 )
-def test_an_aeroplane_refuses_nonsense(command: int, params: tuple[float, ...], result: int) -> None:
+def test_plane_invalid_guided_commands_are_refused(command: int, params: tuple[float, ...], result: int) -> None:
     _, client = plane()
     assert client.command(command, *params) == result

@@ -1,4 +1,4 @@
-"""MANUAL_CONTROL and RC_CHANNELS_OVERRIDE on every kind of ArduPilot: what the axes mean, and what they move."""
+"""MANUAL_CONTROL and RC_CHANNELS_OVERRIDE on every kind of ArduPilot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def armed(kind: str, mode: int) -> tuple[Any, Client]:
 
 
 def fly(client: Client, seconds: float, x: int = 0, y: int = 0, z: int = 500, r: int = 0) -> None:
-    """As a ground station does it: again and again."""
+    """Repeat MANUAL_CONTROL every 0.2 s, as a ground station does."""
     for _ in range(round(seconds / 0.2)):
         client.send(m.ManualControl(client.vehicle.system_id, x, y, z, r, 0))
         client.run(0.2)
@@ -39,8 +39,8 @@ def fly(client: Client, seconds: float, x: int = 0, y: int = 0, z: int = 500, r:
 def pulses(client: Client) -> list[int]:
     client.command(MavCmd.REQUEST_MESSAGE, m.RcChannels.ID)
     client.run(0.05)
-    told = client.last(m.RcChannels)
-    return [getattr(told, f"chan{index}_raw") for index in range(1, 7)]
+    channels = client.last(m.RcChannels)
+    return [getattr(channels, f"chan{index}_raw") for index in range(1, 7)]
 
 
 @pytest.mark.parametrize(
@@ -53,13 +53,13 @@ def pulses(client: Client) -> list[int]:
         ("sub", (0, 300, 200, 400), [1500, 1500, 1380, 1580, 1500, 1560]),
     ],
 )
-def test_axes_become_pulses(kind: str, axes: tuple[int, ...], expected: list[int]) -> None:
+def test_manual_control_axes_become_pulses(kind: str, axes: tuple[int, ...], expected: list[int]) -> None:
     _, client = started(kind)
     fly(client, 0.4, *axes)
     assert pulses(client)[: len(expected)] == expected
 
 
-def test_an_axis_without_a_value_is_given_back() -> None:
+def test_axis_without_value_releases_channel() -> None:
     _, client = started("rover")
     fly(client, 0.4, y=500, z=500)
     fly(client, 0.4, y=NONE, z=500)
@@ -67,7 +67,7 @@ def test_an_axis_without_a_value_is_given_back() -> None:
 
 
 @pytest.mark.parametrize(("kind", "pulse"), [("rover", 1750), ("sub", 1620)])
-def test_a_joystick_that_goes_silent_lets_go_after_three_seconds(kind: str, pulse: int) -> None:
+def test_silent_joystick_releases_channels_after_three_seconds(kind: str, pulse: int) -> None:
     _, client = started(kind)
     fly(client, 0.4, z=500 if kind == "rover" else 800)
     client.run(2.5)
@@ -76,7 +76,7 @@ def test_a_joystick_that_goes_silent_lets_go_after_three_seconds(kind: str, puls
     assert pulses(client)[2] == 1500
 
 
-def test_only_its_own_ground_station_steers_it() -> None:
+def test_manual_control_of_other_ground_station_is_ignored() -> None:
     vehicle, _ = started("rover")
     stranger = Client(vehicle, system_id=77)
     stranger.now = vehicle.now
@@ -88,13 +88,13 @@ def test_only_its_own_ground_station_steers_it() -> None:
     assert vehicle.rc[2] == 1500
 
 
-def test_a_copter_takes_no_negative_thrust() -> None:
+def test_copter_negative_thrust_is_ignored() -> None:
     vehicle, client = started("copter")
     fly(client, 0.4, z=-5)
     assert vehicle.rc[2] == 1000
 
 
-def test_a_copter_climbs_leans_and_turns_by_the_stick() -> None:
+def test_copter_follows_joystick() -> None:
     copter, client = armed("copter", CopterMode.ALT_HOLD)
     fly(client, 6.0, z=800)
     assert copter.altitude_m > 2.0
@@ -113,7 +113,7 @@ def test_a_copter_climbs_leans_and_turns_by_the_stick() -> None:
     assert copter.altitude_m == pytest.approx(height, abs=0.5)
 
 
-def test_a_rover_drives_and_steers_by_the_stick() -> None:
+def test_rover_follows_joystick() -> None:
     rover, client = armed("rover", RoverMode.MANUAL)
     fly(client, 4.0, z=500)
     assert rover.motion.velocity_north > 2.0
@@ -123,7 +123,7 @@ def test_a_rover_drives_and_steers_by_the_stick() -> None:
     assert rover.motion.speed_m_s < -1.0
 
 
-def test_a_submarine_dives_and_moves_by_the_stick() -> None:
+def test_sub_follows_joystick() -> None:
     sub, client = armed("sub", SubMode.ALT_HOLD)
     fly(client, 6.0, z=0)
     depth = sub.motion.down
@@ -138,7 +138,7 @@ def test_a_submarine_dives_and_moves_by_the_stick() -> None:
     assert sub.motion.down == pytest.approx(still, abs=0.1)
 
 
-def test_an_aeroplane_banks_and_climbs_by_the_stick() -> None:
+def test_plane_follows_joystick() -> None:
     plane, client = armed("plane", PlaneMode.TAKEOFF)
     client.run_until(lambda: plane.altitude_m > 40.0)
     assert set_mode(client, PlaneMode.FLY_BY_WIRE_A) == 0
@@ -154,7 +154,7 @@ def test_an_aeroplane_banks_and_climbs_by_the_stick() -> None:
     assert plane.altitude_m < height - 2.0
 
 
-def test_an_override_does_the_same() -> None:
+def test_rc_override_moves_vehicle_like_joystick() -> None:
     rover, client = armed("rover", RoverMode.MANUAL)
     client.send(m.RequestDataStream(1, 1, MavDataStream.RC_CHANNELS, 5, 1))
     for _ in range(20):
@@ -165,7 +165,7 @@ def test_an_override_does_the_same() -> None:
 
 
 @pytest.mark.parametrize("kind", ["copter", "plane", "rover", "sub"])
-def test_an_axis_beyond_its_range_ends_nothing(kind: str) -> None:
+def test_axis_beyond_range_is_not_rejected(kind: str) -> None:
     vehicle, client = started(kind)
     for axis in (-32768, 32766):
         client.send(m.ManualControl(vehicle.system_id, axis, axis, abs(axis) // 2, axis, 0))

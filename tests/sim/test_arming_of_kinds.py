@@ -1,4 +1,4 @@
-"""What Plane, Rover and Sub check before arming; the copter's checks have tests of their own."""
+"""Arming checks of Plane, Rover and Sub; see test_copter_arming for those of Copter."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 KINDS = [SimulatedPlane, SimulatedRover, SimulatedSub]
 
 
-def why_not(client: Client) -> list[str]:
-    """What it says when somebody tries to arm it; empty when that works."""
+def arming_refusals(client: Client) -> list[str]:
+    """Try to arm and return the reasons of the refusal."""
     client.forget()
     result = client.command(ARM, 1)
     assert (result == MavResult.ACCEPTED) != any(text.startswith("Arm: ") for text in client.texts)
     return [text.removeprefix("Arm: ") for text in client.texts if text.startswith("Arm: ")]
 
 
-# -------------------------------------------------------------------------------- every kind of them
+# -------------------------------------------------------------------------------- every kind
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -39,54 +39,56 @@ def why_not(client: Client) -> list[str]:
         ({"FENCE_ENABLE": 1.0, "FENCE_TYPE": 2.0, "FENCE_RADIUS": -1.0}, "Invalid Circle FENCE_RADIUS value"),
     ],
 )
-def test_battery_and_fence(kind: type[ArduPilotVehicle], parameters: dict[str, float], reason: str) -> None:
+def test_battery_and_fence_failures_prevent_arming(
+    kind: type[ArduPilotVehicle], parameters: dict[str, float], reason: str
+) -> None:
     client = ready(kind(boot_time_s=0.0, parameters={"BATT_CAPACITY": 3300.0, **parameters}))
-    assert why_not(client) == [reason]
+    assert arming_refusals(client) == [reason]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_check_can_be_left_out(kind: type[ArduPilotVehicle]) -> None:
+def test_arming_check_can_be_disabled(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0, parameters={"BATT_ARM_VOLT": 13.0, "ARMING_CHECK": 64.0})
-    assert why_not(ready(vehicle)) == []
+    assert arming_refusals(ready(vehicle)) == []
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_without_any_check_it_warns(kind: type[ArduPilotVehicle]) -> None:
+def test_arming_without_checks_warns(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0, parameters={"BATT_ARM_VOLT": 13.0, "ARMING_CHECK": 0.0})
     client = ready(vehicle)
-    assert why_not(client) == []
+    assert arming_refusals(client) == []
     client.run(0.1)
     assert client.texts == ["Warning: Arming Checks Disabled", vehicle.arming.ARMED_TEXT]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_sticks_must_rest(kind: type[ArduPilotVehicle]) -> None:
+def test_moved_sticks_prevent_arming(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0)
     client = ready(vehicle)
     vehicle.rc[0], vehicle.rc[3] = 1600, 1400
-    assert why_not(client) == ["Roll (RC1) is not neutral", "Yaw (RC4) is not neutral"]
+    assert arming_refusals(client) == ["Roll (RC1) is not neutral", "Yaw (RC4) is not neutral"]
     vehicle.rc[0] = vehicle.rc[3] = 1525
-    assert why_not(client) == [], "within the dead zone"
+    assert arming_refusals(client) == [], "within the dead zone"
 
 
 @pytest.mark.parametrize("kind", [SimulatedPlane, SimulatedRover])
-def test_the_throttle_must_rest(kind: type[ArduPilotVehicle]) -> None:
+def test_raised_throttle_prevents_arming_if_checked(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0)
     client = ready(vehicle)
     vehicle.rc[2] = 1700
-    assert why_not(client) == ["Throttle (RC3) is not neutral"]
+    assert arming_refusals(client) == ["Throttle (RC3) is not neutral"]
     vehicle.parameters["RC_OPTIONS"] = 0.0
-    assert why_not(client) == []
+    assert arming_refusals(client) == []
 
 
-def test_the_throttle_of_a_submarine_may_be_anywhere() -> None:
+def test_sub_arming_ignores_throttle_stick() -> None:
     sub, client = ready_sub()
     sub.rc[2] = 1700
-    assert why_not(client) == []
+    assert arming_refusals(client) == []
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_force_passes_over_everything(kind: type[ArduPilotVehicle]) -> None:
+def test_forced_arming_skips_checks(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0, parameters={"BATT_ARM_VOLT": 13.0})
     vehicle.faults.prearm_failures = ["Compass not healthy"]
     client = ready(vehicle)
@@ -94,7 +96,7 @@ def test_force_passes_over_everything(kind: type[ArduPilotVehicle]) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_begins_to_fail_is_told_at_once_and_then_every_half_minute(kind: type[ArduPilotVehicle]) -> None:
+def test_new_prearm_failure_is_reported_immediately_then_periodically(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0)
     client = ready(vehicle)
     client.run(5.0)
@@ -109,7 +111,7 @@ def test_what_begins_to_fail_is_told_at_once_and_then_every_half_minute(kind: ty
 
 
 @pytest.mark.parametrize("kind", [SimulatedPlane, SimulatedRover])
-def test_it_may_need_no_arming(kind: type[ArduPilotVehicle]) -> None:
+def test_arming_require_zero_is_always_armed(kind: type[ArduPilotVehicle]) -> None:
     vehicle = kind(boot_time_s=0.0)
     client = ready(vehicle)
     vehicle.parameters["ARMING_REQUIRE"] = 0.0
@@ -125,12 +127,12 @@ def test_it_may_need_no_arming(kind: type[ArduPilotVehicle]) -> None:
 # ------------------------------------------------------------------------------------------- plane
 
 
-def test_modes_in_which_a_plane_can_be_armed() -> None:
+def test_plane_arming_depends_on_mode() -> None:
     _, client = ready_plane()
     not_armable = {}
     for mode in (0, 1, 2, 5, 6, 7, 11, 12, 13, 15):
         assert set_mode(client, mode) == MavResult.ACCEPTED
-        not_armable[mode] = why_not(client)
+        not_armable[mode] = arming_refusals(client)
         client.command(ARM, 0, 21196.0)
     assert {mode: text for mode, text in not_armable.items() if text} == {11: ["RTL mode not armable"]}
 
@@ -145,20 +147,20 @@ def test_modes_in_which_a_plane_can_be_armed() -> None:
         ("AIRSPEED_MIN", 4.0, "AIRSPEED_MIN too low (4 < 5)"),
     ],
 )
-def test_limits_of_a_plane(name: str, value: float, reason: str) -> None:
+def test_plane_invalid_limits_prevent_arming(name: str, value: float, reason: str) -> None:
     _, client = ready_plane(**{name: value})
-    assert why_not(client) == [reason]
+    assert arming_refusals(client) == [reason]
 
 
-def test_a_plane_needs_gps_in_every_mode() -> None:
+def test_plane_arming_needs_gps_in_every_mode() -> None:
     plane, client = ready_plane()
     plane.faults.gps_lost = True
     client.run(1.0)
     assert set_mode(client, PlaneMode.MANUAL) == MavResult.ACCEPTED
-    assert why_not(client) == ["GPS 1: Bad fix"]
+    assert arming_refusals(client) == ["GPS 1: Bad fix"]
 
 
-def test_a_plane_in_the_air_is_not_disarmed() -> None:
+def test_plane_in_air_refuses_disarming() -> None:
     plane, client = flying_plane()
     assert client.command(ARM, 0) == MavResult.FAILED
     assert client.command(ARM, 0, 21196.0) == MavResult.ACCEPTED
@@ -168,36 +170,36 @@ def test_a_plane_in_the_air_is_not_disarmed() -> None:
 # ------------------------------------------------------------------------------------------- rover
 
 
-def test_a_rover_needs_gps_only_where_it_drives_by_it() -> None:
+def test_rover_arming_needs_gps_in_some_modes() -> None:
     rover, client = ready_rover()
     rover.faults.gps_lost = True
     client.run(1.0)
     assert set_mode(client, RoverMode.GUIDED) == MavResult.ACCEPTED
-    assert why_not(client) == ["GPS 1: Bad fix"]
+    assert arming_refusals(client) == ["GPS 1: Bad fix"]
     assert set_mode(client, RoverMode.MANUAL) == MavResult.ACCEPTED
     rover.parameters["ARMING_NEED_LOC"] = 1.0
-    assert why_not(client) == ["GPS 1: Bad fix"]
+    assert arming_refusals(client) == ["GPS 1: Bad fix"]
     rover.parameters["ARMING_NEED_LOC"] = 0.0
-    assert why_not(client) == []
+    assert arming_refusals(client) == []
 
 
-def test_modes_in_which_a_rover_can_be_armed() -> None:
+def test_rover_arming_depends_on_mode() -> None:
     _, client = ready_rover()
     not_armable = {}
     for mode in (0, 1, 3, 4, 5, 7, 9, 11, 12, 15):
         assert set_mode(client, mode) == MavResult.ACCEPTED
-        not_armable[mode] = why_not(client)
+        not_armable[mode] = arming_refusals(client)
         client.command(ARM, 0)
     refused = {mode for mode, text in not_armable.items() if text == ["Mode not armable"]}
     assert refused == {RoverMode.RTL, RoverMode.SMART_RTL}
 
 
-def test_a_rover_without_speed() -> None:
+def test_rover_without_waypoint_speed_refuses_arming() -> None:
     _, client = ready_rover(WP_SPEED=0.0)
-    assert why_not(client) == ["WP_SPEED too low"]
+    assert arming_refusals(client) == ["WP_SPEED too low"]
 
 
-def test_a_rover_is_disarmed_at_any_time_and_there_is_home() -> None:
+def test_rover_disarms_at_any_time_and_sets_home() -> None:
     rover, client = driving_rover()
     client.run(5.0)
     assert client.command(ARM, 0) == MavResult.ACCEPTED
@@ -208,31 +210,33 @@ def test_a_rover_is_disarmed_at_any_time_and_there_is_home() -> None:
 # --------------------------------------------------------------------------------------------- sub
 
 
-def test_a_submarine_needs_a_button_that_disarms_it() -> None:
+def test_sub_arming_needs_disarm_button() -> None:
     sub, client = ready_sub(BTN4_FUNCTION=0.0)
-    assert why_not(client) == ["Must assign a disarm or arm_toggle button or "], "50 characters are a text"
+    assert arming_refusals(client) == ["Must assign a disarm or arm_toggle button or "], (
+        "texts are cut at 50 characters"
+    )
     sub.parameters["BTN3_FUNCTION"] = 2.0
-    assert why_not(client) == []
+    assert arming_refusals(client) == []
 
 
-def test_such_a_button_may_need_the_shift_button() -> None:
+def test_sub_disarm_button_can_need_shift_button() -> None:
     sub, client = ready_sub(BTN4_FUNCTION=0.0, BTN5_FUNCTION=0.0, BTN3_SFUNCTION=4.0)
-    assert why_not(client)
+    assert arming_refusals(client)
     sub.parameters["BTN5_FUNCTION"] = 1.0
-    assert why_not(client) == []
+    assert arming_refusals(client) == []
 
 
-def test_a_submarine_needs_no_gps_unless_it_is_told_to() -> None:
+def test_sub_arming_needs_gps_only_if_checked() -> None:
     sub, client = ready_sub()
     sub.faults.gps_lost = True
     client.run(1.0)
     arm(client, SubMode.MANUAL)
     client.command(ARM, 0)
     sub.parameters["ARMING_CHECK"] = 1.0
-    assert why_not(client) == ["GPS 1: Bad fix"]
+    assert arming_refusals(client) == ["GPS 1: Bad fix"]
 
 
-def test_prearm_checks_are_run_on_demand() -> None:
+def test_run_prearm_checks_reports_failures() -> None:
     _, client = ready_sub(BATT_ARM_VOLT=13.0)
     assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.ACCEPTED
     client.run(0.1)

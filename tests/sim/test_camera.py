@@ -1,4 +1,4 @@
-"""The camera of a simulated ArduPilot: what it says, single pictures, series, by distance, in missions."""
+"""The camera of a simulated ArduPilot: messages, single images, series, trigger distance, missions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def fitted() -> tuple[SimulatedCopter, Client]:
     return ready_copter(parameters=FITTED)
 
 
-def test_it_is_asked_what_it_is() -> None:
+def test_camera_messages_are_sent_on_request() -> None:
     _, client = fitted()
     for message in (m.CameraInformation, m.CameraSettings, m.CameraCaptureStatus, m.CameraFeedback):
         assert client.command(MavCmd.REQUEST_MESSAGE, message.ID) == MavResult.ACCEPTED
@@ -29,7 +29,7 @@ def test_it_is_asked_what_it_is() -> None:
     assert client.command(MavCmd.REQUEST_MESSAGE, m.CameraImageCaptured.ID) == MavResult.FAILED
 
 
-def test_without_one_nothing_is_told_and_nothing_taken() -> None:
+def test_without_camera_commands_fail_and_nothing_is_streamed() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.CameraInformation.ID) == MavResult.ACCEPTED
     assert client.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1) == MavResult.FAILED
@@ -42,7 +42,7 @@ def test_without_one_nothing_is_told_and_nothing_taken() -> None:
     assert not client.all(m.CameraFeedback)
 
 
-def test_a_picture_is_told_with_where_it_was_taken() -> None:
+def test_feedback_has_position_of_the_image() -> None:
     copter, client = flying_copter(parameters=FITTED)
     assert client.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1) == MavResult.ACCEPTED
     picture = client.last(m.CameraFeedback)
@@ -51,13 +51,13 @@ def test_a_picture_is_told_with_where_it_was_taken() -> None:
     assert (picture.lat, picture.lng) == pytest.approx((place.latitude_e7, place.longitude_e7), abs=20)
     assert picture.alt_rel == pytest.approx(10.0, abs=0.5)
     assert 0.0 <= picture.yaw < 360.0
-    assert client.command(MavCmd.IMAGE_START_CAPTURE, 1, 0, 1) == MavResult.FAILED  # the shutter is open
+    assert client.command(MavCmd.IMAGE_START_CAPTURE, 1, 0, 1) == MavResult.FAILED  # The shutter is still open.
     client.run(0.2)
     assert client.command(MavCmd.DO_DIGICAM_CONTROL, 0, 0, 0, 0, 1) == MavResult.ACCEPTED
     assert client.last(m.CameraFeedback).img_idx == 2
 
 
-def test_a_series_ends_by_itself() -> None:
+def test_series_ends_after_its_count() -> None:
     _, client = fitted()
     assert client.command(MavCmd.IMAGE_START_CAPTURE, 0, 1, 3) == MavResult.ACCEPTED
     client.run(1.5)
@@ -69,7 +69,7 @@ def test_a_series_ends_by_itself() -> None:
     assert [picture.img_idx for picture in client.all(m.CameraFeedback)] == [1, 2, 3]
 
 
-def test_an_endless_series_is_stopped() -> None:
+def test_unlimited_series_stops_on_command() -> None:
     copter, client = fitted()
     assert client.command(MavCmd.IMAGE_START_CAPTURE, 0, 0.5, 0) == MavResult.ACCEPTED
     client.run(2.2)
@@ -81,12 +81,12 @@ def test_an_endless_series_is_stopped() -> None:
 
 
 @pytest.mark.parametrize(("camera", "result"), [(-1, MavResult.UNSUPPORTED), (2, MavResult.FAILED)])
-def test_there_is_one_camera(camera: int, result: int) -> None:
+def test_only_camera_number_one_is_supported(camera: int, result: int) -> None:
     _, client = fitted()
     assert client.command(MavCmd.IMAGE_START_CAPTURE, camera, 0, 1) == result
 
 
-def test_by_distance() -> None:
+def test_trigger_distance_takes_images() -> None:
     copter, client = flying_copter(parameters=FITTED)
     assert client.command(MavCmd.DO_SET_CAM_TRIGG_DIST, 5, 0, 1) == MavResult.ACCEPTED
     assert copter.camera.image_count == 1
@@ -98,7 +98,7 @@ def test_by_distance() -> None:
     assert client.command(MavCmd.DO_SET_CAM_TRIGG_DIST, 0) == MavResult.ACCEPTED
 
 
-def test_commands_of_a_mission() -> None:
+def test_mission_commands_take_images() -> None:
     copter, client = fitted()
     for item in (
         MissionItem(MavCmd.DO_DIGICAM_CONTROL, 2, x=1),
@@ -112,7 +112,7 @@ def test_commands_of_a_mission() -> None:
     assert copter.camera.trigger_distance_m == 20.0
 
 
-def test_old_mistakes() -> None:
+def test_regressions_of_camera_commands() -> None:
     copter, client = ready_copter()
     assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.ParamValue.ID, 1_000_000) == MavResult.ACCEPTED
     copter.booted_at -= 5000.0

@@ -1,4 +1,4 @@
-"""A camera of its own beside a vehicle: what it says, takes, keeps and refuses."""
+"""A simulated camera component: messages, captures, storage and refusals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def fitted(**options: object) -> tuple[SimulatedCamera, ComponentClient]:
     return camera, client
 
 
-def test_it_has_a_heartbeat_of_its_own() -> None:
+def test_camera_sends_its_own_heartbeat() -> None:
     _, client = fitted()
     client.run(3.0)
     heartbeats = client.said_by(CAMERA, m.Heartbeat)
@@ -39,7 +39,7 @@ def test_it_has_a_heartbeat_of_its_own() -> None:
     assert len(client.said_by(1, m.Heartbeat)) == 3
 
 
-def test_it_tells_what_it_is() -> None:
+def test_camera_information_is_sent_on_request() -> None:
     camera, client = fitted(model="Eye", resolution=(640, 480), streams=["rtsp://127.0.0.1/a"])
     (information,) = client.request(CAMERA, m.CameraInformation)
     assert information.model_name.rstrip(b"\0") == b"Eye"
@@ -54,7 +54,7 @@ def test_it_tells_what_it_is() -> None:
     assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.Attitude.ID) == DENIED
 
 
-def test_a_program_of_old_asks_differently() -> None:
+def test_legacy_request_commands_are_answered() -> None:
     _, client = fitted(streams=["rtsp://127.0.0.1/a"])
     for command, kind in (
         (MavCmd.REQUEST_CAMERA_INFORMATION, m.CameraInformation),
@@ -67,7 +67,7 @@ def test_a_program_of_old_asks_differently() -> None:
         assert client.all(kind), kind
 
 
-def test_a_picture_is_there_a_moment_later() -> None:
+def test_image_is_available_after_shutter_time() -> None:
     camera, client = fitted()
     copter = client.vehicle
     assert isinstance(copter, SimulatedCopter)
@@ -85,7 +85,7 @@ def test_a_picture_is_there_a_moment_later() -> None:
     assert source(image) == (1, CAMERA)
 
 
-def test_the_same_order_again_takes_no_second_picture() -> None:
+def test_repeated_sequence_number_takes_no_second_image() -> None:
     camera, client = fitted()
     for number, count in ((1, 1), (1, 1), (2, 2)):
         assert client.ask(CAMERA, START, 0, 0, 1, number) == DONE
@@ -93,7 +93,7 @@ def test_the_same_order_again_takes_no_second_picture() -> None:
         assert camera.image_count == count
 
 
-def test_a_series_ends_by_itself() -> None:
+def test_series_ends_after_its_count() -> None:
     camera, client = fitted()
     assert client.ask(CAMERA, START, 0, 1.0, 3) == DONE
     assert client.ask(CAMERA, START, 0, 0, 1) == BUSY
@@ -106,7 +106,7 @@ def test_a_series_ends_by_itself() -> None:
     assert (status.image_status, camera.image_count) == (0, 3)
 
 
-def test_an_endless_series_is_stopped() -> None:
+def test_unlimited_series_stops_on_command() -> None:
     camera, client = fitted()
     client.ask(CAMERA, START, 0, 0.5, 0)
     client.run(2.3)
@@ -115,8 +115,8 @@ def test_an_endless_series_is_stopped() -> None:
     assert camera.image_count == 5
 
 
-def test_pictures_that_were_not_heard_are_asked_for() -> None:
-    """The client counts: the index of each picture is one more than that of the last."""
+def test_lost_image_reports_are_sent_on_request() -> None:
+    """The client counts: each image index is one more than the last."""
     camera, client = fitted()
     client.ask(CAMERA, START, 0, 1.0, 6)
     client.run(0.9)
@@ -137,7 +137,7 @@ def test_pictures_that_were_not_heard_are_asked_for() -> None:
     assert client.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraImageCaptured.ID, 6) == FAILED
 
 
-def test_a_full_card_takes_no_more() -> None:
+def test_full_card_refuses_images() -> None:
     camera, client = fitted(capacity_mib=12.0)
     client.ask(CAMERA, START, 0, 0.5, 0)
     client.run(4.0)
@@ -150,7 +150,7 @@ def test_a_full_card_takes_no_more() -> None:
     assert (card.status, card.available_capacity) == (0, 0.0)
 
 
-def test_formatting_takes_its_time() -> None:
+def test_formatting_reports_progress() -> None:
     camera, client = fitted()
     client.ask(CAMERA, START, 0, 0, 1)
     client.run(1.0)
@@ -165,7 +165,7 @@ def test_formatting_takes_its_time() -> None:
     assert (camera.card.used_mib, camera.image_count) == (0.0, 0)
 
 
-def test_a_video_is_taken_in_its_mode() -> None:
+def test_video_needs_video_mode() -> None:
     camera, client = fitted()
     assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE) == DENIED
     assert client.ask(CAMERA, MavCmd.SET_CAMERA_MODE, 0, CameraMode.VIDEO) == DONE
@@ -184,7 +184,7 @@ def test_a_video_is_taken_in_its_mode() -> None:
     assert camera.card.used_mib == pytest.approx(35.0)
 
 
-def test_zoom_and_focus_are_told() -> None:
+def test_zoom_and_focus_are_reported() -> None:
     _, client = fitted()
     assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 2, 40.0) == DONE
     assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 0, 1.0) == DONE
@@ -196,7 +196,7 @@ def test_zoom_and_focus_are_told() -> None:
     assert client.last(m.CameraSettings).zoomLevel == 0.0
 
 
-def test_one_without_a_lens_or_a_video_says_so() -> None:
+def test_missing_capabilities_are_unsupported() -> None:
     _, client = fitted(capabilities=CameraCapFlags.CAPTURE_IMAGE)
     assert client.ask(CAMERA, MavCmd.SET_CAMERA_ZOOM, 2, 40.0) == UNSUPPORTED
     assert client.ask(CAMERA, MavCmd.VIDEO_START_CAPTURE) == UNSUPPORTED
@@ -216,7 +216,7 @@ def test_video_streams_are_listed_and_switched() -> None:
     assert client.ask(CAMERA, MavCmd.VIDEO_START_STREAMING, 3) == DENIED
 
 
-def test_its_messages_have_rates_of_their_own() -> None:
+def test_message_intervals_apply_to_the_component() -> None:
     _, client = fitted()
     interval = MavCmd.SET_MESSAGE_INTERVAL
     assert client.ask(CAMERA, interval, m.CameraCaptureStatus.ID, 500_000) == DONE
@@ -234,8 +234,8 @@ def test_its_messages_have_rates_of_their_own() -> None:
 # ----------------------------------------------------------------------------------- several of them
 
 
-def test_commands_reach_whom_they_are_for() -> None:
-    """One camera, both cameras, everybody; nobody answers for a component that is not there."""
+def test_commands_are_handled_by_their_target() -> None:
+    """This camera, both cameras, all components; an absent component does not answer."""
     one, two = SimulatedCamera(100), SimulatedCamera(101)
     _, client = copter_with(one, two, ExtraComponent(102))
     assert client.ask(101, START, 0, 0, 1) == DONE
@@ -250,14 +250,14 @@ def test_commands_reach_whom_they_are_for() -> None:
     assert {source(ack) for ack in client.all(m.CommandAck)} == {(1, 1), (1, 100), (1, 101)}
 
 
-def test_a_broadcast_that_it_does_not_know_is_left_to_the_autopilot() -> None:
+def test_unknown_broadcast_command_is_ignored() -> None:
     _, client = fitted()
     assert client.ask(0, MavCmd.RUN_PREARM_CHECKS) == DONE
     assert client.ask(CAMERA, MavCmd.RUN_PREARM_CHECKS) == UNSUPPORTED
     assert client.ask(1, MavCmd.STORAGE_FORMAT, 1) == UNSUPPORTED
 
 
-def test_a_camera_that_is_a_system_of_its_own() -> None:
+def test_camera_with_its_own_system_id() -> None:
     camera = SimulatedCamera(100, system_id=42)
     _, client = copter_with(camera)
     client.run(2.0)
@@ -266,7 +266,7 @@ def test_a_camera_that_is_a_system_of_its_own() -> None:
     assert client.ask(100, START, 0, 0, 1, system=42) == DONE
 
 
-def test_faults_are_its_own() -> None:
+def test_faults_apply_to_the_component_only() -> None:
     camera, client = fitted()
     camera.faults.refuse(START, MavResult.TEMPORARILY_REJECTED, "card is slow", times=1)
     assert client.ask(CAMERA, START, 0, 0, 1) == BUSY
@@ -284,7 +284,7 @@ def test_faults_are_its_own() -> None:
     assert client.ask(CAMERA, START, 0, 0, 1) == DONE
 
 
-def test_a_reboot_of_the_vehicle_ends_a_series_and_keeps_the_pictures() -> None:
+def test_reboot_ends_series_and_keeps_images() -> None:
     camera, client = fitted()
     client.ask(CAMERA, START, 0, 0.5, 0)
     client.run(1.3)
@@ -300,7 +300,7 @@ def test_a_reboot_of_the_vehicle_ends_a_series_and_keeps_the_pictures() -> None:
 
 
 @pytest.mark.parametrize("make", [SimulatedPx4, SimulatedCopter])
-def test_it_fits_on_any_vehicle(make: type[SimulatedVehicle]) -> None:
+def test_camera_works_on_every_vehicle(make: type[SimulatedVehicle]) -> None:
     camera = SimulatedCamera()
     vehicle = make(components=[camera])  # type: ignore[call-arg]
     client = settled(vehicle)
@@ -309,7 +309,7 @@ def test_it_fits_on_any_vehicle(make: type[SimulatedVehicle]) -> None:
     assert client.last(m.CameraImageCaptured).lat == pytest.approx(vehicle.frame.origin.latitude_e7, abs=50)  # type: ignore[attr-defined]
 
 
-def test_it_belongs_to_one_vehicle() -> None:
+def test_second_vehicle_is_refused() -> None:
     camera = SimulatedCamera()
     with pytest.raises(InvalidArgument):
         _ = camera.system_id
@@ -318,7 +318,7 @@ def test_it_belongs_to_one_vehicle() -> None:
         SimulatedCopter(components=[camera])
 
 
-def test_a_stream_that_is_ordered_again_comes_no_faster() -> None:
+def test_repeated_stream_request_keeps_its_rate() -> None:
     _, client = fitted()
     for interval_us in (1e6, -1, 1e6, 2e6, 1e6):
         client.ask(CAMERA, MavCmd.SET_MESSAGE_INTERVAL, m.CameraCaptureStatus.ID, interval_us)
@@ -327,7 +327,7 @@ def test_a_stream_that_is_ordered_again_comes_no_faster() -> None:
     assert len(client.all(m.CameraCaptureStatus)) == 10
 
 
-def test_zoom_goes_on_until_it_is_stopped_or_at_its_end() -> None:
+def test_continuous_zoom_stops_on_command_or_at_limit() -> None:
     camera, client = fitted()
     zoom = MavCmd.SET_CAMERA_ZOOM
     assert client.ask(CAMERA, zoom, 1, 1.0) == DONE
@@ -349,7 +349,7 @@ def test_zoom_goes_on_until_it_is_stopped_or_at_its_end() -> None:
     assert camera.focus == 75.0
 
 
-def test_what_is_tracked_is_told() -> None:
+def test_tracking_status_is_reported() -> None:
     _, without = fitted()
     for command in (MavCmd.CAMERA_TRACK_POINT, MavCmd.CAMERA_TRACK_RECTANGLE, MavCmd.CAMERA_STOP_TRACKING):
         assert without.ask(CAMERA, command, 0.1, 0.1, 0.2, 0.2) == UNSUPPORTED
@@ -370,7 +370,7 @@ def test_what_is_tracked_is_told() -> None:
     assert client.request(CAMERA, m.CameraTrackingGeoStatus) == [], "it looks to the horizon"
 
 
-def test_a_thermal_one_tells_its_range() -> None:
+def test_thermal_camera_reports_its_range() -> None:
     _, without = fitted()
     assert without.ask(CAMERA, MavCmd.REQUEST_MESSAGE, m.CameraThermalRange.ID) == FAILED
     assert without.ask(CAMERA, MavCmd.SET_CAMERA_SOURCE, 0, 2) == DENIED
@@ -383,7 +383,7 @@ def test_a_thermal_one_tells_its_range() -> None:
     assert client.ask(CAMERA, MavCmd.SET_CAMERA_SOURCE, 0, 2) == DONE
 
 
-def test_pictures_are_files_until_the_card_is_formatted() -> None:
+def test_image_files_exist_until_formatting() -> None:
     camera, client = fitted(picture=lambda image: b"picture %d" % image.image_index)
     for _ in range(2):
         client.ask(CAMERA, START, 0, 0, 1)
@@ -398,7 +398,7 @@ def test_pictures_are_files_until_the_card_is_formatted() -> None:
     assert camera.files.entries("/DCIM") == []
 
 
-def test_single_messages_are_lost() -> None:
+def test_lost_messages_drop_single_messages() -> None:
     camera, client = fitted()
     camera.faults.lose(m.CameraImageCaptured, times=2)
     client.ask(CAMERA, START, 0, 0.5, 3)

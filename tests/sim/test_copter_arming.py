@@ -10,7 +10,7 @@ ARM = MavCmd.COMPONENT_ARM_DISARM
 FORCE = 21196.0
 
 
-def test_arms_in_guided_and_says_so() -> None:
+def test_arming_in_guided_sends_text() -> None:
     copter, client = ready_copter()
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.ACCEPTED
@@ -22,7 +22,7 @@ def test_arms_in_guided_and_says_so() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED, "twice is no error"
 
 
-def test_the_reason_leaves_after_the_refusal() -> None:
+def test_arming_refusal_text_follows_acknowledgement() -> None:
     copter, client = ready_copter()
     copter.faults.prearm_failures = ["Compass not healthy", "Hardware safety switch"]
     assert client.command(ARM, 1) == MavResult.FAILED
@@ -31,7 +31,7 @@ def test_the_reason_leaves_after_the_refusal() -> None:
     assert kinds[0] is m.CommandAck
 
 
-def test_guided_needs_a_position_and_stabilize_does_not() -> None:
+def test_arming_needs_position_in_guided_only() -> None:
     client = Client(SimulatedCopter())  # its boot takes five seconds
     client.run(4.0)
     set_mode(client, CopterMode.GUIDED)
@@ -42,7 +42,7 @@ def test_guided_needs_a_position_and_stabilize_does_not() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED
 
 
-def test_reasons_change_while_it_boots() -> None:
+def test_arming_reasons_change_during_boot() -> None:
     copter = SimulatedCopter(boot_time_s=41.5)
     client = Client(copter)
     seen = []
@@ -61,7 +61,7 @@ def test_reasons_change_while_it_boots() -> None:
     ]
 
 
-def test_modes_that_come_home_cannot_be_armed() -> None:
+def test_arming_in_returning_modes_is_refused() -> None:
     _, client = ready_copter()
     for mode, name in ((CopterMode.RTL, "RTL"), (CopterMode.LAND, "LAND"), (CopterMode.BRAKE, "BRAKE")):
         set_mode(client, mode)
@@ -73,7 +73,7 @@ def test_modes_that_come_home_cannot_be_armed() -> None:
     assert client.command(ARM, 1, FORCE) == MavResult.ACCEPTED, "force passes over it"
 
 
-def test_raised_throttle_keeps_a_stick_mode_from_arming() -> None:
+def test_raised_throttle_prevents_arming_in_stick_modes() -> None:
     copter, client = ready_copter()
     copter.rc[2] = 1700
     assert client.command(ARM, 1) == MavResult.FAILED
@@ -82,7 +82,7 @@ def test_raised_throttle_keeps_a_stick_mode_from_arming() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED
 
 
-def test_checks_on_request_and_every_half_minute() -> None:
+def test_prearm_failures_are_reported_periodically_and_on_request() -> None:
     copter, client = ready_copter()
     assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.ACCEPTED
     assert client.texts == []
@@ -96,7 +96,7 @@ def test_checks_on_request_and_every_half_minute() -> None:
     assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.TEMPORARILY_REJECTED
 
 
-def test_prearm_bit_follows_the_checks_within_a_second() -> None:
+def test_prearm_health_follows_checks_within_one_second() -> None:
     copter, client = ready_copter()
     bit = MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK
     client.command(MavCmd.SET_MESSAGE_INTERVAL, m.SysStatus.ID, 100_000)
@@ -107,7 +107,7 @@ def test_prearm_bit_follows_the_checks_within_a_second() -> None:
     assert not client.last(m.SysStatus).onboard_control_sensors_health & bit
 
 
-def test_disarming_in_the_air_needs_force_and_ends_on_the_ground() -> None:
+def test_disarming_in_air_needs_force_and_crashes() -> None:
     copter, client = flying_copter(5.0)
     assert client.command(ARM, 0) == MavResult.FAILED
     assert client.texts == []
@@ -120,7 +120,7 @@ def test_disarming_in_the_air_needs_force_and_ends_on_the_ground() -> None:
     assert 7.0 < float(hit.split()[4]) < 10.0
 
 
-def test_an_idle_vehicle_is_disarmed_after_disarm_delay() -> None:
+def test_idle_copter_disarms_after_disarm_delay() -> None:
     copter, client = ready_copter()
     set_mode(client, CopterMode.GUIDED)
     client.command(ARM, 1)
@@ -132,14 +132,14 @@ def test_an_idle_vehicle_is_disarmed_after_disarm_delay() -> None:
     assert copter.is_armed
 
 
-def test_too_early_is_refused_with_a_text() -> None:
+def test_arming_before_initialisation_is_refused() -> None:
     client = Client(SimulatedCopter())
     client.run(0.2)
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts[-1] == "Arm: System not initialised"
 
 
-def test_a_low_battery_is_not_armed() -> None:
+def test_low_battery_prevents_arming() -> None:
     _, client = ready_copter(battery_percent=3.0, parameters={"BATT_ARM_VOLT": 10.5})
     assert client.command(ARM, 1) == MavResult.FAILED
     assert client.texts == ["Arm: Battery 1 below minimum arming voltage"]

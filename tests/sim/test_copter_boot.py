@@ -1,4 +1,4 @@
-"""The boot of the simulated copter beside the recording of a real one, ArduCopter 4.7-dev."""
+"""Boot of the simulated copter, compared with a recording of ArduCopter 4.7-dev."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def first(client: Client, kind: type[Message]) -> float:
     return next(now for now, message in client.heard if isinstance(message, kind))
 
 
-def test_says_what_the_real_one_says_when_it_says_it() -> None:
+def test_boot_texts_match_recording() -> None:
     _, client = booting()
     client.run(45.0)
     texts = iter(client.texts)
@@ -54,14 +54,14 @@ def test_says_what_the_real_one_says_when_it_says_it() -> None:
     assert 41.3 < first(client, m.LocalPositionNed) < 41.8
 
 
-def test_estimator_flags_evolve_as_recorded() -> None:
+def test_estimator_flags_match_recording() -> None:
     _, client = booting()
     client.run(45.0)
     flags = [report.flags for report in client.all(m.EkfStatusReport)]
     assert list(dict.fromkeys(flags)) == REAL_EKF_FLAGS
 
 
-def test_position_is_zero_before_the_fix_and_local_position_absent_before_the_estimate() -> None:
+def test_positions_before_fix_and_estimate_match_recording() -> None:
     copter, client = booting()
     client.run(9.0)
     assert copter.navigation.position is None
@@ -78,7 +78,7 @@ def test_position_is_zero_before_the_fix_and_local_position_absent_before_the_es
     assert client.command(MavCmd.GET_HOME_POSITION) == 4
 
 
-def test_health_bits_follow_the_recording() -> None:
+def test_sensor_health_matches_recording() -> None:
     _, client = booting()
     client.run(45.0)
     health = dict.fromkeys(hex(status.onboard_control_sensors_health) for status in client.all(m.SysStatus))
@@ -93,7 +93,7 @@ def test_health_bits_follow_the_recording() -> None:
     assert hex(status.onboard_control_sensors_health) == "0x5771fc2f"
 
 
-def test_state_leaves_boot_after_it_is_ready() -> None:
+def test_system_state_leaves_boot_after_ready() -> None:
     _, client = booting()
     client.run(4.1)
     beats = [(beat.base_mode, beat.system_status) for beat in client.all(m.Heartbeat)]
@@ -101,7 +101,7 @@ def test_state_leaves_boot_after_it_is_ready() -> None:
     assert beats[-1] == (81, MavState.STANDBY)
 
 
-def test_nothing_but_heartbeats_and_texts_without_being_asked() -> None:
+def test_no_streams_without_request() -> None:
     client = Client(SimulatedCopter(boot_time_s=1.0))
     client.run(12.0)
     kinds = {type(message) for _, message in client.heard}
@@ -109,7 +109,7 @@ def test_nothing_but_heartbeats_and_texts_without_being_asked() -> None:
     assert len(client.all(m.Heartbeat)) == 12
 
 
-def test_boot_time_is_an_option_and_zero_is_ready_at_once() -> None:
+def test_boot_time_zero_is_ready_at_once() -> None:
     copter, client = booting(boot_time_s=2.0)
     took = client.run_until(lambda: copter.navigation.has_position)
     assert took == pytest.approx(2.0, abs=0.1)
@@ -117,7 +117,7 @@ def test_boot_time_is_an_option_and_zero_is_ready_at_once() -> None:
     assert copter.navigation.home == (0.0, 0.0, 0.0)
 
 
-def test_plain_text_comes_before_the_first_frame() -> None:
+def test_boot_text_precedes_first_frame() -> None:
     copter = SimulatedCopter(boot_text=True)
     copter.step(0.0)
     text = copter.take_outbox()
@@ -125,7 +125,7 @@ def test_plain_text_comes_before_the_first_frame() -> None:
     assert 60 < len(text) < 200
 
 
-def test_version_is_packed_as_autopilots_do() -> None:
+def test_version_number_is_packed_as_in_autopilot_version() -> None:
     _, client = ready_copter(version="4.5.7")
     assert client.command(MavCmd.REQUEST_MESSAGE, m.AutopilotVersion.ID) == 0
     version = client.last(m.AutopilotVersion)
@@ -136,7 +136,7 @@ def test_version_is_packed_as_autopilots_do() -> None:
     assert client.last(m.AutopilotVersion).flight_sw_version == 0x04070000
 
 
-def test_home_has_no_attitude() -> None:
+def test_home_position_quaternion_is_nan() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.GET_HOME_POSITION) == 0
     home = client.last(m.HomePosition)
@@ -145,7 +145,7 @@ def test_home_has_no_attitude() -> None:
     assert kinds.index(m.HomePosition) < kinds.index(m.CommandAck), "sent before the answer"
 
 
-def test_a_reboot_is_silence_and_a_new_life() -> None:
+def test_reboot_is_silent_and_resets_vehicle() -> None:
     copter, client = ready_copter()
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     set_mode(client, CopterMode.GUIDED)
@@ -167,7 +167,7 @@ def test_a_reboot_is_silence_and_a_new_life() -> None:
     assert copter.parameters["STAT_BOOTCNT"] == 2
 
 
-def test_losing_gps_is_noticed_at_once_by_the_receiver_and_later_by_the_estimator() -> None:
+def test_gps_loss_affects_receiver_first_and_estimator_later() -> None:
     copter, client = ready_copter()
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     copter.faults.gps_lost = True

@@ -19,13 +19,13 @@ OUT_EAST = (0, 0, 0, 0.0, 0.0, 0.0, 0.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def fly_east(copter: SimulatedCopter, client: Client) -> None:
-    """By velocity until a mode takes over."""
+    """Fly east by velocity until another mode takes over."""
     for _ in range(60):
         client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0xDC7, *OUT_EAST[3:]))
         client.run(0.5)
         if copter.mode.number != CopterMode.GUIDED:
             return
-    raise AssertionError("nobody stopped it")
+    raise AssertionError("the fence did not act")
 
 
 def upload(copter: SimulatedCopter, *items: MissionItem) -> None:
@@ -40,7 +40,7 @@ def corner(copter: SimulatedCopter, north: float, east: float, *, count: int, in
     return MissionItem(kind, 0, float(count), x=place.latitude_e7, y=place.longitude_e7)
 
 
-def test_nothing_happens_without_a_fence() -> None:
+def test_disabled_fence_does_nothing() -> None:
     copter, client = flying_copter()
     for _ in range(10):
         client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 0xDC7, *OUT_EAST[3:]))
@@ -49,7 +49,7 @@ def test_nothing_happens_without_a_fence() -> None:
     assert not client.all(m.FenceStatus)
 
 
-def test_beyond_the_circle_it_returns_and_says_so() -> None:
+def test_circle_breach_returns_and_reports() -> None:
     copter, client = flying_copter(parameters=ENABLED)
     fly_east(copter, client)
     assert copter.mode.number == CopterMode.RTL
@@ -70,20 +70,20 @@ def test_beyond_the_circle_it_returns_and_says_so() -> None:
         (5, CopterMode.SMART_RTL),
     ],
 )
-def test_actions(action: int, mode: int) -> None:
+def test_fence_action_selects_mode(action: int, mode: int) -> None:
     copter, client = flying_copter(parameters={**ENABLED, "FENCE_ACTION": float(action)})
     fly_east(copter, client)
     assert copter.mode.number == mode
 
 
-def test_report_only() -> None:
+def test_fence_report_only_keeps_mode() -> None:
     copter, _ = flying_copter(parameters={**ENABLED, "FENCE_ACTION": 0.0, "FENCE_ALT_MAX": 5.0})
     assert copter.mode.number == CopterMode.GUIDED
     assert copter.fence.breached == 1
     assert copter.fence.health == (True, False, False)
 
 
-def test_the_ceiling() -> None:
+def test_max_altitude_breach_returns() -> None:
     copter, client = flying_copter(parameters=ENABLED)
     copter.parameters["FENCE_ALT_MAX"] = 8.0
     client.run(0.5)
@@ -92,7 +92,7 @@ def test_the_ceiling() -> None:
     assert client.last(m.FenceStatus).breach_type == FenceBreach.MAXALT
 
 
-def test_the_floor_comes_into_force_above_it_and_goes_for_the_landing() -> None:
+def test_min_altitude_fence_enables_above_it_and_disables_for_landing() -> None:
     copter, client = ready_copter(parameters={**ENABLED, "FENCE_TYPE": 15.0, "FENCE_ALT_MIN": 5.0})
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.ACCEPTED
@@ -105,7 +105,7 @@ def test_the_floor_comes_into_force_above_it_and_goes_for_the_landing() -> None:
     assert not any("breached" in text for text in client.texts)
 
 
-def test_a_pilot_who_changes_the_mode_has_ten_seconds() -> None:
+def test_mode_change_during_breach_suspends_fence_ten_seconds() -> None:
     copter, client = flying_copter(parameters={**ENABLED, "FENCE_ALT_MAX": 25.0})
     copter.parameters["FENCE_ALT_MAX"] = 8.0
     client.run(0.5)
@@ -116,7 +116,7 @@ def test_a_pilot_who_changes_the_mode_has_ten_seconds() -> None:
     assert client.texts == ["Manual recovery started"]
 
 
-def test_the_mode_is_held_when_the_options_say_so() -> None:
+def test_fence_option_refuses_mode_changes_during_breach() -> None:
     copter, client = flying_copter(parameters={**ENABLED, "FENCE_OPTIONS": 1.0})
     fly_east(copter, client)
     client.forget()
@@ -125,7 +125,7 @@ def test_the_mode_is_held_when_the_options_say_so() -> None:
     assert client.texts == ["Mode change to GUIDED failed: in fence recovery"]
 
 
-def test_places_outside_are_refused() -> None:
+def test_reposition_outside_fence_is_refused() -> None:
     copter, client = flying_copter(parameters=ENABLED)
     far = copter.frame.to_global(0.0, 100.0, 0.0)
     x, y = far.latitude_e7, far.longitude_e7
@@ -136,7 +136,7 @@ def test_places_outside_are_refused() -> None:
     assert client.command_int(MavCmd.DO_REPOSITION, 3, -1, 1, x=x, y=y, z=15) == MavResult.ACCEPTED
 
 
-def test_an_uploaded_zone_is_not_entered_unpunished() -> None:
+def test_exclusion_zone_breach_returns() -> None:
     copter, client = flying_copter(parameters={"FENCE_ENABLE": 1.0})
     corners = [(-20.0, 15.0), (20.0, 15.0), (20.0, 30.0), (-20.0, 30.0)]
     upload(copter, *(corner(copter, n, e, count=4, inside=False) for n, e in corners))
@@ -156,12 +156,12 @@ def test_an_uploaded_zone_is_not_entered_unpunished() -> None:
         ({"FENCE_ALT_MIN": 50.0}, "FENCE_ALT_MAX < FENCE_ALT_MIN"),
     ],
 )
-def test_settings_that_cannot_be_armed_with(parameters: dict[str, float], reason: str) -> None:
+def test_invalid_fence_settings_prevent_arming(parameters: dict[str, float], reason: str) -> None:
     copter, _ = ready_copter(parameters={**ENABLED, **parameters})
     assert copter.arming.reasons() == [reason]
 
 
-def test_outside_it_is_not_armed() -> None:
+def test_arming_outside_fence_is_refused() -> None:
     copter, client = ready_copter(parameters=ENABLED)
     inside = [(10.0, 10.0), (20.0, 10.0), (20.0, 20.0)]
     upload(copter, *(corner(copter, n, e, count=3, inside=True) for n, e in inside))
@@ -171,7 +171,7 @@ def test_outside_it_is_not_armed() -> None:
     assert client.texts == ["Arm: Vehicle breaching Polygon fence"]
 
 
-def test_switching_it_by_command() -> None:
+def test_fence_enable_command_switches_kinds() -> None:
     copter, client = ready_copter()
     assert client.command(FENCE, 1) == MavResult.ACCEPTED
     assert copter.fence.enabled == 7
@@ -180,10 +180,10 @@ def test_switching_it_by_command() -> None:
     assert client.command(FENCE, 7) == MavResult.FAILED
     assert client.command(FENCE, 0) == MavResult.ACCEPTED
     copter.parameters["FENCE_TYPE"] = 4.0
-    assert client.command(FENCE, 1) == MavResult.FAILED, "there is no polygon"
+    assert client.command(FENCE, 1) == MavResult.FAILED, "no polygon is uploaded"
 
 
-def test_it_is_switched_on_with_the_motors() -> None:
+def test_fence_autoenable_follows_arming() -> None:
     _, client = ready_copter(parameters={"FENCE_AUTOENABLE": 3.0})
     assert set_mode(client, CopterMode.GUIDED) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.ACCEPTED
@@ -194,7 +194,7 @@ def test_it_is_switched_on_with_the_motors() -> None:
     assert client.texts[-2:] == ["Max Alt, Circle and Polygon fences auto-disabled", "Disarming motors"]
 
 
-def test_status_is_streamed_only_while_the_fence_is_on() -> None:
+def test_fence_status_is_streamed_only_while_enabled() -> None:
     copter, client = ready_copter()
     assert client.command(MavCmd.SET_MESSAGE_INTERVAL, m.FenceStatus.ID, 500_000) == MavResult.ACCEPTED
     client.run(2.0)
@@ -207,7 +207,7 @@ def test_status_is_streamed_only_while_the_fence_is_on() -> None:
     assert client.last(m.SysStatus).onboard_control_sensors_enabled & Sensor.MAV_SYS_STATUS_GEOFENCE
 
 
-def test_distances() -> None:
+def test_zone_distances_are_signed() -> None:
     square = PolygonZone([(0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)])
     assert square.outside_m((5.0, 4.0)) == pytest.approx(-4.0)
     assert square.outside_m((5.0, 13.0)) == pytest.approx(3.0)

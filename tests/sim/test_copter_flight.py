@@ -54,7 +54,7 @@ def place(copter: SimulatedCopter) -> tuple[float, float, float]:
 # ---------------------------------------------------------------------------------------- take-off
 
 
-def test_take_off_takes_as_long_as_the_real_one() -> None:
+def test_take_off_duration_matches_recording() -> None:
     copter, client = ready_copter()
     set_mode(client, CopterMode.GUIDED)
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
@@ -68,7 +68,7 @@ def test_take_off_takes_as_long_as_the_real_one() -> None:
     assert copter.altitude_m == pytest.approx(10.0, abs=0.05)
 
 
-def test_disarmed_while_it_takes_off_it_falls_and_has_landed() -> None:
+def test_disarming_during_take_off_falls_and_lands() -> None:
     copter, client = ready_copter()
     set_mode(client, CopterMode.GUIDED)
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
@@ -80,7 +80,7 @@ def test_disarmed_while_it_takes_off_it_falls_and_has_landed() -> None:
     assert copter.is_landed
 
 
-def test_landed_state_goes_through_take_off_to_in_air() -> None:
+def test_landed_state_passes_takeoff_to_in_air() -> None:
     copter, client = ready_copter()
     client.command(MavCmd.SET_MESSAGE_INTERVAL, m.ExtendedSysState.ID, 100_000)
     set_mode(client, CopterMode.GUIDED)
@@ -101,7 +101,7 @@ def test_landed_state_goes_through_take_off_to_in_air() -> None:
 
 
 @pytest.mark.parametrize(("armed", "altitude"), [(False, 10.0), (True, 0.0), (True, -5.0)])
-def test_take_off_is_refused(armed: bool, altitude: float) -> None:
+def test_take_off_with_invalid_request_is_refused(armed: bool, altitude: float) -> None:
     _, client = ready_copter()
     set_mode(client, CopterMode.GUIDED)
     if armed:
@@ -109,7 +109,7 @@ def test_take_off_is_refused(armed: bool, altitude: float) -> None:
     assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude) == MavResult.FAILED
 
 
-def test_take_off_needs_a_mode_that_can_and_happens_once() -> None:
+def test_take_off_needs_capable_mode_and_ground() -> None:
     _, client = ready_copter()
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
     assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0) == MavResult.FAILED
@@ -123,7 +123,7 @@ def test_take_off_needs_a_mode_that_can_and_happens_once() -> None:
 # ----------------------------------------------------------------------------------------- targets
 
 
-def test_flies_fifty_metres_north_like_the_real_one() -> None:
+def test_flight_duration_over_fifty_metres_matches_recording() -> None:
     copter, client = flying_copter()
     client.send(
         m.SetPositionTargetGlobalInt(
@@ -134,7 +134,7 @@ def test_flies_fifty_metres_north_like_the_real_one() -> None:
     assert took == pytest.approx(9.7, rel=0.15)
     client.run(5.0)
     assert copter.motion.north == pytest.approx(50.0, abs=0.1)
-    assert abs(copter.motion.yaw) < 0.05, "looks where it flies"
+    assert abs(copter.motion.yaw) < 0.05, "points in the direction of flight"
     client.command(MavCmd.REQUEST_MESSAGE, m.PositionTargetGlobalInt.ID)
     target = client.last(m.PositionTargetGlobalInt)
     assert target.lat_int == -353628118
@@ -142,7 +142,7 @@ def test_flies_fifty_metres_north_like_the_real_one() -> None:
     assert target.type_mask == 65016
 
 
-def test_reposition_is_known_as_command_int_only() -> None:
+def test_reposition_is_supported_as_command_int_only() -> None:
     copter, client = flying_copter()
     north = copter.navigation.frame.to_global(30.0, 0.0, 0.0)
     x, y = north.latitude_e7, north.longitude_e7
@@ -158,7 +158,7 @@ def test_reposition_is_known_as_command_int_only() -> None:
     assert bad == MavResult.DENIED
 
 
-def test_position_targets_in_all_local_frames() -> None:
+def test_position_target_works_in_all_local_frames() -> None:
     copter, client = flying_copter()
     local_target(client, POSITION | NO_YAW, (10, 5, -12))
     client.run(15.0)
@@ -173,7 +173,7 @@ def test_position_targets_in_all_local_frames() -> None:
     assert place(copter) == pytest.approx(wanted, abs=0.3)
 
 
-def test_velocity_is_flown_and_ends_three_seconds_after_the_last_setpoint() -> None:
+def test_velocity_target_expires_after_three_seconds() -> None:
     copter, client = flying_copter()
     for _ in range(8):
         local_target(client, VELOCITY | NO_YAW, velocity=(3.0, -2.0, -0.5))
@@ -185,14 +185,14 @@ def test_velocity_is_flown_and_ends_three_seconds_after_the_last_setpoint() -> N
     assert speed(copter) == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
 
 
-def test_body_velocity_follows_the_nose() -> None:
+def test_body_velocity_target_is_relative_to_heading() -> None:
     copter, client = flying_copter(heading_deg=90.0)
     local_target(client, VELOCITY | T.YAW_IGNORE, velocity=(4.0, 0.0, 0.0), frame=MavFrame.BODY_NED)
     client.run(2.5)
     assert speed(copter) == pytest.approx((0.0, 4.0, 0.0), abs=0.1)
 
 
-def test_acceleration_setpoints_accelerate_and_then_stop() -> None:
+def test_acceleration_target_accelerates_and_expires() -> None:
     copter, client = flying_copter()
     local_target(client, ACCELERATION | NO_YAW, acceleration=(1.0, 0.0, 0.0))
     client.run(2.0)
@@ -201,7 +201,7 @@ def test_acceleration_setpoints_accelerate_and_then_stop() -> None:
     assert speed(copter)[0] == pytest.approx(0.0, abs=0.05)
 
 
-def test_position_with_velocity_tracks_a_moving_target() -> None:
+def test_position_velocity_target_tracks_moving_target() -> None:
     copter, client = flying_copter()
     for step in range(40):
         time = step * 0.25
@@ -211,7 +211,7 @@ def test_position_with_velocity_tracks_a_moving_target() -> None:
     assert speed(copter)[0] == pytest.approx(2.0, abs=0.2)
 
 
-def test_attitude_setpoints_lean_and_climb_and_time_out() -> None:
+def test_attitude_target_leans_climbs_and_expires() -> None:
     copter, client = flying_copter()
     pitch = math.radians(-10)
     q = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
@@ -224,7 +224,7 @@ def test_attitude_setpoints_lean_and_climb_and_time_out() -> None:
     assert abs(math.degrees(copter.motion.pitch)) < 3
 
 
-def test_nonsense_stops_the_vehicle() -> None:
+def test_invalid_setpoint_stops_copter() -> None:
     copter, client = flying_copter()
     local_target(client, VELOCITY | NO_YAW, velocity=(5.0, 0.0, 0.0))
     client.run(2.0)
@@ -233,7 +233,7 @@ def test_nonsense_stops_the_vehicle() -> None:
     assert speed(copter) == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
 
 
-def test_setpoints_are_ignored_on_the_ground_and_in_other_modes() -> None:
+def test_setpoints_are_ignored_on_ground_and_outside_guided() -> None:
     copter, client = ready_copter()
     set_mode(client, CopterMode.GUIDED)
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
@@ -250,7 +250,7 @@ def test_setpoints_are_ignored_on_the_ground_and_in_other_modes() -> None:
 # --------------------------------------------------------------------------- speed, heading, pause
 
 
-def test_speed_can_be_changed_for_the_present_kind_of_target() -> None:
+def test_change_speed_is_valid_for_present_kind_of_target() -> None:
     copter, client = flying_copter()
     local_target(client, POSITION | NO_YAW, (200, 0, -10))
     assert client.command(MavCmd.DO_CHANGE_SPEED, 1, 3.0) == MavResult.ACCEPTED
@@ -264,7 +264,7 @@ def test_speed_can_be_changed_for_the_present_kind_of_target() -> None:
     assert client.command(MavCmd.DO_CHANGE_SPEED, 1, 3.0) == MavResult.FAILED
 
 
-def test_heading_commands_and_region_of_interest() -> None:
+def test_heading_follows_condition_yaw_and_region_of_interest() -> None:
     copter, client = flying_copter(heading_deg=0.0)
     assert client.command(MavCmd.CONDITION_YAW, 90, 0, 1, 0) == MavResult.ACCEPTED
     local_target(client, VELOCITY | T.YAW_IGNORE | T.YAW_RATE_IGNORE)  # resets it, as in the firmware
@@ -283,7 +283,7 @@ def test_heading_commands_and_region_of_interest() -> None:
     assert client.command(MavCmd.DO_SET_ROI_NONE) == MavResult.ACCEPTED
 
 
-def test_the_long_way_round_when_the_direction_says_so() -> None:
+def test_condition_yaw_direction_can_turn_long_way() -> None:
     copter, client = flying_copter(heading_deg=0.0)
     local_target(client, VELOCITY | NO_YAW)
     client.command(MavCmd.CONDITION_YAW, 90, 30, -1, 0)
@@ -293,7 +293,7 @@ def test_the_long_way_round_when_the_direction_says_so() -> None:
     assert math.degrees(copter.motion.yaw) == pytest.approx(90, abs=1)
 
 
-def test_yaw_rate_setpoint_turns_and_stops_with_its_stream() -> None:
+def test_yaw_rate_target_turns_and_expires() -> None:
     copter, client = flying_copter()
     local_target(client, VELOCITY | T.YAW_IGNORE, rate=0.5)
     client.run(2.0)
@@ -302,7 +302,7 @@ def test_yaw_rate_setpoint_turns_and_stops_with_its_stream() -> None:
     assert copter.motion.yaw_rate == 0.0
 
 
-def test_pause_and_continue() -> None:
+def test_pause_and_continue_stop_and_resume_flight() -> None:
     copter, client = flying_copter()
     local_target(client, POSITION | NO_YAW, (100, 0, -10))
     client.run(4.0)
@@ -323,7 +323,7 @@ def test_pause_and_continue() -> None:
 # -------------------------------------------------------------------------------------- coming home
 
 
-def test_rtl_climbs_comes_home_waits_lands_and_disarms_like_the_real_one() -> None:
+def test_rtl_phases_match_recording() -> None:
     copter, client = flying_copter()
     local_target(client, POSITION | NO_YAW, (50, 0, -10))
     client.run(15.0)
@@ -346,7 +346,7 @@ def test_rtl_climbs_comes_home_waits_lands_and_disarms_like_the_real_one() -> No
     assert client.last(m.Heartbeat).system_status == MavState.STANDBY
 
 
-def test_smart_rtl_and_landing_elsewhere() -> None:
+def test_smart_rtl_returns_and_land_lands_in_place() -> None:
     copter, client = flying_copter()
     local_target(client, POSITION | NO_YAW, (0, 30, -8))
     client.run(10.0)
@@ -358,13 +358,11 @@ def test_smart_rtl_and_landing_elsewhere() -> None:
     assert copter.altitude_m == 0.0
 
 
-def test_home_can_be_set_and_is_kept_when_it_was_set_by_hand() -> None:
+def test_home_set_by_command_is_kept_at_arming() -> None:
     copter, client = ready_copter()
     spot = copter.navigation.frame.to_global(20.0, -10.0, 0.0)
     x, y = spot.latitude_e7, spot.longitude_e7
-    assert (
-        client.command_int(MavCmd.DO_SET_HOME, MavFrame.GLOBAL, 0, x=x, y=y, z=584.09) == MavResult.ACCEPTED
-    )
+    assert client.command_int(MavCmd.DO_SET_HOME, MavFrame.GLOBAL, 0, x=x, y=y, z=584.09) == MavResult.ACCEPTED
     assert client.last(m.HomePosition).latitude == x
     set_mode(client, CopterMode.GUIDED)
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
@@ -376,7 +374,7 @@ def test_home_can_be_set_and_is_kept_when_it_was_set_by_hand() -> None:
 # ------------------------------------------------------------------------------------- other modes
 
 
-def test_brake_stops_and_stays_and_loiter_needs_the_throttle_in_the_middle() -> None:
+def test_brake_holds_position_and_loiter_follows_throttle() -> None:
     copter, client = flying_copter(20.0)
     local_target(client, VELOCITY | NO_YAW, velocity=(5.0, 0.0, 0.0))
     client.run(3.0)
@@ -393,7 +391,7 @@ def test_brake_stops_and_stays_and_loiter_needs_the_throttle_in_the_middle() -> 
     assert speed(copter)[2] > 1.0, "the released throttle is low: it descends"
 
 
-def test_stabilize_with_a_low_throttle_comes_down() -> None:
+def test_stabilize_with_low_throttle_descends() -> None:
     copter, client = flying_copter(20.0)
     set_mode(client, CopterMode.STABILIZE)
     client.run(10.0)
@@ -401,7 +399,7 @@ def test_stabilize_with_a_low_throttle_comes_down() -> None:
     client.run_until(lambda: not copter.is_armed, 15.0)
 
 
-def test_unknown_modes_and_modes_without_position_are_refused_with_a_reason() -> None:
+def test_unavailable_modes_are_refused_with_text() -> None:
     copter, client = ready_copter()
     assert set_mode(client, 99) == MavResult.FAILED
     assert client.texts[-1] == "No such mode 99"
@@ -415,18 +413,18 @@ def test_unknown_modes_and_modes_without_position_are_refused_with_a_reason() ->
     assert client.command(MavCmd.MISSION_START) == MavResult.FAILED
 
 
-def test_the_old_set_mode_message_changes_the_mode_without_an_answer() -> None:
+def test_set_mode_message_changes_mode_without_acknowledgement() -> None:
     copter, client = ready_copter()
     client.send(m.SetMode(1, 1, CopterMode.GUIDED))
     assert copter.mode.number == CopterMode.GUIDED
     assert client.all(m.CommandAck) == []
-    assert client.last(m.Heartbeat).custom_mode == CopterMode.GUIDED, "told at once"
+    assert client.last(m.Heartbeat).custom_mode == CopterMode.GUIDED, "broadcast at once"
 
 
 # --------------------------------------------------------------------------------------- failsafes
 
 
-def test_losing_gps_in_flight_ends_in_land() -> None:
+def test_gps_loss_in_flight_changes_to_land() -> None:
     copter, client = flying_copter()
     copter.faults.gps_lost = True
     client.run(12.0)
@@ -436,7 +434,7 @@ def test_losing_gps_in_flight_ends_in_land() -> None:
     assert client.last(m.Heartbeat).system_status == MavState.CRITICAL
 
 
-def test_ground_station_failsafe_is_off_until_it_is_switched_on() -> None:
+def test_ground_station_failsafe_is_off_by_default() -> None:
     copter, client = flying_copter()
     client.send(m.Heartbeat(6, 8, 0, 0, 4))
     client.run(8.0)
@@ -453,7 +451,7 @@ def test_ground_station_failsafe_is_off_until_it_is_switched_on() -> None:
     assert client.texts[-1] == "GCS Failsafe Cleared"
 
 
-def test_a_battery_that_runs_low_warns_and_acts() -> None:
+def test_low_battery_in_flight_warns_and_acts() -> None:
     copter, client = flying_copter(battery_percent=100.0, parameters={"BATT_FS_LOW_ACT": 2})
     before = copter.battery.percent
     client.run(10.0)
@@ -464,7 +462,7 @@ def test_a_battery_that_runs_low_warns_and_acts() -> None:
     assert copter.mode.number == CopterMode.RTL
 
 
-def test_a_failed_motor_brings_it_down() -> None:
+def test_failed_motor_crashes_copter() -> None:
     copter, client = flying_copter(20.0)
     copter.faults.motor_failed = True
     client.run(4.0)
@@ -472,7 +470,7 @@ def test_a_failed_motor_brings_it_down() -> None:
     assert any("SIM Hit ground" in text for text in client.texts)
 
 
-def test_termination_stops_the_motors() -> None:
+def test_flight_termination_stops_motors() -> None:
     copter, client = flying_copter(5.0)
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 0) == MavResult.FAILED
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.ACCEPTED

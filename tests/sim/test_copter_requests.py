@@ -1,4 +1,4 @@
-"""Asking the simulated copter for messages and parameters."""
+"""Message and parameter requests to a simulated copter."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ STREAMED_BY_A_REAL_COPTER = {
     "SCALED_PRESSURE", "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "SIMSTATE", "SYSTEM_TIME", "SYS_STATUS",
     "TERRAIN_REPORT", "TERRAIN_REQUEST", "VFR_HUD", "VIBRATION", "WIND",
 }  # fmt: skip
-"""With REQUEST_DATA_STREAM ALL, in GUIDED with a target."""
+"""Messages after REQUEST_DATA_STREAM ALL, in GUIDED with a target."""
 
 
 def interval(client: Client, message_id: int, microseconds: float) -> int | None:
     return client.command(MavCmd.SET_MESSAGE_INTERVAL, message_id, microseconds)
 
 
-def test_all_streams_are_the_messages_of_the_recorded_copter() -> None:
+def test_all_streams_match_recorded_copter() -> None:
     _, client = flying_copter()
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 3576, 5, 0, -10, 0, 0, 0, 0, 0, 0, 0, 0))
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 10, 1))
@@ -34,7 +34,7 @@ def test_all_streams_are_the_messages_of_the_recorded_copter() -> None:
     assert per_second == pytest.approx(275, rel=0.05)
 
 
-def test_a_group_starts_and_stops_alone() -> None:
+def test_stream_group_starts_and_stops_alone() -> None:
     _, client = ready_copter()
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 4, 1))
     client.run(5.0)
@@ -46,7 +46,7 @@ def test_a_group_starts_and_stops_alone() -> None:
     assert client.all(m.Attitude) == []
 
 
-def test_intervals_by_id() -> None:
+def test_message_interval_sets_rate_by_id() -> None:
     _, client = ready_copter()
     assert interval(client, m.Attitude.ID, 100_000) == MavResult.ACCEPTED
     assert interval(client, m.AttitudeQuaternion.ID, 500_000) == MavResult.ACCEPTED
@@ -60,7 +60,7 @@ def test_intervals_by_id() -> None:
     assert {type(message) for _, message in client.heard} == {m.Heartbeat}
 
 
-def test_intervals_are_refused_as_the_firmware_does() -> None:
+def test_invalid_message_intervals_are_refused() -> None:
     _, client = ready_copter()
     assert interval(client, 12345, 100_000) == MavResult.DENIED
     assert client.texts == ["No ap_message for mavlink id (12345)"]
@@ -69,7 +69,7 @@ def test_intervals_are_refused_as_the_firmware_does() -> None:
     assert interval(client, m.Attitude.ID, -5) == MavResult.DENIED
 
 
-def test_heartbeats_have_an_interval_too() -> None:
+def test_heartbeat_interval_can_be_changed() -> None:
     _, client = ready_copter()
     interval(client, m.Heartbeat.ID, 200_000)
     client.run(2.0)
@@ -80,7 +80,7 @@ def test_heartbeats_have_an_interval_too() -> None:
     assert len(client.all(m.Heartbeat)) <= 6
 
 
-def test_the_interval_can_be_asked_for() -> None:
+def test_get_message_interval_returns_interval() -> None:
     _, client = ready_copter()
     interval(client, m.Attitude.ID, 100_000)
     for message_id, expected in ((m.Attitude.ID, 100_000), (m.VfrHud.ID, -1)):
@@ -93,7 +93,7 @@ def test_the_interval_can_be_asked_for() -> None:
     assert client.last(m.MessageInterval).message_id == m.Attitude.ID
 
 
-def test_a_single_message_follows_its_acknowledgement() -> None:
+def test_requested_message_follows_acknowledgement() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID) == MavResult.ACCEPTED
     assert [type(message) for _, message in client.heard] == [m.CommandAck, m.SysStatus]
@@ -103,7 +103,7 @@ def test_a_single_message_follows_its_acknowledgement() -> None:
     assert client.all(m.DistanceSensor) == [], "accepted, but there is no sensor"
 
 
-def test_modes_can_be_listed() -> None:
+def test_available_modes_can_be_requested() -> None:
     copter, client = ready_copter()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 0) == MavResult.ACCEPTED
     modes = client.all(m.AvailableModes)
@@ -118,7 +118,7 @@ def test_modes_can_be_listed() -> None:
     assert copter.requests is not None
 
 
-def test_old_firmwares_can_be_imitated() -> None:
+def test_unsupported_commands_and_streams_can_be_configured() -> None:
     without = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.DO_SET_MODE)
     _, client = ready_copter(unsupported_commands=without)
     assert interval(client, m.Attitude.ID, 100_000) == MavResult.UNSUPPORTED
@@ -129,7 +129,7 @@ def test_old_firmwares_can_be_imitated() -> None:
     assert {type(message) for _, message in client.heard} == {m.Heartbeat}
 
 
-def test_a_range_finder_measures_the_height() -> None:
+def test_range_finder_reports_height() -> None:
     _, client = flying_copter(rangefinder_reach_m=30.0)
     interval(client, m.DistanceSensor.ID, 100_000)
     interval(client, m.Rangefinder.ID, 100_000)
@@ -138,7 +138,7 @@ def test_a_range_finder_measures_the_height() -> None:
     assert client.last(m.Rangefinder).distance == pytest.approx(10.2, abs=0.05)
 
 
-def test_values_agree_with_each_other_in_flight() -> None:
+def test_telemetry_values_are_consistent_in_flight() -> None:
     copter, client = flying_copter()
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 10, 1))
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 3576, 100, 0, -10, 0, 0, 0, 0, 0, 0, 0, 0))
@@ -162,7 +162,7 @@ def test_values_agree_with_each_other_in_flight() -> None:
     assert copter.battery.percent > 95
 
 
-def test_calibration_takes_time_and_needs_to_be_disarmed() -> None:
+def test_gyro_calibration_takes_time_and_needs_disarmed() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.PREFLIGHT_CALIBRATION, 1) is None
     client.run(1.1)
@@ -174,13 +174,13 @@ def test_calibration_takes_time_and_needs_to_be_disarmed() -> None:
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.FAILED
 
 
-def test_unknown_commands_are_unsupported() -> None:
+def test_unknown_command_is_unsupported() -> None:
     _, client = ready_copter()
     assert client.command(31010) == MavResult.UNSUPPORTED
     assert client.command(MavCmd.DO_SET_REVERSE) == MavResult.UNSUPPORTED
 
 
-def test_time_synchronisation_is_answered_and_ping_is_not() -> None:
+def test_timesync_is_answered_and_ping_is_not() -> None:
     copter, client = ready_copter()
     client.send(m.Timesync(0, 123_456_789))
     answer = client.last(m.Timesync)
@@ -195,7 +195,7 @@ def test_time_synchronisation_is_answered_and_ping_is_not() -> None:
 # -------------------------------------------------------------------------------------- parameters
 
 
-def test_the_parameter_list_is_complete_and_in_order() -> None:
+def test_parameter_list_is_complete_and_ordered() -> None:
     copter, client = ready_copter()
     client.send(m.ParamRequestList(1, 1))
     client.run(1.0)
@@ -207,7 +207,7 @@ def test_the_parameter_list_is_complete_and_in_order() -> None:
     )
 
 
-def test_parameters_are_read_by_name_and_index_and_set() -> None:
+def test_parameter_can_be_read_and_set() -> None:
     copter, client = ready_copter()
     client.send(m.ParamRequestRead(1, 1, "WPNAV_SPEED", -1))
     assert client.last(m.ParamValue).param_value == 1000.0
@@ -221,7 +221,7 @@ def test_parameters_are_read_by_name_and_index_and_set() -> None:
     assert client.last(m.ParamValue).param_value == 127.0, "an INT8 holds no more"
 
 
-def test_unknown_parameters_and_values_are_met_with_silence() -> None:
+def test_unknown_parameter_gets_no_answer() -> None:
     _, client = ready_copter()
     client.send(m.ParamRequestRead(1, 1, "NO_SUCH_PARAM", -1))
     client.send(m.ParamRequestRead(1, 1, "", 9999))
@@ -230,7 +230,7 @@ def test_unknown_parameters_and_values_are_met_with_silence() -> None:
     assert client.heard == []
 
 
-def test_a_parameter_of_the_flight_takes_effect() -> None:
+def test_flight_parameter_takes_effect() -> None:
     copter, client = ready_copter(parameters={"WPNAV_SPEED_UP": 100})
     client.send(m.ParamSet(1, 1, "WPNAV_SPEED", 200.0, 9))
     client.command(MavCmd.DO_SET_MODE, 1, 4)

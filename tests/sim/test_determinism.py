@@ -1,4 +1,4 @@
-"""The same seed and the same calls give the same bytes, of every kind of vehicle, however time is cut into steps."""
+"""Equal seeds and calls produce equal bytes for every kind of vehicle and any step size."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavDataStream
 from aerokit.mavlink.message import Message
-from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, Wind, simulated_link
+from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, SimulatedWind, simulated_link
 from aerokit.testing import run_virtual
 from aerokit.transport import Peer
 
 KINDS = [
     kind
     for _, kind in inspect.getmembers(aerokit.sim, inspect.isclass)
-    if issubclass(kind, SimulatedVehicle)
-    and {"seed", "boot_time_s"} <= set(inspect.signature(kind).parameters)
+    if issubclass(kind, SimulatedVehicle) and {"seed", "boot_time_s"} <= set(inspect.signature(kind).parameters)
 ]
 END_S = 6.0
 FORCE = 21196.0
@@ -40,6 +39,7 @@ HEARTBEAT = m.Heartbeat(6, 8, 0, 0, 4, 3)
 STREAMS = m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1)
 ARM = command(MavCmd.COMPONENT_ARM_DISARM, 1.0, FORCE)
 TAKE_OFF = command(MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 10.0)
+# Messages of a client; not every kind supports all of them.
 CALLS: tuple[Message, ...] = (
     HEARTBEAT,
     STREAMS,
@@ -56,7 +56,6 @@ CALLS: tuple[Message, ...] = (
     m.Timesync(0, 7),
     m.SetPositionTargetLocalNed(0, 1, 1, 1, 0xDC7, 0, 0, 0, 3.0, -2.0, -0.5, 0, 0, 0, 0, 0),
 )
-"""What a client might say; not every kind understands all of it."""
 
 instants = st.floats(0.0, END_S)
 scripts = st.lists(st.tuples(instants, st.sampled_from(CALLS)), max_size=8).map(
@@ -65,8 +64,8 @@ scripts = st.lists(st.tuples(instants, st.sampled_from(CALLS)), max_size=8).map(
 
 
 @dataclass(frozen=True)
-class Said:
-    """What two channels of a vehicle gave in a run."""
+class ChannelOutput:
+    """Output of two channels of a vehicle in a run."""
 
     first: bytes
     second: bytes
@@ -74,29 +73,27 @@ class Said:
 
 def fly(
     kind: type[SimulatedVehicle], calls: list[tuple[float, Message]], cuts: list[float], *, seed: int = 5
-) -> Said:
-    """The bytes of a run in which a tenth of the frames is lost; ``cuts`` are when it is stepped needlessly."""
-    vehicle = made(kind, seed)
+) -> ChannelOutput:
+    """Return the bytes of a run with 10 % loss; ``cuts`` are times of additional steps."""
+    vehicle = booting_vehicle(kind, seed)
     vehicle.faults.loss = 0.1
     second, encoder = vehicle.open_channel(), FrameEncoder(255, 190)
     vehicle.step(0.0)
     first = b""
-    for when, message in sorted(
-        [*calls, *((cut, None) for cut in cuts), (END_S, None)], key=lambda each: each[0]
-    ):
+    for when, message in sorted([*calls, *((cut, None) for cut in cuts), (END_S, None)], key=lambda each: each[0]):
         if message is None:
             vehicle.step(when)
         else:
             vehicle.receive(encoder.encode(message), when)
         first += vehicle.take_outbox()
-    return Said(first, second.take_outbox())
+    return ChannelOutput(first, second.take_outbox())
 
 
-def made(kind: type[SimulatedVehicle], seed: int) -> SimulatedVehicle:
-    """One that has booted after a second, if its kind can be told so."""
+def booting_vehicle(kind: type[SimulatedVehicle], seed: int) -> SimulatedVehicle:
+    """Return a vehicle that boots in one second, if its kind has that option."""
     wanted: dict[str, object] = {
         "boot_time_s": 1.0,
-        "wind": Wind(3.0, 1.0, gusts_m_s=1.0),
+        "wind": SimulatedWind(3.0, 1.0, gusts_m_s=1.0),
         "parameter_count": 20,
     }
     known = inspect.signature(kind).parameters
@@ -105,25 +102,23 @@ def made(kind: type[SimulatedVehicle], seed: int) -> SimulatedVehicle:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(
-    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
-)
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(calls=scripts, cuts=st.lists(instants, max_size=30))
-def test_steps_may_be_cut_at_will(
+def test_step_size_does_not_change_the_bytes(
     kind: type[SimulatedVehicle], calls: list[tuple[float, Message]], cuts: list[float]
 ) -> None:
     assert fly(kind, calls, []) == fly(kind, calls, cuts)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_same_seed_says_the_same_and_another_one_does_not(kind: type[SimulatedVehicle]) -> None:
+def test_seed_determines_the_bytes(kind: type[SimulatedVehicle]) -> None:
     calls: list[tuple[float, Message]] = [(2.0, STREAMS), (3.0, ARM), (3.1, TAKE_OFF)]
     assert fly(kind, calls, []) == fly(kind, calls, [])
     assert fly(kind, calls, []) != fly(kind, calls, [], seed=6)
 
 
-class Ears:
-    """Keeps what came and when."""
+class StoringReceiver:
+    """Stores received bytes with their times."""
 
     def __init__(self) -> None:
         self.heard: list[tuple[float, bytes]] = []
@@ -132,14 +127,14 @@ class Ears:
         self.heard.append((asyncio.get_running_loop().time(), data))
 
     def link_lost(self, error: LinkLost) -> None:
-        """It is closed by its owner."""
+        """Called when the owner closes the link."""
 
 
 async def serve(seed: int) -> list[tuple[float, bytes]]:
-    """Ten seconds of a copter and a PX4 on one link, asked for streams and told to fly."""
+    """Run a copter and a PX4 on one link for ten seconds, with streams and a flight."""
     copter = SimulatedCopter(boot_time_s=1.0, seed=seed, parameter_count=20)
-    px4 = SimulatedPx4(system_id=2, boot_time_s=1.0, seed=seed, parameter_count=20, wind=Wind(gusts_m_s=1.0))
-    ears, encoder = Ears(), FrameEncoder(255, 190)
+    px4 = SimulatedPx4(system_id=2, boot_time_s=1.0, seed=seed, parameter_count=20, wind=SimulatedWind(gusts_m_s=1.0))
+    ears, encoder = StoringReceiver(), FrameEncoder(255, 190)
     async with simulated_link([copter, px4], latency_s=0.01) as link:
         await link.open(ears)
         await asyncio.sleep(2.0)
@@ -149,7 +144,7 @@ async def serve(seed: int) -> list[tuple[float, bytes]]:
     return ears.heard
 
 
-def test_a_server_says_the_same_at_the_same_times() -> None:
+def test_server_sends_equal_bytes_at_equal_times() -> None:
     first = run_virtual(serve(1))
     assert first == run_virtual(serve(1))
     assert first != run_virtual(serve(2))

@@ -1,4 +1,4 @@
-"""What Plane, Rover and Sub do outside their fences; what the fence itself does is tested with the copter's."""
+"""Reactions of Plane, Rover and Sub to fence breaches; see test_copter_fence for the fence itself."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedPlane, SimulatedRover
 
 FENCE = MavCmd.DO_FENCE_ENABLE
-ROOF = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 7.0, "FENCE_RADIUS": 2000.0}
-GARDEN = {"FENCE_ENABLE": 1.0, "FENCE_RADIUS": 20.0}
+HIGH_FENCE = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 7.0, "FENCE_RADIUS": 2000.0}
+SMALL_CIRCLE = {"FENCE_ENABLE": 1.0, "FENCE_RADIUS": 20.0}
 
 
-def lower_the_roof(client: Client, plane: SimulatedPlane) -> None:
+def lower_max_altitude(client: Client, plane: SimulatedPlane) -> None:
     plane.parameters["FENCE_ALT_MAX"] = 30.0
     client.run(0.6)
 
@@ -42,9 +42,9 @@ def lower_the_roof(client: Client, plane: SimulatedPlane) -> None:
     ("action", "mode"),
     [(1, PlaneMode.RTL), (6, PlaneMode.GUIDED), (7, PlaneMode.GUIDED), (8, PlaneMode.AUTOLAND)],
 )
-def test_a_plane_turns_back(action: int, mode: int) -> None:
-    plane, client = flying_plane(**ROOF, FENCE_ACTION=float(action))
-    lower_the_roof(client, plane)
+def test_plane_breach_executes_fence_action(action: int, mode: int) -> None:
+    plane, client = flying_plane(**HIGH_FENCE, FENCE_ACTION=float(action))
+    lower_max_altitude(client, plane)
     assert plane.mode.number == mode
     assert client.texts == ["Max Alt fence breached", "Manual recovery started"]
     status = client.last(m.FenceStatus)
@@ -53,9 +53,9 @@ def test_a_plane_turns_back(action: int, mode: int) -> None:
     assert not healthy(client, Sensor.MAV_SYS_STATUS_GEOFENCE)
 
 
-def test_a_plane_may_only_report() -> None:
-    plane, client = flying_plane(**ROOF, FENCE_ACTION=0.0)
-    lower_the_roof(client, plane)
+def test_plane_report_only_keeps_mode() -> None:
+    plane, client = flying_plane(**HIGH_FENCE, FENCE_ACTION=0.0)
+    lower_max_altitude(client, plane)
     assert plane.mode.number == PlaneMode.LOITER
     assert client.texts == ["Max Alt fence breached"]
     plane.parameters["FENCE_ALT_MAX"] = 100.0
@@ -63,21 +63,21 @@ def test_a_plane_may_only_report() -> None:
     assert client.texts[1:] == ["Fence breach cleared"]
 
 
-def test_a_plane_that_turns_back_keeps_its_mode_and_clears_silently() -> None:
-    plane, client = flying_plane(**ROOF)
-    lower_the_roof(client, plane)
+def test_plane_breach_refuses_mode_changes_and_clears_silently() -> None:
+    plane, client = flying_plane(**HIGH_FENCE)
+    lower_max_altitude(client, plane)
     client.forget()
     assert set_mode(client, PlaneMode.LOITER) == MavResult.FAILED
     assert client.texts == ["Mode change to LOITER denied, in fence recovery"]
     plane.parameters["FENCE_ALT_MAX"] = 100.0
     client.run(0.6)
-    assert len(client.texts) == 1, "it is on its way back, the fence is quiet"
+    assert len(client.texts) == 1, "no further reports during the return"
     assert set_mode(client, PlaneMode.LOITER) == MavResult.ACCEPTED
 
 
-def test_a_pilot_of_a_plane_has_ten_seconds() -> None:
-    plane, client = flying_plane(**ROOF, FENCE_OPTIONS=0.0)
-    lower_the_roof(client, plane)
+def test_plane_mode_change_suspends_fence_ten_seconds() -> None:
+    plane, client = flying_plane(**HIGH_FENCE, FENCE_OPTIONS=0.0)
+    lower_max_altitude(client, plane)
     assert set_mode(client, PlaneMode.LOITER) == MavResult.ACCEPTED
     assert client.texts[-1] == "Manual recovery started"
     plane.parameters["FENCE_RADIUS"] = 10.0
@@ -91,9 +91,9 @@ def test_a_pilot_of_a_plane_has_ten_seconds() -> None:
     assert "Circle fence breached" in client.texts
 
 
-def test_where_a_plane_circles_outside() -> None:
-    plane, client = flying_plane(**ROOF, FENCE_ACTION=6.0)
-    lower_the_roof(client, plane)
+def test_plane_return_place_depends_on_parameters() -> None:
+    plane, client = flying_plane(**HIGH_FENCE, FENCE_ACTION=6.0)
+    lower_max_altitude(client, plane)
     home = plane.navigation.home
     assert home is not None
     assert plane.guided.destination == pytest.approx((home[0], home[1], home[2] - 10.0)), "between -8 and 28"
@@ -107,16 +107,16 @@ def test_where_a_plane_circles_outside() -> None:
     assert plane.fence.return_place() == pytest.approx((500.0, 0.0, home[2] - 60.0), abs=0.1)
 
 
-def test_without_the_fence_a_plane_goes_on_as_before() -> None:
-    plane, client = flying_plane(PlaneMode.CRUISE, **ROOF, FENCE_ACTION=6.0)
-    lower_the_roof(client, plane)
+def test_plane_disabled_fence_restores_mode() -> None:
+    plane, client = flying_plane(PlaneMode.CRUISE, **HIGH_FENCE, FENCE_ACTION=6.0)
+    lower_max_altitude(client, plane)
     assert plane.mode.number == PlaneMode.GUIDED
     assert client.command(FENCE, 0) == MavResult.ACCEPTED
     client.run(0.6)
     assert plane.mode.number == PlaneMode.CRUISE
 
 
-def test_a_plane_switches_its_fence_with_the_throttle() -> None:
+def test_plane_fence_autoenable_follows_arming() -> None:
     _, client = ready_plane(FENCE_TYPE=7.0, FENCE_AUTOENABLE=3.0)
     arm(client, PlaneMode.FLY_BY_WIRE_A)
     client.run(0.1)
@@ -129,8 +129,8 @@ def test_a_plane_switches_its_fence_with_the_throttle() -> None:
 # ------------------------------------------------------------------------------------------- rover
 
 
-def leave_the_garden(action: int) -> tuple[SimulatedRover, Client]:
-    rover, client = driving_rover(60.0, **GARDEN, FENCE_ACTION=float(action))
+def drive_out_of_circle(action: int) -> tuple[SimulatedRover, Client]:
+    rover, client = driving_rover(60.0, **SMALL_CIRCLE, FENCE_ACTION=float(action))
     client.run_until(lambda: rover.fence.breached != 0)
     client.run(0.2)
     return rover, client
@@ -146,8 +146,8 @@ def leave_the_garden(action: int) -> tuple[SimulatedRover, Client]:
         (6, RoverMode.LOITER),
     ],
 )
-def test_a_rover_does_what_is_configured_without_a_word(action: int, mode: int) -> None:
-    rover, client = leave_the_garden(action)
+def test_rover_breach_executes_fence_action_silently(action: int, mode: int) -> None:
+    rover, client = drive_out_of_circle(action)
     assert rover.mode.number == mode
     assert client.texts == ["Manual recovery started"]
     status = client.last(m.FenceStatus)
@@ -155,22 +155,22 @@ def test_a_rover_does_what_is_configured_without_a_word(action: int, mode: int) 
     assert status.breach_mitigation == FenceMitigate.NONE
 
 
-def test_a_rover_may_only_report() -> None:
-    rover, client = leave_the_garden(0)
+def test_rover_report_only_keeps_mode() -> None:
+    rover, client = drive_out_of_circle(0)
     assert (client.texts, rover.mode.number) == ([], RoverMode.GUIDED)
     assert client.last(m.FenceStatus).breach_status == 1
 
 
-def test_a_rover_that_is_stopped_outside_is_not_armed_there() -> None:
-    rover, client = leave_the_garden(5)
+def test_rover_disarmed_outside_fence_refuses_arming() -> None:
+    rover, client = drive_out_of_circle(5)
     assert client.texts[0] == "Throttle disarmed"
     rover.navigation.set_home((0.0, 0.0, 0.0), lock=True)
     client.run(0.2)
     assert rover.arming.reasons() == ["Vehicle breaching Circle fence"]
 
 
-def test_a_rover_far_outside_holds() -> None:
-    rover, client = ready_rover(**GARDEN)
+def test_rover_far_outside_fence_holds() -> None:
+    rover, client = ready_rover(**SMALL_CIRCLE)
     rover.motion.north = 150.0
     arm(client, RoverMode.GUIDED)
     rover.navigation.set_home((0.0, 0.0, 0.0), lock=True)
@@ -178,8 +178,8 @@ def test_a_rover_far_outside_holds() -> None:
     assert rover.mode.number == RoverMode.HOLD
 
 
-def test_a_rover_in_hold_outside_may_be_driven_on() -> None:
-    rover, client = leave_the_garden(2)
+def test_rover_mode_change_suspends_fence() -> None:
+    rover, client = drive_out_of_circle(2)
     assert set_mode(client, RoverMode.GUIDED) == MavResult.ACCEPTED
     client.run(0.5)
     assert client.texts == ["Manual recovery started"] * 2
@@ -189,7 +189,7 @@ def test_a_rover_in_hold_outside_may_be_driven_on() -> None:
 # --------------------------------------------------------------------------------------------- sub
 
 
-def test_a_submarine_only_tells_that_it_is_outside() -> None:
+def test_sub_breach_is_reported_only() -> None:
     sub, client = armed_sub(FENCE_ENABLE=1.0, FENCE_TYPE=2.0, FENCE_RADIUS=3.0, FENCE_MARGIN=1.0)
     sub.motion.north = 10.0
     client.run(0.6)
@@ -202,7 +202,7 @@ def test_a_submarine_only_tells_that_it_is_outside() -> None:
     assert client.texts[-1] == "Arm: Vehicle breaching Circle fence"
 
 
-def test_a_submarine_looks_only_while_it_is_armed() -> None:
+def test_sub_fence_is_checked_only_while_armed() -> None:
     sub, client = ready_sub(FENCE_ENABLE=1.0, FENCE_TYPE=2.0, FENCE_RADIUS=3.0, FENCE_MARGIN=1.0)
     sub.motion.north = 10.0
     client.run(1.0)

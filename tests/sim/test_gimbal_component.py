@@ -1,4 +1,4 @@
-"""A gimbal of its own beside a vehicle: who is in control, where it points, what it says."""
+"""A simulated gimbal component: control, directions and messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def degrees(gimbal: SimulatedGimbal) -> list[float]:
     return [math.degrees(angle) for angle in gimbal.angles()]
 
 
-def test_it_introduces_itself() -> None:
+def test_information_is_sent_on_request() -> None:
     _, client = fitted(pitch_deg=(-80.0, 10.0))
     client.run(2.0)
     assert client.said_by(GIMBAL, m.Heartbeat)[0].type == MavType.GIMBAL
@@ -50,7 +50,7 @@ def test_it_introduces_itself() -> None:
     assert (status.gimbal_device_id, status.primary_control_sysid) == (GIMBAL, 0)
 
 
-def test_it_streams_where_it_points() -> None:
+def test_attitude_is_streamed() -> None:
     _, client = fitted(attitude_rate_hz=10.0)
     client.run(2.0)
     assert len(client.all(m.GimbalDeviceAttitudeStatus)) == pytest.approx(20, abs=1)
@@ -60,7 +60,7 @@ def test_it_streams_where_it_points() -> None:
     assert not client.all(m.GimbalDeviceAttitudeStatus)
 
 
-def test_nobody_steers_it_without_control() -> None:
+def test_commands_without_control_are_denied() -> None:
     gimbal, client = fitted()
     assert client.ask(GIMBAL, POINT, -30, 0, NAN, NAN) == DENIED
     assert client.ask(GIMBAL, MavCmd.DO_SET_ROI_NONE) == DENIED
@@ -69,7 +69,7 @@ def test_nobody_steers_it_without_control() -> None:
     assert degrees(gimbal) == [0.0, 0.0, 0.0]
 
 
-def test_control_is_claimed_told_and_let_go() -> None:
+def test_control_is_claimed_reported_and_released() -> None:
     gimbal, client = fitted()
     assert client.ask(GIMBAL, CONFIGURE, -2, -2, *KEEP) == DONE
     status = client.last(m.GimbalManagerStatus)
@@ -81,7 +81,7 @@ def test_control_is_claimed_told_and_let_go() -> None:
     assert client.ask(GIMBAL, CONFIGURE, 300, 0, *KEEP) == DENIED
 
 
-def test_another_ground_station_takes_it_away() -> None:
+def test_another_ground_station_takes_control() -> None:
     gimbal, client = claimed()
     other = FrameEncoder(254, 190)
     claim = m.CommandLong(1, GIMBAL, CONFIGURE, 0, -2, -2, -1, -1, 0, 0, 0)
@@ -89,11 +89,11 @@ def test_another_ground_station_takes_it_away() -> None:
     client.listen()
     assert gimbal.primary == (254, 190)
     assert client.ask(GIMBAL, POINT, -30, 0, NAN, NAN) == DENIED
-    assert client.ask(GIMBAL, CONFIGURE, -3, -3, *KEEP) == DONE  # lets go what it does not have
+    assert client.ask(GIMBAL, CONFIGURE, -3, -3, *KEEP) == DONE  # Releases control that it does not have.
     assert gimbal.primary == (254, 190)
 
 
-def test_it_turns_with_limited_speed() -> None:
+def test_turn_rate_is_limited() -> None:
     gimbal, client = claimed(slew_deg_s=30.0)
     assert client.ask(GIMBAL, POINT, -60, 20, NAN, NAN) == DONE
     client.run(1.0)
@@ -104,7 +104,7 @@ def test_it_turns_with_limited_speed() -> None:
     assert math.degrees(euler_from_quaternion(*status.q)[1]) == pytest.approx(-60.0, abs=0.1)
 
 
-def test_it_stays_within_its_limits() -> None:
+def test_angles_are_limited() -> None:
     gimbal, client = claimed(pitch_deg=(-45.0, 10.0))
     client.ask(GIMBAL, POINT, -90, 0, NAN, NAN)
     client.run(3.0)
@@ -116,7 +116,7 @@ def test_it_stays_within_its_limits() -> None:
     assert degrees(gimbal)[1] == pytest.approx(10.0)
 
 
-def test_a_locked_yaw_keeps_its_direction() -> None:
+def test_locked_yaw_keeps_its_direction() -> None:
     gimbal, client = claimed()
     copter = client.vehicle
     assert isinstance(copter, SimulatedCopter)
@@ -132,7 +132,7 @@ def test_a_locked_yaw_keeps_its_direction() -> None:
     assert degrees(gimbal)[2] == pytest.approx(0.0, abs=0.1)
 
 
-def test_messages_steer_it_too() -> None:
+def test_messages_control_the_gimbal() -> None:
     gimbal, client = claimed()
     client.send(m.GimbalManagerSetPitchyaw(1, GIMBAL, 0, 0, math.radians(-20), 0.0, NAN, NAN))
     client.run(2.0)
@@ -149,7 +149,7 @@ def test_messages_steer_it_too() -> None:
     assert degrees(gimbal) == pytest.approx([0.0, 0.0, 0.0])
 
 
-def test_it_looks_at_a_place() -> None:
+def test_gimbal_points_at_a_position() -> None:
     gimbal, client = claimed()
     copter = client.vehicle
     assert isinstance(copter, SimulatedCopter)
@@ -159,7 +159,7 @@ def test_it_looks_at_a_place() -> None:
     client.send(order)
     assert client.last(m.CommandAck).result == MavResult.ACCEPTED
     client.run(4.0)
-    assert degrees(gimbal) == pytest.approx([0.0, 25.0, 90.0], abs=0.5)  # 45 degrees up are more than it can
+    assert degrees(gimbal) == pytest.approx([0.0, 25.0, 90.0], abs=0.5)  # 45 degrees up exceed the limit.
     copter.motion.north = 100.0
     assert degrees(gimbal)[2] == pytest.approx(135.0, abs=0.5)
     assert client.ask(GIMBAL, MavCmd.DO_SET_ROI_NONE) == DONE
@@ -167,7 +167,7 @@ def test_it_looks_at_a_place() -> None:
     assert degrees(gimbal) == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
 
 
-def test_two_gimbals_and_the_autopilot_are_told_apart() -> None:
+def test_commands_select_one_of_two_gimbals() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     _, client = copter_with(one, two, heading_deg=0.0, parameters={"MNT1_TYPE": 1.0})
     client.run(1.0)
@@ -184,7 +184,7 @@ def test_two_gimbals_and_the_autopilot_are_told_apart() -> None:
     assert told == {(1, 1): 1, (1, 154): 154, (1, 171): 171}
 
 
-def test_a_camera_looks_where_its_gimbal_points() -> None:
+def test_camera_has_direction_of_its_gimbal() -> None:
     gimbal = SimulatedGimbal()
     camera = SimulatedCamera(gimbal=gimbal)
     _, client = copter_with(gimbal, camera, heading_deg=90.0)

@@ -1,4 +1,4 @@
-"""Whatever arrives, simulated vehicles go on; tests/fuzz looks for what does not yet."""
+"""Simulated vehicles survive malformed input; tests/fuzz searches for more of it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from aerokit.sim.vehicle import SimulatedVehicle
 KEY = SigningKey(bytes(range(32)))
 
 
-def hearing(vehicle: SimulatedVehicle, *frames: bytes) -> list[Message]:
-    """What it says in the three seconds after it has heard them."""
+def replies_of(vehicle: SimulatedVehicle, *frames: bytes) -> list[Message]:
+    """Return what the vehicle sends in the three seconds after these bytes."""
     vehicle.step(vehicle.now + 3.0)
     vehicle.take_outbox()
     for frame in frames:
@@ -39,32 +39,30 @@ def framed(message: Message, signing: Signing | None = None) -> bytes:
 
 @pytest.mark.parametrize("kind", kind_names())
 @pytest.mark.parametrize("timestamp", [LAST_TIMESTAMP, LAST_TIMESTAMP + 1, (1 << 64) - 1])
-def test_a_time_stamp_at_the_end_of_time(kind: str, timestamp: int) -> None:
+def test_setup_signing_with_last_timestamp_is_survived(kind: str, timestamp: int) -> None:
     vehicle = simulated(kind, boot_time_s=0.0)
-    hearing(vehicle, framed(m.SetupSigning(1, 1, KEY.secret, timestamp)))
+    replies_of(vehicle, framed(m.SetupSigning(1, 1, KEY.secret, timestamp)))
 
 
 @pytest.mark.parametrize("kind", kind_names())
-def test_a_frame_that_is_signed_at_the_end_of_time(kind: str) -> None:
+def test_frame_signed_with_last_timestamp_is_survived(kind: str) -> None:
     vehicle = simulated(kind, boot_time_s=0.0, signing_key=KEY)
     signing = Signing(KEY, link_id=7, timestamp=LAST_TIMESTAMP)
-    hearing(vehicle, framed(m.Heartbeat(6, 8, 0, 0, 4), signing))
+    replies_of(vehicle, framed(m.Heartbeat(6, 8, 0, 0, 4), signing))
 
 
 @pytest.mark.parametrize("kind", ["px4", "px4_plane"])
-@pytest.mark.parametrize(
-    "message", [m.ParamSet(1, 1, "A" * 16, 1.0, 9), m.ParamRequestRead(1, 1, "A" * 16, -1)]
-)
-def test_a_name_that_is_no_text(kind: str, message: Message) -> None:
-    """Each byte that is no UTF-8 becomes three, and the name is told in the answer."""
+@pytest.mark.parametrize("message", [m.ParamSet(1, 1, "A" * 16, 1.0, 9), m.ParamRequestRead(1, 1, "A" * 16, -1)])
+def test_invalid_utf8_name_is_survived(kind: str, message: Message) -> None:
+    """Each byte that is not UTF-8 becomes three, and the answer contains the name."""
     body = framed(message)[:-2].replace(b"A" * 16, b"\xff" * 16)
     crc = x25(body[1:] + bytes((message.CRC_EXTRA,)))
-    (error,) = hearing(simulated(kind, boot_time_s=0.0), body + crc.to_bytes(2, "little"))
+    (error,) = replies_of(simulated(kind, boot_time_s=0.0), body + crc.to_bytes(2, "little"))
     assert isinstance(error, m.ParamError)
     assert error.param_id == "\ufffd" * 5
 
 
-def test_a_place_beyond_the_world() -> None:
+def test_position_out_of_range_is_survived() -> None:
     far = fitted(m.GlobalPositionInt(0, 10**10, -(10**10), 5, 10**12, 0, 0, 0, 70_000))
     assert (far.lat, far.lon, far.alt, far.relative_alt, far.hdg) == (
         2**31 - 1,
@@ -76,10 +74,10 @@ def test_a_place_beyond_the_world() -> None:
     assert far.encode()
 
 
-def test_a_number_beyond_all_numbers() -> None:
+def test_float_beyond_the_range_becomes_infinite() -> None:
     assert fitted(m.VfrHud(-1e300, 1e39, 400_000, 5, math.nan, 0.0)).airspeed == -math.inf
 
 
-def test_what_is_of_a_wrong_type_is_a_mistake_and_stays_one() -> None:
+def test_value_of_wrong_type_raises() -> None:
     wrong = m.Heartbeat("six", 8, 0, 0, 4)  # type: ignore[arg-type]
     assert fitted(wrong) == wrong

@@ -7,13 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame
-from aerokit.sim.motion import Motion, Wind, approach_speed, wrap_pi
+from aerokit.sim.motion import GlobalPoint, LocalFrame, Motion, SimulatedWind, approach_speed, wrap_pi
 
 DT = 0.02
 
 
-def hovering(wind: Wind | None = None, height: float = 20.0) -> Motion:
+def hovering(wind: SimulatedWind | None = None, height: float = 20.0) -> Motion:
     motion = Motion(random.Random(1), wind=wind)
     motion.down = -height
     return motion
@@ -25,7 +24,7 @@ def fly(motion: Motion, seconds: float) -> None:
 
 
 def go_to(motion: Motion, north: float, east: float, down: float, seconds: float) -> float:
-    """Flies there; gives the largest distance beyond the target, along the line of flight."""
+    """Fly to a target and return the largest overshoot along the line of flight."""
     start = (motion.north, motion.east)
     length = math.hypot(north - start[0], east - start[1])
     beyond = 0.0
@@ -36,7 +35,7 @@ def go_to(motion: Motion, north: float, east: float, down: float, seconds: float
     return beyond
 
 
-def test_arrives_and_stays_without_overshooting() -> None:
+def test_motion_arrives_without_overshoot() -> None:
     motion = hovering()
     assert go_to(motion, 60.0, 80.0, -30.0, 40.0) < 0.3
     assert (motion.north, motion.east, motion.down) == pytest.approx((60.0, 80.0, -30.0), abs=0.05)
@@ -48,7 +47,7 @@ def test_arrives_and_stays_without_overshooting() -> None:
     east=st.floats(-300, 300),
     down=st.floats(-100, -1),
 )
-def test_keeps_its_limits_on_the_way(north: float, east: float, down: float) -> None:
+def test_motion_respects_limits(north: float, east: float, down: float) -> None:
     motion = hovering()
     for _ in range(500):
         motion.seek_position(north, east, down, speed=8.0, climb=2.5, descent=1.5)
@@ -59,7 +58,7 @@ def test_keeps_its_limits_on_the_way(north: float, east: float, down: float) -> 
         assert abs(motion.pitch) <= motion.limits.lean_rad + 1e-9
 
 
-def test_leans_forward_to_go_forward_and_back_to_stop() -> None:
+def test_motion_leans_forward_to_start_and_back_to_stop() -> None:
     motion = hovering()
     motion.seek_velocity(10.0, 0.0, 0.0)
     fly(motion, 1.0)
@@ -70,8 +69,8 @@ def test_leans_forward_to_go_forward_and_back_to_stop() -> None:
     assert math.degrees(motion.pitch) > 5
 
 
-def test_hovering_in_wind_leans_into_it() -> None:
-    motion = hovering(Wind(north_m_s=-8.0))
+def test_hovering_in_wind_leans_into_wind() -> None:
+    motion = hovering(SimulatedWind(north_m_s=-8.0))
     motion.seek_velocity(0.0, 0.0, 0.0)
     fly(motion, 5.0)
     assert math.degrees(motion.pitch) < -10
@@ -79,14 +78,14 @@ def test_hovering_in_wind_leans_into_it() -> None:
     assert motion.ground_speed_m_s == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_same_seed_gives_the_same_gusts() -> None:
-    one, other = hovering(Wind(gusts_m_s=2.0)), hovering(Wind(gusts_m_s=2.0))
+def test_gusts_are_deterministic_for_seed() -> None:
+    one, other = hovering(SimulatedWind(gusts_m_s=2.0)), hovering(SimulatedWind(gusts_m_s=2.0))
     fly(one, 5.0)
     fly(other, 5.0)
     assert one.airspeed_m_s == other.airspeed_m_s > 0.0
 
 
-def test_falls_without_power_and_remembers_the_impact() -> None:
+def test_motion_without_power_falls_and_records_impact() -> None:
     motion = hovering(height=20.0)
     while not motion.is_on_ground:
         motion.step(DT, powered=False)
@@ -94,7 +93,7 @@ def test_falls_without_power_and_remembers_the_impact() -> None:
     assert motion.down == 0.0
 
 
-def test_turns_the_short_way_at_its_rate() -> None:
+def test_motion_turns_shortest_way_at_turn_rate() -> None:
     motion = hovering()
     motion.yaw = math.radians(170)
     motion.face(math.radians(-170))
@@ -105,19 +104,19 @@ def test_turns_the_short_way_at_its_rate() -> None:
 
 
 @given(st.floats(-100, 100))
-def test_wrap_pi_keeps_the_direction(angle: float) -> None:
+def test_wrap_pi_keeps_direction(angle: float) -> None:
     assert -math.pi <= wrap_pi(angle) <= math.pi
     assert math.cos(wrap_pi(angle)) == pytest.approx(math.cos(angle), abs=1e-6)
 
 
 @given(st.floats(0, 1000), st.floats(0.1, 5), st.floats(0.1, 10))
-def test_approach_speed_can_still_stop(distance: float, gain: float, deceleration: float) -> None:
+def test_approach_speed_allows_stop_in_time(distance: float, gain: float, deceleration: float) -> None:
     speed = approach_speed(distance, gain, deceleration)
     assert speed * speed / (2 * deceleration) <= distance + 1e-6
 
 
 @given(st.floats(-3000, 3000), st.floats(-3000, 3000), st.floats(-60, 60))
-def test_local_frame_goes_there_and_back(north: float, east: float, latitude: float) -> None:
+def test_local_frame_conversion_round_trips(north: float, east: float, latitude: float) -> None:
     frame = LocalFrame(GlobalPoint(round(latitude * 1e7), 85_000_000, 400.0))
     place = frame.to_global(north, east, -10.0)
     assert frame.to_local(place.latitude_e7, place.longitude_e7) == pytest.approx((north, east), abs=0.02)

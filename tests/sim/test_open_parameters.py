@@ -1,4 +1,4 @@
-"""Programs send NaN for parameters that they leave open; no command with such numbers, or huge ones, ends a vehicle."""
+"""Commands with NaN or huge params do not break a vehicle; programs send NaN for params that they leave unset."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from aerokit.sim import SimulatedCamera, SimulatedGimbal
 from aerokit.sim.kinds import simulated
 
 KINDS = ("copter", "plane", "rover", "sub", "px4", "px4_plane")
+# The vehicle is silent after it.
 LAST = (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN,)
-"""Nothing is heard after it."""
 _ENDS = (*LAST, MavCmd.DO_FLIGHTTERMINATION, MavCmd.COMPONENT_ARM_DISARM)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -1e30])
 @pytest.mark.parametrize("kind", KINDS)
-def test_any_command_with_open_parameters(kind: str, number: float) -> None:
+def test_any_command_with_nan_params_is_answered(kind: str, number: float) -> None:
     devices = (SimulatedCamera(), SimulatedGimbal())
     client = settled(simulated(kind, boot_time_s=0.0, components=devices, parameter_count=100))
     for command in (*(each for each in MavCmd if each not in LAST), *LAST):
@@ -32,7 +32,7 @@ def test_any_command_with_open_parameters(kind: str, number: float) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nan_neither_arms_nor_disarms(kind: str) -> None:
+def test_nan_arms_or_disarms_nothing(kind: str) -> None:
     client = settled(simulated(kind, boot_time_s=0.0))
     results = client.ask(1, MavCmd.COMPONENT_ARM_DISARM, *(math.nan,) * 7)
     assert MavResult.ACCEPTED not in results
@@ -40,8 +40,8 @@ def test_nan_neither_arms_nor_disarms(kind: str) -> None:
 
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 @pytest.mark.parametrize("kind", ["copter", "px4"])
-def test_open_parameters_in_the_air(kind: str, number: float) -> None:
-    """Wherever it then goes, it is somewhere."""
+def test_commands_with_nan_params_in_flight_are_answered(kind: str, number: float) -> None:
+    """The position stays finite."""
     vehicle: Any = simulated(kind, boot_time_s=0.0, components=(SimulatedCamera(), SimulatedGimbal()))
     client = settled(vehicle)
     if kind == "copter":

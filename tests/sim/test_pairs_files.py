@@ -1,4 +1,4 @@
-"""Files and logs between our machines and simulated vehicles over bad radios: MAVFTP, parameter pack, log download."""
+"""Files and logs between the client's protocol machines and simulated vehicles over bad radios."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from aerokit.parameters import unpack_parameters
 from aerokit.protocols.blocks import Reassembly
 from aerokit.protocols.ftp import DATA_SIZE, FtpClient, FtpMessage, FtpRequest
 from aerokit.protocols.ftp_transfer import FtpDownload, FtpUpload
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd, LogList
+from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogList, LogStop
 from aerokit.testing.fault_model import FaultModel
 
-# Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.
+# No shrinking: a failure reports radio and seed, and shrinking a transfer that hangs would take minutes.
 few = settings(max_examples=6, phases=[Phase.generate])
 each = pytest.mark.parametrize("kind", KINDS)
 Op = MavFtpOpcode
 
 
 class Files:
-    """What a program does with a file: request by request, and anew when the vehicle has closed it meanwhile."""
+    """File access of a program, one request at a time; reopens a file that the vehicle has closed."""
 
     def __init__(self, pair: Pair) -> None:
         self.pair = pair
@@ -34,9 +34,7 @@ class Files:
     def ask(self, opcode: MavFtpOpcode, path: str, *, session: int = 0, offset: int = 0) -> FtpMessage:
         data = b"" if opcode == Op.TERMINATESESSION else path.encode()
         return self.pair.run(
-            FtpRequest(
-                self.client, opcode, path=path, session=session, offset=offset, data=data, patience_s=60
-            )
+            FtpRequest(self.client, opcode, path=path, session=session, offset=offset, data=data, idle_timeout_s=60)
         )
 
     def read(self, path: str) -> bytes:
@@ -45,9 +43,7 @@ class Files:
 
         def once(opened: FtpMessage) -> None:
             size = int.from_bytes(opened.data[:4], "little")
-            self.pair.run(
-                FtpDownload(self.client, path, into, session=opened.session, size=size, patience_s=60)
-            )
+            self.pair.run(FtpDownload(self.client, path, into, session=opened.session, size=size, idle_timeout_s=60))
 
         self._with_file(Op.OPENFILERO, path, once)
         return bytes(content)
@@ -57,7 +53,7 @@ class Files:
             Op.CREATEFILE,
             path,
             lambda opened: self.pair.run(
-                FtpUpload(self.client, path, content, session=opened.session, patience_s=60)
+                FtpUpload(self.client, path, content, session=opened.session, idle_timeout_s=60)
             ),
         )
 
@@ -69,14 +65,14 @@ class Files:
                 self.ask(Op.TERMINATESESSION, path, session=opened.session)
                 return
             except FileError:
-                self.pair.wait(12.0)  # until the vehicle has closed what nobody uses
+                self.pair.wait(12.0)  # Wait until the vehicle closes unused sessions.
         raise AssertionError(f"{path} cannot be used")
 
 
 @each
 @few
 @given(radio=radios, seed=seeds, content=st.binary(max_size=4000))
-def test_a_file_is_read_as_it_is(kind: str, radio: FaultModel, seed: int, content: bytes) -> None:
+def test_downloaded_file_equals_the_original(kind: str, radio: FaultModel, seed: int, content: bytes) -> None:
     vehicle = vehicle_of(kind)
     vehicle.files.put("/note", content)
     assert Files(Pair(vehicle, radio, seed)).read("/note") == content
@@ -85,7 +81,7 @@ def test_a_file_is_read_as_it_is(kind: str, radio: FaultModel, seed: int, conten
 @each
 @few
 @given(radio=radios, seed=seeds, content=st.binary(max_size=2000))
-def test_a_file_that_is_written_is_there(kind: str, radio: FaultModel, seed: int, content: bytes) -> None:
+def test_uploaded_file_exists(kind: str, radio: FaultModel, seed: int, content: bytes) -> None:
     vehicle = vehicle_of(kind)
     folder = "/APM" if kind == "copter" else "/fs/microsd"
     vehicle.files.make_folder(f"{folder}/new")
@@ -99,7 +95,7 @@ def test_a_file_that_is_written_is_there(kind: str, radio: FaultModel, seed: int
 
 @few
 @given(radio=radios, seed=seeds)
-def test_the_parameter_pack_is_what_the_vehicle_has(radio: FaultModel, seed: int) -> None:
+def test_parameter_pack_equals_the_parameters(radio: FaultModel, seed: int) -> None:
     vehicle = vehicle_of("copter")
     table = unpack_parameters(Files(Pair(vehicle, radio, seed)).read("@PARAM/param.pck"))
     assert {name: table[name].value for name in table} == pytest.approx(
@@ -110,15 +106,15 @@ def test_the_parameter_pack_is_what_the_vehicle_has(radio: FaultModel, seed: int
 @each
 @few
 @given(radio=radios, seed=seeds)
-def test_logs_are_listed_and_read_as_they_are(kind: str, radio: FaultModel, seed: int) -> None:
+def test_downloaded_logs_equal_the_originals(kind: str, radio: FaultModel, seed: int) -> None:
     pair = Pair(vehicle_of(kind), radio, seed)
-    entries = pair.run(LogList(1, 1, first_id=int(kind == "copter"), patience_s=60))
+    entries = pair.run(LogList(1, 1, first_id=int(kind == "copter"), idle_timeout_s=60))
     assert [(entry.size, entry.time_utc) for entry in entries] == [(log.size, log.time_utc) for log in LOGS]
     for entry, log in zip(entries, LOGS, strict=True):
         content = bytearray()
         into = Reassembly(content.extend, block_size=LOG_BLOCK)
-        pair.run(LogDownload(1, 1, entry.id, entry.size, into, patience_s=60))
+        pair.run(LogDownload(1, 1, entry.id, entry.size, into, idle_timeout_s=60))
         assert bytes(content) == log.make()
-    pair.run(LogEnd(1, 1))
+    pair.run(LogStop(1, 1))
     pair.wait(1.0)
     assert not pair.vehicle.storage.logs.is_busy

@@ -1,4 +1,4 @@
-"""Parameters between our machines and simulated vehicles over bad radios: list, read, write."""
+"""Parameters between the client's protocol machines and simulated vehicles over bad radios: list, read, write."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from aerokit.protocols.parameter_requests import ParameterReads, ParameterWrites
 from aerokit.testing.fault_model import FaultModel
 
 each = pytest.mark.parametrize("kind", KINDS)
-# Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.
+# No shrinking: a failure reports radio and seed, and shrinking a transfer that hangs would take minutes.
 few = settings(max_examples=6, phases=[Phase.generate])
 
 
 @each
 @few
 @given(radio=radios, seed=seeds)
-def test_the_list_is_that_of_the_vehicle(kind: str, radio: FaultModel, seed: int) -> None:
+def test_list_equals_the_parameters(kind: str, radio: FaultModel, seed: int) -> None:
     vehicle = vehicle_of(kind)
     table = Pair(vehicle, radio, seed).run(ParameterList(1, 1, bytewise=kind == "px4"))
     assert {name: table[name].value for name in table} == pytest.approx(
@@ -32,7 +32,7 @@ def test_the_list_is_that_of_the_vehicle(kind: str, radio: FaultModel, seed: int
 
 @few
 @given(radio=radios, seed=seeds)
-def test_a_list_has_the_hash_that_px4_tells(radio: FaultModel, seed: int) -> None:
+def test_list_hash_equals_px4_hash(radio: FaultModel, seed: int) -> None:
     pair = Pair(vehicle_of("px4"), radio, seed)
     table = pair.run(ParameterList(1, 1, bytewise=True))
     told = pair.run(ParameterReads(1, 1, ["_HASH_CHECK"], bytewise=True))["_HASH_CHECK"]
@@ -43,17 +43,13 @@ def test_a_list_has_the_hash_that_px4_tells(radio: FaultModel, seed: int) -> Non
 @each
 @few
 @given(radio=radios, seed=seeds, picks=st.lists(st.integers(0, 59), max_size=12, unique=True))
-def test_what_is_read_is_what_the_vehicle_has(
-    kind: str, radio: FaultModel, seed: int, picks: list[int]
-) -> None:
+def test_read_value_equals_the_parameter(kind: str, radio: FaultModel, seed: int, picks: list[int]) -> None:
     vehicle = vehicle_of(kind)
     known = sorted(vehicle.parameters)
     names = [known[pick] for pick in picks]
-    exchange = ParameterReads(
-        1, 1, [*names, "NOT_THERE"], bytewise=kind == "px4", are_doubtful=True, patience_s=60
-    )
+    exchange = ParameterReads(1, 1, [*names, "NOT_THERE"], bytewise=kind == "px4", probe=True, idle_timeout_s=60)
     answers = Pair(vehicle, radio, seed).run(exchange)
-    assert isinstance(answers.pop("NOT_THERE"), ParameterRejected | ParameterTimeout)  # silence, on both
+    assert isinstance(answers.pop("NOT_THERE"), ParameterRejected | ParameterTimeout)  # Neither answers.
     assert {name: answer.value for name, answer in answers.items() if isinstance(answer, Parameter)} == (
         pytest.approx({name: vehicle.parameters[name] for name in names}, rel=1e-6)
     )
@@ -62,15 +58,13 @@ def test_what_is_read_is_what_the_vehicle_has(
 @each
 @few
 @given(radio=radios, seed=seeds, values=st.lists(st.integers(0, 9), min_size=1, max_size=8))
-def test_what_is_written_is_there_and_nothing_else_changes(
-    kind: str, radio: FaultModel, seed: int, values: list[int]
-) -> None:
+def test_set_changes_only_its_parameter(kind: str, radio: FaultModel, seed: int, values: list[int]) -> None:
     vehicle = vehicle_of(kind)
     table = Pair(vehicle).run(ParameterList(1, 1, bytewise=kind == "px4"))
     before = {name: vehicle.parameters[name] for name in vehicle.parameters}
     names = [name for name in table if not name.startswith(("STAT_", "MAV_", "SYSID", "FORMAT"))][5:]
     wanted = [table[name].replace(value=value) for name, value in zip(names, values, strict=False)]
-    exchange = ParameterWrites(1, 1, wanted, bytewise=kind == "px4", patience_s=60)
+    exchange = ParameterWrites(1, 1, wanted, bytewise=kind == "px4", idle_timeout_s=60)
     answers = Pair(vehicle, radio, seed).run(exchange)
     for one in wanted:
         answer = answers[one.name]

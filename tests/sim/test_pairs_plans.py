@@ -1,4 +1,4 @@
-"""Missions, fences and rally points between our machines and simulated vehicles over bad radios."""
+"""Missions, fences and rally points between the client's protocol machines and simulated vehicles over bad radios."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
 from aerokit.protocols.mission_download import MissionDownload
 from aerokit.protocols.mission_upload import MissionUpload
-from aerokit.protocols.missions import MissionClear, MissionSetCurrent
+from aerokit.protocols.missions import MissionClear, SetCurrentItem
 from aerokit.testing.fault_model import FaultModel
 
-# Without shrinking: what fails says radio and seed, and a transfer that hangs would take minutes to shrink.
+# No shrinking: a failure reports radio and seed, and shrinking a transfer that hangs would take minutes.
 few = settings(max_examples=6, phases=[Phase.generate])
 each = pytest.mark.parametrize("kind", KINDS)
 GLOBAL = MavFrame.GLOBAL_RELATIVE_ALT
@@ -40,10 +40,10 @@ def places_of(items: Sequence[MissionItem | None]) -> list[tuple[int, float, flo
 
 
 def download(pair: Pair, mission_type: int) -> list[tuple[int, float, float, float]]:
-    """What is on the vehicle, without home."""
+    """Return the items on the vehicle, without home."""
     window = 1 if pair.is_px4 else 4
-    came = pair.run(MissionDownload(1, 1, mission_type=mission_type, window=window, patience_s=60)).items
-    pair.wait(6.0)  # PX4 is busy until it has our acknowledgement, or has given up to wait for it
+    came = pair.run(MissionDownload(1, 1, mission_type=mission_type, window=window, idle_timeout_s=60)).items
+    pair.wait(6.0)  # PX4 is busy until it has our acknowledgement or times out.
     return places_of(came[mission_type == MISSION and not pair.is_px4 :])
 
 
@@ -51,7 +51,7 @@ def download(pair: Pair, mission_type: int) -> list[tuple[int, float, float, flo
 @pytest.mark.parametrize("mission_type", [MISSION, FENCE, POINTS])
 @few
 @given(radio=radios, seed=seeds, corners=st.lists(places, min_size=3, max_size=12), window=st.integers(1, 6))
-def test_a_plan_goes_up_and_comes_down_as_it_was(
+def test_downloaded_plan_equals_the_upload(
     kind: str, mission_type: int, radio: FaultModel, seed: int, corners: list[tuple[int, int]], window: int
 ) -> None:
     pair = Pair(vehicle_of(kind), radio, seed)
@@ -59,30 +59,28 @@ def test_a_plan_goes_up_and_comes_down_as_it_was(
     with_home = [item(WAYPOINT, 0), *items] if mission_type == MISSION and kind == "copter" else items
     for attempt in range(3):
         upload = MissionUpload(
-            1, 1, with_home, window=window if attempt == 0 else 1, mission_type=mission_type, patience_s=60
+            1, 1, with_home, window=window if attempt == 0 else 1, mission_type=mission_type, idle_timeout_s=60
         )
-        if pair.run(upload).is_sure:
+        if pair.run(upload).is_confirmed:
             break
         pair.wait(10.0)
     pair.wait(6.0)
     assert download(pair, mission_type) == places_of(items)
     assert download(Pair(pair.vehicle), mission_type) == places_of(items)
-    pair.run(MissionClear(1, 1, mission_type=mission_type, patience_s=60))
+    pair.run(MissionClear(1, 1, mission_type=mission_type, idle_timeout_s=60))
     assert download(pair, mission_type) == []
 
 
 @each
 @few
 @given(radio=radios, seed=seeds, seq=st.integers(1, 5))
-def test_the_current_item_is_the_one_that_was_wanted(
-    kind: str, radio: FaultModel, seed: int, seq: int
-) -> None:
+def test_set_current_selects_the_item(kind: str, radio: FaultModel, seed: int, seq: int) -> None:
     vehicle = vehicle_of(kind)
     items = plan_of(MISSION, [(47_390_0000, 8_540_0000 + n) for n in range(6)])
-    assert Pair(vehicle).run(MissionUpload(1, 1, items, window=1)).is_sure
+    assert Pair(vehicle).run(MissionUpload(1, 1, items, window=1)).is_confirmed
     pair = Pair(vehicle, radio, seed)
     vehicle.channels[0].streams.set_interval(MissionCurrent.ID, 1.0, pair.now)
-    pair.run(MissionSetCurrent(1, 1, seq, patience_s=60))
+    pair.run(SetCurrentItem(1, 1, seq, idle_timeout_s=60))
     told = vehicle.build(MissionCurrent.ID)
     assert isinstance(told, MissionCurrent)
     assert told.seq == seq

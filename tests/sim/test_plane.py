@@ -15,7 +15,7 @@ from aerokit.events import StatusTextReceived
 from aerokit.mavlink.enums import MavCmd, MavResult, MavType, PlaneMode
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.missions import Mission, MissionItem
-from aerokit.sim import Wind, simulated_link
+from aerokit.sim import SimulatedWind, simulated_link
 from aerokit.sim.ardupilot import SimulatedPlane
 from aerokit.testing import VIRTUAL_BACKEND
 
@@ -41,14 +41,14 @@ async def take_off(vehicle: aerokit.Vehicle) -> None:
 
 
 def item(plane: SimulatedPlane, command: int, *place: float, turns: float = 0.0) -> MissionItem:
-    """One that leads north, east and up in metres from where the plane was switched on."""
+    """Return an item at metres north, east and up from the power-on location."""
     north, east, up = place
     point = plane.navigation.frame.to_global(north, east, 0.0)
     x, y = point.latitude_e7, point.longitude_e7
     return MissionItem(command=command, frame=3, param1=turns, x=x, y=y, z=up)
 
 
-async def test_is_an_aeroplane_on_the_ground() -> None:
+async def test_plane_identifies_itself_on_ground() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:
         assert (vehicle.autopilot.firmware, vehicle.mode.value.name) == ("ArduPlane", "MANUAL")
@@ -57,7 +57,7 @@ async def test_is_an_aeroplane_on_the_ground() -> None:
         assert (heartbeat.type, heartbeat.base_mode, heartbeat.system_status) == (MavType.FIXED_WING, 81, 3)
 
 
-async def test_takes_off_goes_holds_returns_and_lands() -> None:
+async def test_plane_flies_from_take_off_to_landing() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:
         await take_off(vehicle)
@@ -71,9 +71,7 @@ async def test_takes_off_goes_holds_returns_and_lands() -> None:
         await vehicle.return_to_launch()
         await asyncio.sleep(60.0)
         assert plane.altitude_m == pytest.approx(100.0, abs=2.0)
-        assert vehicle.distance_to(Position(home.latitude_deg, home.longitude_deg)) == pytest.approx(
-            80.0, abs=8.0
-        )
+        assert vehicle.distance_to(Position(home.latitude_deg, home.longitude_deg)) == pytest.approx(80.0, abs=8.0)
         await vehicle.land()
         assert plane.is_landed
         assert plane.wing.impact_speed_m_s < 1.0
@@ -81,7 +79,7 @@ async def test_takes_off_goes_holds_returns_and_lands() -> None:
         assert not plane.is_armed
 
 
-async def test_speed_is_airspeed_within_its_limits() -> None:
+async def test_change_speed_sets_airspeed_within_limits() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:
         await take_off(vehicle)
@@ -94,7 +92,7 @@ async def test_speed_is_airspeed_within_its_limits() -> None:
         assert error.value.result == MavResult.FAILED
 
 
-async def test_autoland_is_for_the_air() -> None:
+async def test_autoland_on_ground_is_refused() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:
         await vehicle.arm()
@@ -102,8 +100,8 @@ async def test_autoland_is_for_the_air() -> None:
             await vehicle.set_mode("AUTOLAND")
 
 
-async def test_after_an_autoland_it_arms_and_disarms_by_itself() -> None:
-    """As the real one: the landing is still complete. `arm` leaves the mode first."""
+async def test_arming_after_autoland_disarms_again() -> None:
+    """Match the firmware, where the landing is still complete. `arm` leaves the mode first."""
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:
         await take_off(vehicle)
@@ -114,16 +112,16 @@ async def test_after_an_autoland_it_arms_and_disarms_by_itself() -> None:
             ack = await vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 1)
             assert ack.result == MavResult.ACCEPTED
             await asyncio.sleep(2.0)
-            said = [each.text for each in iter(texts.get_nowait, None)]
-        assert said == ["Throttle armed", "Throttle disarmed", "Auto disarmed"]
+            received = [text.text for text in iter(texts.get_nowait, None)]
+        assert received == ["Throttle armed", "Throttle disarmed", "Auto disarmed"]
         assert (plane.is_armed, vehicle.mode_name) == (False, "AUTOLAND")
         await vehicle.arm()
         await asyncio.sleep(5.0)
         assert (plane.is_armed, vehicle.mode_name) == (True, "FBWA")
 
 
-async def test_circles_in_the_wind() -> None:
-    plane = SimulatedPlane(boot_time_s=1.0, wind=Wind(4.0, -3.0))
+async def test_loiter_circle_is_kept_in_wind() -> None:
+    plane = SimulatedPlane(boot_time_s=1.0, wind=SimulatedWind(4.0, -3.0))
     async with flown(plane) as vehicle:
         await take_off(vehicle)
         await vehicle.set_mode("LOITER")
@@ -134,7 +132,7 @@ async def test_circles_in_the_wind() -> None:
         assert off == pytest.approx(80.0, abs=8.0)
 
 
-async def test_flies_a_mission_and_lands() -> None:
+async def test_plane_flies_mission_and_lands() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with flown(plane) as vehicle:
         mission = Mission(
@@ -156,7 +154,7 @@ async def test_flies_a_mission_and_lands() -> None:
         assert abs(plane.wing.north) < 60.0
 
 
-async def test_says_when_its_throttle_is_armed() -> None:
+async def test_arming_sends_throttle_armed_text() -> None:
     async with flown(SimulatedPlane(boot_time_s=1.0)) as vehicle:
         with vehicle.subscribe(StatusTextReceived, capacity=10) as texts:
             await vehicle.arm()

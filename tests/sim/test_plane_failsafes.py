@@ -1,4 +1,4 @@
-"""ArduPlane's failsafes: radio (short and long), ground station, battery; each action, each text."""
+"""Actions and texts of ArduPlane's failsafes: radio (short and long), ground station, battery."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEARTBEAT = {"FS_GCS_ENABL": 1.0}
 # ------------------------------------------------------------------------------------------- short
 
 
-def test_a_pilot_without_a_radio_circles_and_then_returns() -> None:
+def test_radio_failsafe_circles_then_returns() -> None:
     plane, client = flying_plane(PlaneMode.FLY_BY_WIRE_A)
     plane.faults.rc_lost = True
     client.run(1.15)
@@ -43,7 +43,7 @@ def test_a_pilot_without_a_radio_circles_and_then_returns() -> None:
     assert client.texts[2:] == ["RC Long Failsafe On: RTL"]
 
 
-def test_a_radio_that_comes_back_soon_gives_the_mode_back() -> None:
+def test_early_radio_recovery_restores_mode() -> None:
     plane, client = flying_plane(PlaneMode.FLY_BY_WIRE_A)
     plane.faults.rc_lost = True
     client.run(2.0)
@@ -60,7 +60,7 @@ def test_a_radio_that_comes_back_soon_gives_the_mode_back() -> None:
     assert healthy(client, Sensor.RC_RECEIVER)
 
 
-def test_a_radio_that_comes_back_late_changes_no_mode() -> None:
+def test_late_radio_recovery_keeps_mode() -> None:
     plane, client = flying_plane(PlaneMode.CRUISE)
     plane.faults.rc_lost = True
     client.run(7.0)
@@ -82,7 +82,7 @@ def test_a_radio_that_comes_back_late_changes_no_mode() -> None:
         (2, PlaneMode.MANUAL, PlaneMode.FLY_BY_WIRE_A),
     ],
 )
-def test_the_short_action_is_configured(action: int, mode: int, then: int) -> None:
+def test_short_failsafe_executes_configured_action(action: int, mode: int, then: int) -> None:
     plane, client = flying_plane(mode, FS_SHORT_ACTN=float(action))
     plane.faults.rc_lost = True
     client.run(2.0)
@@ -91,7 +91,7 @@ def test_the_short_action_is_configured(action: int, mode: int, then: int) -> No
     assert client.texts[1] == (switched if mode != then else "RC Short Failsafe On")
 
 
-def test_without_the_short_one_the_long_one_counts_from_the_last_pulse() -> None:
+def test_long_failsafe_without_short_counts_from_last_pulse() -> None:
     plane, client = flying_plane(FS_SHORT_ACTN=3.0)
     plane.faults.rc_lost = True
     client.run(4.9)
@@ -100,7 +100,7 @@ def test_without_the_short_one_the_long_one_counts_from_the_last_pulse() -> None
     assert client.texts[1:] == ["RC Long Failsafe On: RTL"]
 
 
-def test_a_low_throttle_is_a_lost_radio() -> None:
+def test_low_throttle_triggers_radio_failsafe() -> None:
     plane, client = flying_plane()
     plane.parameters["SIM_RC_FAIL"] = 2.0
     client.run(0.5)
@@ -108,7 +108,7 @@ def test_a_low_throttle_is_a_lost_radio() -> None:
 
 
 @pytest.mark.parametrize("enabled", [0.0, 2.0])
-def test_without_the_throttle_failsafe_only_sys_status_knows(enabled: float) -> None:
+def test_disabled_throttle_failsafe_shows_in_sys_status_only(enabled: float) -> None:
     plane, client = flying_plane(THR_FAILSAFE=enabled)
     plane.faults.rc_lost = True
     client.run(8.0)
@@ -131,7 +131,7 @@ def test_without_the_throttle_failsafe_only_sys_status_knows(enabled: float) -> 
         (1, PlaneMode.AUTOLAND, PlaneMode.AUTOLAND),
     ],
 )
-def test_the_long_action_is_configured(action: int, mode: int, then: int) -> None:
+def test_long_failsafe_executes_configured_action(action: int, mode: int, then: int) -> None:
     plane, client = flying_plane(mode, FS_SHORT_ACTN=3.0, FS_LONG_ACTN=float(action), **HEARTBEAT)
     lose_ground_station(client, 5.5)
     assert plane.mode.number == then
@@ -139,7 +139,7 @@ def test_the_long_action_is_configured(action: int, mode: int, then: int) -> Non
     assert client.texts == ([] if landing else [f"GCS Failsafe On: {plane.mode.name}"])
 
 
-def test_the_long_one_waits_for_the_end_of_a_take_off() -> None:
+def test_long_failsafe_waits_for_end_of_take_off() -> None:
     plane, client = ready_plane(**HEARTBEAT)
     assert set_mode(client, PlaneMode.TAKEOFF) == MavResult.ACCEPTED
     plane.arming.arm()
@@ -156,7 +156,7 @@ def test_the_long_one_waits_for_the_end_of_a_take_off() -> None:
 # ---------------------------------------------------------------------------------- ground station
 
 
-def test_a_ground_station_that_comes_back_is_told() -> None:
+def test_ground_station_recovery_is_reported() -> None:
     plane, client = flying_plane(**HEARTBEAT)
     lose_ground_station(client, 4.9)
     assert client.texts == []
@@ -170,19 +170,19 @@ def test_a_ground_station_that_comes_back_is_told() -> None:
     assert client.last(m.Heartbeat).system_status == MavState.ACTIVE
 
 
-def test_a_ground_station_that_was_never_heard_is_not_missed() -> None:
+def test_ground_station_never_seen_triggers_no_failsafe() -> None:
     plane, client = flying_plane(**HEARTBEAT)
     client.run(8.0)
     assert plane.mode.number == PlaneMode.LOITER
 
 
-def test_the_ground_station_may_matter_only_in_auto() -> None:
+def test_ground_station_failsafe_can_be_limited_to_auto() -> None:
     plane, client = flying_plane(FS_GCS_ENABL=3.0)
     lose_ground_station(client, 8.0)
     assert (client.texts, plane.mode.number) == ([], PlaneMode.LOITER)
 
 
-def test_it_acts_disarmed_too_and_is_not_armed_then() -> None:
+def test_radio_failsafe_while_disarmed_acts_and_prevents_arming() -> None:
     plane, client = ready_plane()
     plane.faults.rc_lost = True
     client.run(4.0)
@@ -200,7 +200,7 @@ def test_it_acts_disarmed_too_and_is_not_armed_then() -> None:
 # ----------------------------------------------------------------------------------------- battery
 
 
-def test_a_low_battery_returns_and_a_critical_one_finds_no_landing() -> None:
+def test_low_battery_returns_and_critical_lacks_landing_sequence() -> None:
     plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=1.0, BATT_FS_CRT_ACT=2.0)
     drain(plane, client, LOW)
     assert plane.mode.number == PlaneMode.RTL
@@ -215,7 +215,7 @@ def test_a_low_battery_returns_and_a_critical_one_finds_no_landing() -> None:
     assert plane.mode.number == PlaneMode.RTL
 
 
-def test_a_lesser_action_does_not_follow_a_graver_one() -> None:
+def test_less_severe_battery_action_is_not_executed() -> None:
     plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=2.0, BATT_FS_CRT_ACT=1.0)
     drain(plane, client, LOW)
     assert set_mode(client, PlaneMode.LOITER) == MavResult.ACCEPTED
@@ -223,17 +223,15 @@ def test_a_lesser_action_does_not_follow_a_graver_one() -> None:
     assert plane.mode.number == PlaneMode.LOITER
 
 
-@pytest.mark.parametrize(
-    ("action", "then"), [(0, PlaneMode.LOITER), (7, PlaneMode.AUTOLAND), (3, PlaneMode.LOITER)]
-)
-def test_what_else_a_low_battery_does(action: int, then: int) -> None:
+@pytest.mark.parametrize(("action", "then"), [(0, PlaneMode.LOITER), (7, PlaneMode.AUTOLAND), (3, PlaneMode.LOITER)])
+def test_low_battery_executes_other_actions(action: int, then: int) -> None:
     plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=float(action))
     drain(plane, client, LOW)
     assert plane.mode.number == then
     assert plane.is_armed
 
 
-def test_a_low_battery_lands_where_the_mission_says() -> None:
+def test_low_battery_lands_at_mission_landing_sequence() -> None:
     plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=2.0)
     place = plane.frame.to_global(1500.0, 0.0, 0.0)
     x, y = place.latitude_e7, place.longitude_e7
@@ -244,7 +242,7 @@ def test_a_low_battery_lands_where_the_mission_says() -> None:
     assert plane.mission.nav_index == 3
 
 
-def test_a_flight_is_not_terminated() -> None:
+def test_flight_termination_is_refused() -> None:
     plane, client = flying_plane(**BATTERY, BATT_FS_LOW_ACT=3.0)
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.FAILED
     assert client.texts == ["AFS not enabled, can't terminate the vehicle"]
@@ -254,7 +252,7 @@ def test_a_flight_is_not_terminated() -> None:
     assert plane.is_armed
 
 
-def test_it_returns_even_when_it_does_not_know_where_it_is() -> None:
+def test_radio_failsafe_returns_without_position() -> None:
     plane, client = flying_plane(**HEARTBEAT)
     plane.faults.gps_lost = True
     client.run(11.0)

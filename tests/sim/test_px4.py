@@ -1,4 +1,4 @@
-"""The simulated PX4 beside what real firmwares (v1.16.1, v1.17-alpha) were seen to do."""
+"""The simulated PX4 behaves as real firmware (v1.16.1, v1.17-alpha) was observed to."""
 
 from __future__ import annotations
 
@@ -40,9 +40,7 @@ def ready_px4(**options: object) -> tuple[SimulatedPx4, Client]:
 
 def flying_px4(altitude_m: float = 10.0, **options: object) -> tuple[SimulatedPx4, Client]:
     px4, client = ready_px4(**options)
-    assert (
-        client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 489.4 + altitude_m) == MavResult.ACCEPTED
-    )
+    assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 489.4 + altitude_m) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.ACCEPTED
     client.run_until(lambda: px4.mode == (4, 3), 40.0)
     client.run(5.0)
@@ -51,7 +49,7 @@ def flying_px4(altitude_m: float = 10.0, **options: object) -> tuple[SimulatedPx
 
 
 def set_mode(client: Client, main: int, sub: int = 0) -> list[int]:
-    """Both answers."""
+    """Return both answers."""
     client.forget()
     client.command(MavCmd.DO_SET_MODE, 1, main, sub)
     return [ack.result for ack in client.all(m.CommandAck)]
@@ -71,7 +69,7 @@ def stream_velocity(client: Client, seconds: float, velocity: tuple[float, float
 # -------------------------------------------------------------------------------------------- boot
 
 
-def test_streams_without_being_asked() -> None:
+def test_default_streams_are_sent() -> None:
     client = Client(SimulatedPx4(home=PX4_HOME))
     client.run(30.0)
     kinds = Counter(message.NAME for _, message in client.heard)
@@ -107,7 +105,7 @@ def test_boot_states_flags_and_health_as_recorded() -> None:
     assert client.texts[0] == "Preflight Fail: heading estimate invalid"
 
 
-def test_arming_too_early_is_refused_without_a_text() -> None:
+def test_arming_during_boot_fails_without_text() -> None:
     client = Client(SimulatedPx4(home=PX4_HOME))
     client.run(0.5)
     assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
@@ -118,7 +116,7 @@ def test_arming_too_early_is_refused_without_a_text() -> None:
 # ------------------------------------------------------------------------------------ arm, take off
 
 
-def test_arming_is_denied_with_texts_after_the_answer() -> None:
+def test_arming_denial_sends_texts_after_acknowledgement() -> None:
     px4, client = ready_px4()
     px4.faults.prearm_failures = ["Compass 0 fault"]
     assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
@@ -128,12 +126,10 @@ def test_arming_is_denied_with_texts_after_the_answer() -> None:
         "Preflight Fail: Compass 0 fault",
     ]
     assert type(client.heard[0][1]) is m.CommandAck
-    assert client.command(ARM, 1, 21196.0) == MavResult.TEMPORARILY_REJECTED, (
-        "external commands are always checked"
-    )
+    assert client.command(ARM, 1, 21196.0) == MavResult.TEMPORARILY_REJECTED, "external commands are always checked"
 
 
-def test_take_off_is_accepted_disarmed_and_takes_as_long_as_the_real_one() -> None:
+def test_take_off_has_duration_of_the_real_one() -> None:
     px4, client = ready_px4()
     assert client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 499.4) == MavResult.ACCEPTED
     client.run(3.0)
@@ -163,14 +159,14 @@ def test_take_off_without_an_altitude_uses_the_parameter() -> None:
     assert px4.altitude_m == pytest.approx(2.5, abs=0.1)
 
 
-def test_an_armed_vehicle_that_does_nothing_is_disarmed() -> None:
+def test_idle_armed_vehicle_is_disarmed() -> None:
     px4, client = ready_px4()
     client.command(ARM, 1)
     assert client.run_until(lambda: not px4.is_armed) == pytest.approx(10.0, abs=0.2)
     assert client.texts[-1] == "Disarmed by auto preflight disarming\t"
 
 
-def test_disarming_in_the_air_is_refused_with_a_text() -> None:
+def test_disarming_in_flight_is_refused_with_text() -> None:
     px4, client = flying_px4()
     assert client.command(ARM, 0) == MavResult.TEMPORARILY_REJECTED
     assert client.texts == ["Disarming denied: not landed\t"]
@@ -182,7 +178,7 @@ def test_disarming_in_the_air_is_refused_with_a_text() -> None:
 # ------------------------------------------------------------------------------------------- modes
 
 
-def test_modes_are_acknowledged_twice_and_only_the_heartbeat_tells() -> None:
+def test_mode_change_is_acknowledged_twice() -> None:
     _, client = flying_px4()
     assert set_mode(client, 4, 6) == [MavResult.ACCEPTED, MavResult.ACCEPTED]
     assert client.all(m.Heartbeat) == []
@@ -194,14 +190,14 @@ def test_modes_are_acknowledged_twice_and_only_the_heartbeat_tells() -> None:
     assert mode(client) == HOLD
 
 
-def test_the_old_set_mode_message_is_acknowledged_once() -> None:
+def test_set_mode_message_is_acknowledged_once() -> None:
     _, client = ready_px4()
     client.send(m.SetMode(1, 1, TAKEOFF))
     assert [ack.result for ack in client.all(m.CommandAck)] == [MavResult.ACCEPTED]
     assert mode(client) == TAKEOFF
 
 
-def test_modes_without_what_they_need_are_refused_in_the_air() -> None:
+def test_modes_without_requirements_are_refused_in_flight() -> None:
     _, client = flying_px4()
     assert set_mode(client, 6) == [MavResult.ACCEPTED, MavResult.TEMPORARILY_REJECTED], "no set-points"
     assert set_mode(client, 4, 4) == [MavResult.ACCEPTED, MavResult.TEMPORARILY_REJECTED], "no mission"
@@ -224,12 +220,10 @@ def test_reposition_holds_at_an_amsl_altitude() -> None:
     assert client.command(MavCmd.DO_REPOSITION, -1, 0) == MavResult.UNSUPPORTED
 
 
-def test_return_climbs_comes_home_lands_disarms_and_holds_again() -> None:
+def test_return_climbs_lands_and_disarms_at_home() -> None:
     px4, client = flying_px4()
     there = px4.frame.to_global(34.0, 23.0, 0.0)
-    client.command(
-        MavCmd.DO_REPOSITION, -1, 1, 0, NAN, there.latitude_e7 / 1e7, there.longitude_e7 / 1e7, 502.4
-    )
+    client.command(MavCmd.DO_REPOSITION, -1, 1, 0, NAN, there.latitude_e7 / 1e7, there.longitude_e7 / 1e7, 502.4)
     client.run(20.0)
     client.forget()
     assert client.command(MavCmd.NAV_RETURN_TO_LAUNCH) == MavResult.ACCEPTED
@@ -248,9 +242,7 @@ def test_return_climbs_comes_home_lands_disarms_and_holds_again() -> None:
     assert math.hypot(px4.motion.north, px4.motion.east) < 0.6
     assert mode(client) == HOLD
     own = client.all(m.CommandLong)
-    assert [(c.target_system, c.target_component, c.command) for c in own] == [
-        (1, 0, MavCmd.NAV_RETURN_TO_LAUNCH)
-    ]
+    assert [(c.target_system, c.target_component, c.command) for c in own] == [(1, 0, MavCmd.NAV_RETURN_TO_LAUNCH)]
 
 
 def test_landing() -> None:
@@ -264,15 +256,13 @@ def test_landing() -> None:
 # ---------------------------------------------------------------------------------------- offboard
 
 
-def test_offboard_flies_velocities_while_they_come() -> None:
+def test_offboard_flies_streamed_velocities() -> None:
     px4, client = flying_px4()
     stream_velocity(client, 1.0, (0.0, 0.0, 0.0))
     assert set_mode(client, 6) == [MavResult.ACCEPTED, MavResult.ACCEPTED]
     stream_velocity(client, 5.0, (3.0, -1.0, -0.5))
     motion = px4.motion
-    assert (motion.velocity_north, motion.velocity_east, motion.velocity_down) == pytest.approx(
-        (3, -1, -0.5), abs=0.1
-    )
+    assert (motion.velocity_north, motion.velocity_east, motion.velocity_down) == pytest.approx((3, -1, -0.5), abs=0.1)
     assert client.last(m.Heartbeat).custom_mode == OFFBOARD
 
 
@@ -308,7 +298,7 @@ def test_offboard_can_take_off() -> None:
 
 
 @pytest.mark.parametrize(("version", "action"), [("1.16.1", POSITION), ("1.17.0-alpha", RTL)])
-def test_lost_setpoints_are_acted_on_at_once(version: str, action: int) -> None:
+def test_lost_setpoints_trigger_the_failsafe(version: str, action: int) -> None:
     _, client = flying_px4(version=version)
     stream_velocity(client, 1.0, (1.0, 0.0, 0.0))
     set_mode(client, 6)
@@ -319,7 +309,7 @@ def test_lost_setpoints_are_acted_on_at_once(version: str, action: int) -> None:
     assert "Failsafe activated\t" in client.texts
 
 
-def test_it_goes_on_with_setpoints_that_come_back() -> None:
+def test_offboard_resumes_with_new_setpoints() -> None:
     _, client = flying_px4()
     stream_velocity(client, 1.0, (1.0, 0.0, 0.0))
     set_mode(client, 6)
@@ -345,7 +335,7 @@ def test_attitude_setpoints() -> None:
 # ------------------------------------------------------------------------------------ link protocol
 
 
-def test_requested_messages_come_before_their_answer() -> None:
+def test_requested_message_precedes_its_acknowledgement() -> None:
     _, client = ready_px4()
     assert client.command(MavCmd.REQUEST_MESSAGE, m.AutopilotVersion.ID) == MavResult.ACCEPTED
     assert [type(message) for _, message in client.heard] == [m.AutopilotVersion, m.CommandAck]
@@ -366,7 +356,7 @@ def test_intervals_can_be_changed_and_reset() -> None:
     assert client.last(m.MessageInterval).interval_us == 250_000
 
 
-def test_modes_named_by_the_standard_have_no_name() -> None:
+def test_standard_modes_have_no_name() -> None:
     _, client = ready_px4()
     client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 0)
     modes = client.all(m.AvailableModes)
@@ -382,7 +372,7 @@ def test_calibration_texts() -> None:
     assert client.texts[-1] == "[cal] calibration done: gyro"
 
 
-def test_integers_travel_as_their_bytes() -> None:
+def test_integer_parameters_are_encoded_bytewise() -> None:
     px4, client = ready_px4()
     client.send(m.ParamRequestList(1, 1))
     client.run(1.0)
@@ -402,7 +392,7 @@ def test_integers_travel_as_their_bytes() -> None:
     assert len(client.all(m.ParamValue)) == 2
 
 
-def test_setting_the_hash_ends_a_running_list() -> None:
+def test_setting_the_hash_stops_the_list() -> None:
     px4, client = ready_px4()
     client.send(m.ParamRequestList(1, 1))
     client.send(m.ParamSet(1, 1, "_HASH_CHECK", 0.0, 5))
@@ -410,7 +400,7 @@ def test_setting_the_hash_ends_a_running_list() -> None:
     assert 0 < len(client.all(m.ParamValue)) < len(px4.parameters)
 
 
-def test_losing_gps_takes_the_position_away() -> None:
+def test_lost_gps_drops_the_position() -> None:
     px4, client = ready_px4()
     px4.faults.gps_lost = True
     client.run(3.0)
@@ -430,7 +420,7 @@ def test_home_set_by_hand_has_no_attitude() -> None:
     assert math.isnan(home.q[0])
 
 
-def test_a_reboot_starts_over() -> None:
+def test_reboot_resets_the_state() -> None:
     px4, client = ready_px4()
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == MavResult.ACCEPTED
     client.run(0.3)
@@ -453,14 +443,14 @@ def test_any_command_is_answered(command: int, numbers: tuple[float, ...], flyin
     client.command(command, *numbers)
     client.run(15.0)
     finals = [ack for ack in client.all(m.CommandAck) if ack.result != MavResult.IN_PROGRESS]
-    at_most = 2 if command == MavCmd.DO_SET_MODE else 1  # a part of it that does not run here answers nothing
+    at_most = 2 if command == MavCmd.DO_SET_MODE else 1  # A module that does not run here does not answer.
     assert at_most - 1 <= len(finals) <= at_most
     assert client.framer.statistics.bad_crcs == 0
 
 
 @settings(max_examples=15)
 @given(mask=st.integers(0, 0xFFF), frame=st.integers(0, 21), numbers=st.tuples(*(st.floats(width=32),) * 11))
-def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
+def test_any_setpoint_is_handled(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
     rates_and_thrust = numbers[4], numbers[5], numbers[6], numbers[7]
     px4, client = flying_px4(3.0)
     for _ in range(8):

@@ -1,4 +1,4 @@
-"""What a simulated PX4 answers, beside what real firmware (v1.17-alpha) was seen to answer."""
+"""Answers of the simulated PX4, compared with real firmware (v1.17-alpha)."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def test_results(command: int, param1: float, result: int) -> None:
     "command",
     [MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.SET_CAMERA_MODE, MavCmd.DO_WINCH, MavCmd.NAV_DELAY],
 )
-def test_nobody_answers_for_parts_that_do_not_run(command: int) -> None:
+def test_commands_of_missing_modules_are_not_answered(command: int) -> None:
     _, client = ready()
     assert client.command(command) is None
     client.run(2.0)
     assert client.all(m.CommandAck) == []
 
 
-def test_an_arming_param_that_is_neither_is_told_and_not_answered() -> None:
+def test_invalid_arm_param_sends_text_without_answer() -> None:
     _, client = ready()
     assert client.command(ARM, 2) is None
     assert client.texts == ["Unsupported ARM_DISARM param: 2.000\t"]
@@ -90,7 +90,7 @@ def test_some_modes_cannot_be_armed_in() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED
 
 
-def test_every_arming_but_the_first_begins_a_log() -> None:
+def test_each_arming_after_the_first_starts_log() -> None:
     _, client = ready(unix_time_at_boot=1_790_000_000.0)
     for logs in (0, 1):
         client.forget()
@@ -122,7 +122,7 @@ def test_precision_landing_lands() -> None:
     assert px4.mode == HOLD
 
 
-def test_disarmed_by_force_while_it_lifts_off_it_lands_and_flies_again() -> None:
+def test_forced_disarm_during_take_off_allows_new_flight() -> None:
     px4, client = ready()
     client.command(MavCmd.DO_SET_MODE, 1, 4, 2)
     client.command(ARM, 1)
@@ -137,7 +137,7 @@ def test_disarmed_by_force_while_it_lifts_off_it_lands_and_flies_again() -> None
     assert client.texts[-1] == "Takeoff detected\t"
 
 
-def test_a_terminated_flight_falls_and_is_over() -> None:
+def test_terminated_flight_falls() -> None:
     px4, client = flying()
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.ACCEPTED
     client.run(6.0)
@@ -149,7 +149,7 @@ def test_a_terminated_flight_falls_and_is_over() -> None:
     assert client.texts[-1] == "Switching to Hold is currently not available\t"
 
 
-def test_a_take_off_never_leads_down() -> None:
+def test_take_off_below_current_altitude_does_not_descend() -> None:
     px4, client = flying()
     client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 493.4)
     assert client.texts == ["Already higher than takeoff altitude\t"]
@@ -157,7 +157,7 @@ def test_a_take_off_never_leads_down() -> None:
     assert px4.altitude_m == pytest.approx(10.0, abs=0.6)
 
 
-def test_calibration_by_hand_waits_until_it_is_cancelled() -> None:
+def test_manual_calibration_runs_until_cancelled() -> None:
     _, client = ready()
     assert client.command(MavCmd.PREFLIGHT_CALIBRATION, 0, 1) == MavResult.ACCEPTED
     client.run(6.0)
@@ -171,7 +171,7 @@ def test_calibration_by_hand_waits_until_it_is_cancelled() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED
 
 
-def test_a_mission_for_other_vehicles_is_rejected() -> None:
+def test_vtol_mission_is_rejected() -> None:
     px4, client = ready()
     px4.missions.replace(0, [MissionItem(MavCmd.NAV_VTOL_TAKEOFF, 3, x=473977432, y=85455939, z=10.0)])
     assert client.command(MavCmd.MISSION_START) == MavResult.DENIED
@@ -185,9 +185,7 @@ def test_a_mission_for_other_vehicles_is_rejected() -> None:
     ("mode", "attitude_hz", "status_hz", "imu_hz"),
     [("normal", 2, 1, 0), ("onboard", 100, 5, 50), ("config", 50, 1, 50), ("minimal", 10, 0.1, 0)],
 )
-def test_rates_follow_the_mode_of_the_link(
-    mode: str, attitude_hz: float, status_hz: float, imu_hz: float
-) -> None:
+def test_rates_depend_on_the_link_mode(mode: str, attitude_hz: float, status_hz: float, imu_hz: float) -> None:
     _, client = ready(link_modes=[mode])
     client.run(10.0)
     seen = Counter(type(message) for _, message in client.heard)
@@ -197,7 +195,7 @@ def test_rates_follow_the_mode_of_the_link(
     assert seen[m.Heartbeat] == seen[m.MissionCurrent] == 10
 
 
-def test_the_origin_is_told_once_on_each_link() -> None:
+def test_origin_is_sent_once_on_each_link() -> None:
     px4 = SimulatedPx4(boot_time_s=1.0, parameter_count=100)
     client = Client(px4)
     client.run(10.0)
@@ -209,7 +207,7 @@ def test_the_origin_is_told_once_on_each_link() -> None:
     assert interval(client, m.GpsGlobalOrigin.ID) == 1_000_000, "what it says all the same"
 
 
-def test_a_second_link_has_the_last_mode() -> None:
+def test_further_links_use_the_last_mode() -> None:
     px4 = SimulatedPx4(boot_time_s=1.0, parameter_count=100, link_modes=("minimal", "onboard"))
     other = px4.open_channel()
     px4.step(0.0)
@@ -224,7 +222,7 @@ def interval(client: Client, message_id: int) -> int:
     return client.last(m.MessageInterval).interval_us
 
 
-def test_intervals_are_told_as_the_real_one_tells_them() -> None:
+def test_message_interval_reports_as_the_firmware() -> None:
     _, client = ready()
     assert interval(client, m.Heartbeat.ID) == 1_000_000
     assert interval(client, m.SysStatus.ID) == 1_000_000
@@ -267,13 +265,13 @@ def test_messages_on_request(kind: type[m.Heartbeat]) -> None:
     client.last(kind).encode()
 
 
-def test_what_only_others_can_send_is_denied() -> None:
+def test_unavailable_messages_are_denied() -> None:
     _, client = ready()
     for kind in (m.MissionCurrent, m.ParamValue, m.GimbalManagerInformation, m.RcChannels):
         assert client.command(MavCmd.REQUEST_MESSAGE, kind.ID) == MavResult.DENIED
 
 
-def test_the_modes_are_listed_with_places_for_modes_of_others() -> None:
+def test_available_modes_include_external_modes() -> None:
     _, client = ready()
     client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 0)
     modes = client.all(m.AvailableModes)
@@ -283,7 +281,7 @@ def test_the_modes_are_listed_with_places_for_modes_of_others() -> None:
     assert client.command(MavCmd.REQUEST_MESSAGE, m.AvailableModes.ID, 99) == MavResult.DENIED
 
 
-def test_events_are_counted_from_just_before_the_overflow() -> None:
+def test_event_sequence_starts_before_the_overflow() -> None:
     px4, client = ready()
     assert px4.build(m.CurrentEventSequence.ID) == m.CurrentEventSequence(65525, 0)
     client.command(ARM, 1)
@@ -292,14 +290,14 @@ def test_events_are_counted_from_just_before_the_overflow() -> None:
     assert (event.sequence, event.id, event.arguments[0]) == (65526, 26266355, 4)
 
 
-def test_all_that_it_can_tell_can_be_sent() -> None:
+def test_every_builder_creates_a_valid_message() -> None:
     px4, _ = ready()
     built = [message for message in map(px4.build, BUILDERS) if message is not None]
     assert len(built) > 30
     assert all(len(message.encode()) == message.LENGTH for message in built)
 
 
-def test_messages_that_pymavlink_has_not_are_read_by_their_names() -> None:
+def test_messages_unknown_to_pymavlink_are_sent() -> None:
     px4, client = ready()
     client.command(MavCmd.REQUEST_MESSAGE, m.ComponentMetadata.ID)
     assert client.last(m.ComponentMetadata).uri == "mftp://etc/extras/component_general.json.xz"
@@ -327,7 +325,7 @@ def setpoint(frame: int, mask: int) -> m.SetPositionTargetLocalNed:
         ),
     ],
 )
-def test_set_points_that_say_nothing_are_told(message: m.SetPositionTargetLocalNed, text: str) -> None:
+def test_empty_setpoints_send_a_text(message: m.SetPositionTargetLocalNed, text: str) -> None:
     px4, client = ready()
     client.send(message)
     assert "".join(client.texts) == text
@@ -339,14 +337,12 @@ def place(px4: SimulatedPx4, north: float, east: float) -> tuple[int, int]:
     return there.latitude_e7, there.longitude_e7
 
 
-def put(
-    px4: SimulatedPx4, kind: int, command: int, north: float, east: float, up: float, param1: float = 0.0
-) -> None:
+def put(px4: SimulatedPx4, kind: int, command: int, north: float, east: float, up: float, param1: float = 0.0) -> None:
     x, y = place(px4, north, east)
     assert px4.missions.replace(kind, [MissionItem(command, 6, param1, x=x, y=y, z=up)]) == 0
 
 
-def test_a_fence_that_home_is_not_in_is_not_looked_at() -> None:
+def test_fence_that_excludes_home_is_ignored() -> None:
     px4, client = ready(parameters={"GF_ACTION": 2})
     put(px4, 1, MavCmd.NAV_FENCE_CIRCLE_INCLUSION, 200.0, 0.0, 0.0, 50.0)
     client.run(0.1)
@@ -354,7 +350,7 @@ def test_a_fence_that_home_is_not_in_is_not_looked_at() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED
 
 
-def test_a_mission_beyond_the_fence_is_none() -> None:
+def test_mission_beyond_the_fence_is_rejected() -> None:
     px4, client = ready(parameters={"GF_ACTION": 2})
     put(px4, 1, MavCmd.NAV_FENCE_CIRCLE_INCLUSION, 0.0, 0.0, 0.0, 30.0)
     put(px4, 0, MavCmd.NAV_WAYPOINT, 60.0, 0.0, 10.0)
@@ -364,7 +360,7 @@ def test_a_mission_beyond_the_fence_is_none() -> None:
 
 
 @pytest.mark.parametrize(("kind", "north"), [(0, 30.0), (1, 30.0), (3, 30.0), (4, 0.0)])
-def test_it_returns_to_the_rally_point_that_is_near(kind: int, north: float) -> None:
+def test_return_uses_nearest_rally_point(kind: int, north: float) -> None:
     px4, client = flying()
     px4.parameters["RTL_TYPE"] = kind
     put(px4, 2, MavCmd.NAV_RALLY_POINT, 30.0, 20.0, 15.0)

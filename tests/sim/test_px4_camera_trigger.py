@@ -1,4 +1,4 @@
-"""A simulated PX4's camera trigger: there by its parameter, told twice, and stopped only by who started it."""
+"""Camera trigger of a simulated PX4: enabling, double reports, series."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def fitted(mode: float = 1.0) -> tuple[SimulatedPx4, ComponentClient]:
     return px4, settled(px4)
 
 
-def test_without_it_nobody_answers() -> None:
+def test_commands_without_trigger_are_not_answered() -> None:
     _, client = fitted(0.0)
     for command in (CONTROL, SWITCH, INTERVAL):
         assert client.ask(1, command, 1, 0, 0, 0, 1) == []
@@ -29,7 +29,7 @@ def test_without_it_nobody_answers() -> None:
     assert client.all(m.CameraTrigger) == []
 
 
-def test_a_picture_is_told_twice() -> None:
+def test_image_is_reported_twice() -> None:
     px4, client = fitted()
     assert client.ask(1, CONTROL, *SHOOT) == DONE
     assert client.ask(1, CONTROL, *SHOOT) == [MavResult.TEMPORARILY_REJECTED]
@@ -41,7 +41,7 @@ def test_a_picture_is_told_twice() -> None:
     assert image.lat == pytest.approx(px4.frame.origin.latitude_e7, abs=50)
 
 
-def test_a_series_goes_on_until_it_is_stopped() -> None:
+def test_series_runs_until_stopped() -> None:
     px4, client = fitted()
     assert client.ask(1, INTERVAL, 500, -1) == DONE
     assert client.ask(1, SWITCH, 1, 1, 0) == DONE

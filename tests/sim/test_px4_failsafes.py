@@ -1,4 +1,4 @@
-"""The failsafes of a simulated PX4 beside what real firmware (v1.17-alpha) was seen to do."""
+"""Failsafes of a simulated PX4, compared with real firmware (v1.17-alpha)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAN = math.nan
 
 
 class Station(Client):
-    """A client that says once a second that it is a ground station, until it is ``silent``."""
+    """A client that sends ground-station heartbeats at 1 Hz until it is ``silent``."""
 
     silent = False
 
@@ -47,16 +47,14 @@ def set_mode(station: Station, sub: int) -> None:
 
 def fly_north(px4: SimulatedPx4, station: Station, metres: float, seconds: float) -> None:
     place = px4.frame.to_global(metres, 0.0, 0.0)
-    station.command_int(
-        MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=NAN
-    )
+    station.command_int(MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=NAN)
     station.run(seconds)
 
 
 # ----------------------------------------------------------------------------------------- battery
 
 
-def test_the_battery_warns_returns_and_lands() -> None:
+def test_battery_levels_warn_return_and_land() -> None:
     px4, station = flying()
     px4.battery.percent = 14.9
     station.run(1.0)
@@ -78,14 +76,14 @@ def test_the_battery_warns_returns_and_lands() -> None:
 
 
 @pytest.mark.parametrize(("action", "mode"), [(0, HOLD), (2, LAND), (3, RTL)])
-def test_what_a_critical_battery_does_is_a_parameter(action: int, mode: tuple[int, int]) -> None:
+def test_critical_battery_action_is_a_parameter(action: int, mode: tuple[int, int]) -> None:
     px4, station = flying(COM_LOW_BAT_ACT=action, COM_FAIL_ACT_T=0.0)
     px4.battery.percent = 6.0
     station.run(1.0)
     assert px4.mode == mode
 
 
-def test_who_chooses_a_mode_takes_over_until_it_gets_worse() -> None:
+def test_mode_change_overrides_until_worse_failure() -> None:
     px4, station = flying(COM_FAIL_ACT_T=0.0)
     px4.battery.percent = 6.0
     station.run(1.0)
@@ -96,7 +94,7 @@ def test_who_chooses_a_mode_takes_over_until_it_gets_worse() -> None:
     assert not px4.is_in_failsafe
 
 
-def test_fresh_set_points_do_not_end_another_failsafe() -> None:
+def test_new_setpoints_do_not_end_other_failsafes() -> None:
     px4, station = flying(COM_FAIL_ACT_T=1.0)
     px4.battery.percent = 100.0
     for step in range(20):
@@ -110,7 +108,7 @@ def test_fresh_set_points_do_not_end_another_failsafe() -> None:
     assert px4.mode == RTL
 
 
-def test_an_empty_battery_cannot_be_armed() -> None:
+def test_empty_battery_prevents_arming() -> None:
     px4 = SimulatedPx4(boot_time_s=1.0, battery_percent=6.0, parameter_count=150)
     station = Station(px4)
     station.run(2.0)
@@ -121,7 +119,7 @@ def test_an_empty_battery_cannot_be_armed() -> None:
 # ------------------------------------------------------------------------------------------- links
 
 
-def test_a_lost_station_is_told_and_by_default_nothing_else() -> None:
+def test_lost_station_only_sends_text_by_default() -> None:
     px4, station = flying()
     station.silent = True
     station.run(12.0)
@@ -132,7 +130,7 @@ def test_a_lost_station_is_told_and_by_default_nothing_else() -> None:
     assert station.texts[1:] == ["GCS connection regained\t"]
 
 
-def test_a_lost_station_brings_it_home_and_its_return_changes_nothing() -> None:
+def test_regained_station_does_not_end_the_return() -> None:
     px4, station = flying(NAV_DLL_ACT=2)
     station.silent = True
     station.run(12.0)
@@ -153,7 +151,7 @@ def test_a_lost_station_brings_it_home_and_its_return_changes_nothing() -> None:
     assert not px4.is_in_failsafe
 
 
-def test_without_a_station_it_is_not_armed_when_one_is_demanded() -> None:
+def test_required_station_prevents_arming() -> None:
     px4 = SimulatedPx4(boot_time_s=1.0, parameter_count=150, parameters={"NAV_DLL_ACT": 2})
     client = Client(px4)
     client.run(2.0)
@@ -162,7 +160,7 @@ def test_without_a_station_it_is_not_armed_when_one_is_demanded() -> None:
 
 
 @pytest.mark.parametrize(("excepted", "mode"), [(0, RTL), (2, HOLD)])
-def test_lost_sticks_bring_it_home_unless_the_mode_is_excepted(excepted: int, mode: tuple[int, int]) -> None:
+def test_lost_sticks_trigger_return_unless_excepted(excepted: int, mode: tuple[int, int]) -> None:
     px4, station = flying(COM_RCL_EXCEPT=excepted, COM_FAIL_ACT_T=0.0)
     station.run(2.0)
     assert px4.mode == HOLD, "sticks that never were are not missed"
@@ -177,7 +175,7 @@ def test_lost_sticks_bring_it_home_unless_the_mode_is_excepted(excepted: int, mo
 
 
 @pytest.mark.parametrize(("action", "mode"), [(1, HOLD), (2, HOLD), (3, RTL), (5, LAND)])
-def test_beyond_the_greatest_distance(action: int, mode: tuple[int, int]) -> None:
+def test_maximum_distance_triggers_fence_action(action: int, mode: tuple[int, int]) -> None:
     px4, station = flying(GF_ACTION=0, GF_MAX_HOR_DIST=30.0, COM_FAIL_ACT_T=0.0)
     fly_north(px4, station, 100.0, 10.0)
     px4.parameters["GF_ACTION"] = action
@@ -187,14 +185,14 @@ def test_beyond_the_greatest_distance(action: int, mode: tuple[int, int]) -> Non
     assert px4.is_in_failsafe == (action > 1)
 
 
-def test_nobody_is_sent_beyond_the_fence() -> None:
+def test_reposition_beyond_the_fence_is_refused() -> None:
     px4, station = flying(GF_MAX_HOR_DIST=30.0)
     fly_north(px4, station, 100.0, 10.0)
     assert station.texts == ["Reposition is outside geofence\t"]
     assert px4.motion.north == pytest.approx(0.0, abs=1.0)
 
 
-def test_a_polygon_and_a_circle() -> None:
+def test_polygon_and_circle_fences() -> None:
     px4, _ = flying(GF_ACTION=2)
     corners = [(-50, -50), (50, -50), (50, 50), (-50, 50)]
     fence = [fence_item(px4, MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, 4, *corner) for corner in corners]

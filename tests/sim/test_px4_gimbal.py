@@ -1,4 +1,4 @@
-"""The gimbal of a simulated PX4, as seen on PX4 1.17 in simulation with MNT_MODE_IN 4 and MNT_MODE_OUT 0."""
+"""Gimbal of a simulated PX4, compared with PX4 1.17 in simulation (MNT_MODE_IN 4, MNT_MODE_OUT 0)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def angles(client: Client) -> list[float]:
     return [round(math.degrees(each), 1) for each in euler_from_quaternion(*told.q)]
 
 
-def test_without_one_nobody_answers() -> None:
+def test_commands_without_gimbal_are_not_answered() -> None:
     each = Client(SimulatedPx4(boot_time_s=1.0))
     each.run(3.0)
     assert each.command(POINT, -10, 0, NAN, NAN, LEVEL) is None
@@ -55,7 +55,7 @@ def test_without_one_nobody_answers() -> None:
     assert each.all(m.GimbalDeviceAttitudeStatus) == []
 
 
-def test_it_tells_by_itself_and_on_request(client: Client) -> None:
+def test_messages_are_streamed_and_sent_on_request(client: Client) -> None:
     client.run(4.0)
     assert len(client.all(m.GimbalDeviceAttitudeStatus)) == pytest.approx(20, abs=2)
     assert len(client.all(m.GimbalManagerStatus)) == pytest.approx(2, abs=1)
@@ -65,7 +65,7 @@ def test_it_tells_by_itself_and_on_request(client: Client) -> None:
     assert math.degrees(told.pitch_min) == pytest.approx(-45)
 
 
-def test_it_obeys_only_who_is_in_control(client: Client) -> None:
+def test_commands_without_control_are_denied(client: Client) -> None:
     assert client.command(POINT, -30, 0, NAN, NAN, LEVEL) == DENIED
     assert client.command(CONFIGURE, -2, -2, -1, -1) == ACCEPTED
     assert gimbal(client).gimbal.in_control == (1, 1), "whoever asks is PX4 itself"
@@ -95,7 +95,7 @@ def test_frames_neutral_and_retracted(claimed: Client) -> None:
     assert angles(claimed) == [0, -45, 0]
 
 
-def test_rates_are_slow_and_end_by_themselves(claimed: Client) -> None:
+def test_rates_are_slow_and_time_out(claimed: Client) -> None:
     nothing = (NAN,) * 4
     rates = (0.0, math.radians(-100), math.radians(200))
     claimed.send(m.GimbalManagerSetPitchyaw(1, 1, LEVEL, 0, NAN, NAN, -1.0, 1.0))
@@ -112,7 +112,7 @@ def test_rates_are_slow_and_end_by_themselves(claimed: Client) -> None:
     assert angles(claimed) == [0, -20, 0]
 
 
-def test_places_are_obeyed_whoever_orders_them(client: Client) -> None:
+def test_region_of_interest_needs_no_control(client: Client) -> None:
     px4 = gimbal(client)
     there = px4.frame.to_global(0.0, 50.0, 0.0)
     roi = MavCmd.DO_SET_ROI_LOCATION
@@ -123,7 +123,7 @@ def test_places_are_obeyed_whoever_orders_them(client: Client) -> None:
     assert angles(client) == [0, 0, 0]
 
 
-def test_the_mounts_command_needs_no_control(client: Client) -> None:
+def test_mount_command_needs_no_control(client: Client) -> None:
     mount = MavCmd.DO_MOUNT_CONTROL
     assert client.command(mount, -20, 5, 340, 0, 0, 0, MavMountMode.MAVLINK_TARGETING) == ACCEPTED
     assert angles(client) == [5, -20, -20]
@@ -132,7 +132,7 @@ def test_the_mounts_command_needs_no_control(client: Client) -> None:
     assert client.command(mount, 0, 0, 0, 0, 0, 0, MavMountMode.RC_TARGETING) == ACCEPTED
 
 
-def test_on_the_way_home_it_is_neutral_and_nobodys(claimed: Client) -> None:
+def test_return_resets_angles_and_control(claimed: Client) -> None:
     px4 = gimbal(claimed)
     claimed.command(POINT, -30, 0, NAN, NAN, LEVEL)
     px4.change_mode(RTL)
@@ -145,7 +145,7 @@ def test_on_the_way_home_it_is_neutral_and_nobodys(claimed: Client) -> None:
     assert claimed.command(POINT, -30, 0, NAN, NAN, LEVEL) == ACCEPTED
 
 
-def test_a_reboot_forgets_who_was_in_control(claimed: Client) -> None:
+def test_reboot_resets_control(claimed: Client) -> None:
     gimbal(claimed).restart()
     claimed.run(5.0)
     assert gimbal(claimed).gimbal.in_control == (0, 0)

@@ -1,4 +1,4 @@
-"""A simulated PX4 fixed wing: what it says, and how it flies for a client and for `aerokit.Vehicle`."""
+"""A simulated PX4 plane: messages, and flights by a client and by `aerokit.Vehicle`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def item(
     return MissionItem(command, 3, param1, 0, 0, NAN, place.latitude_e7, place.longitude_e7, up)
 
 
-def test_it_says_what_it_is() -> None:
+def test_plane_identifies_itself() -> None:
     plane, client = ready_plane()
     client.run(1.0)
     assert client.last(m.Heartbeat).type == MavType.FIXED_WING
@@ -55,7 +55,7 @@ def test_it_says_what_it_is() -> None:
     assert len(SimulatedPx4Plane().parameters) == 978
 
 
-def test_armed_on_the_ground_it_stays_armed() -> None:
+def test_plane_on_ground_stays_armed() -> None:
     plane, client = ready_plane()
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED
     client.run(30.0)
@@ -63,7 +63,7 @@ def test_armed_on_the_ground_it_stays_armed() -> None:
     assert away_m(plane) == 0.0
 
 
-def test_it_climbs_out_and_circles_where_it_arrived() -> None:
+def test_take_off_climbs_out_and_circles() -> None:
     plane, client = ready_plane()
     client.command(MavCmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, NAN)
     client.command(MavCmd.COMPONENT_ARM_DISARM, 1)
@@ -89,12 +89,10 @@ def test_it_climbs_out_and_circles_where_it_arrived() -> None:
     ]
 
 
-def test_it_is_sent_elsewhere_and_told_how_fast() -> None:
+def test_reposition_and_speed_change() -> None:
     plane, client = flying_plane()
     place = plane.frame.to_global(600.0, 300.0, 0.0)
-    client.command_int(
-        MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=584.09 + 80
-    )
+    client.command_int(MavCmd.DO_REPOSITION, 5, -1, 1, 0, NAN, x=place.latitude_e7, y=place.longitude_e7, z=584.09 + 80)
     client.run(90.0)
     assert away_m(plane, 600.0, 300.0) == pytest.approx(80.0, abs=8.0)
     assert plane.altitude_m == pytest.approx(80.0, abs=2.0)
@@ -103,7 +101,7 @@ def test_it_is_sent_elsewhere_and_told_how_fast() -> None:
     assert client.last(m.VfrHud).airspeed == pytest.approx(20.0, abs=0.5), "FW_AIRSPD_MAX"
 
 
-def test_it_returns_to_a_circle_and_stays() -> None:
+def test_return_circles_above_home() -> None:
     plane, client = flying_plane()
     client.command(MavCmd.NAV_RETURN_TO_LAUNCH)
     client.run(150.0)
@@ -113,7 +111,7 @@ def test_it_returns_to_a_circle_and_stays() -> None:
     assert plane.altitude_m == pytest.approx(100.0, abs=3.0)
 
 
-def test_it_returns_and_lands_when_told_so() -> None:
+def test_return_lands_if_configured() -> None:
     plane, client = flying_plane(RTL_LAND_DELAY=0.0)
     client.command(MavCmd.NAV_RETURN_TO_LAUNCH)
     client.run_until(lambda: not plane.is_armed, 300.0)
@@ -124,7 +122,7 @@ def test_it_returns_and_lands_when_told_so() -> None:
     ]
 
 
-def test_it_lands_in_circles() -> None:
+def test_land_mode_descends_in_circles() -> None:
     plane, client = flying_plane()
     north, east = plane.motion.north, plane.motion.east
     client.command(MavCmd.NAV_LAND)
@@ -133,7 +131,7 @@ def test_it_lands_in_circles() -> None:
     assert plane.motion.impact_speed_m_s < 1.0
 
 
-def test_a_mission_from_climb_out_to_roll_out() -> None:
+def test_mission_from_climb_out_to_roll_out() -> None:
     plane, client = ready_plane()
     items = [
         item(plane, MavCmd.NAV_TAKEOFF, 200, 0, 40),
@@ -143,10 +141,7 @@ def test_a_mission_from_climb_out_to_roll_out() -> None:
     ]
     assert plane.missions.replace(0, items) == 0
     client.run(0.1)
-    assert (
-        client.texts == ["Mission rejected: Landing waypoint/pattern req", "uired.\t"]
-        or not plane.mission.is_valid
-    )
+    assert client.texts == ["Mission rejected: Landing waypoint/pattern req", "uired.\t"] or not plane.mission.is_valid
     assert client.command(MavCmd.MISSION_START) == MavResult.DENIED
     plane.missions.replace(0, [*items, item(plane, MavCmd.NAV_LAND, 0, 0, 0)])
     assert client.command(MavCmd.MISSION_START) == MavResult.ACCEPTED
@@ -155,7 +150,7 @@ def test_a_mission_from_climb_out_to_roll_out() -> None:
     assert away_m(plane) < 150.0
 
 
-def test_a_steady_wind_does_not_carry_it_off() -> None:
+def test_constant_wind_does_not_displace_the_circle() -> None:
     plane, client = flying_plane()
     plane.motion.wind.east_m_s = 5.0
     north, east, _ = plane.flight.target
@@ -163,7 +158,7 @@ def test_a_steady_wind_does_not_carry_it_off() -> None:
     assert away_m(plane, north, east) == pytest.approx(80.0, abs=25.0)
 
 
-def test_a_vehicle_object_flies_it() -> None:
+def test_vehicle_object_flies_the_plane() -> None:
     async def fly() -> None:
         plane = SimulatedPx4Plane(boot_time_s=1.0, fast_rate_hz=5.0)
         async with simulated_link(plane) as link, aerokit.connect(link) as vehicle:
@@ -172,9 +167,7 @@ def test_a_vehicle_object_flies_it() -> None:
             await vehicle.take_off(50.0)
             assert plane.altitude_m > 40.0
             place = plane.frame.to_global(500.0, 0.0, 0.0)
-            target = aerokit.Position(
-                place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, altitude_relative_m=60.0
-            )
+            target = aerokit.Position(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7, altitude_relative_m=60.0)
             await vehicle.go_to(target)
             assert away_m(plane, 500.0, 0.0) < 130.0
             await vehicle.set_mode("RTL")

@@ -1,4 +1,4 @@
-"""A simulated PX4 flown by hand, beside what real firmware (v1.17-alpha) was seen to do."""
+"""Manual control of a simulated PX4, compared with real firmware (v1.17-alpha)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ALTITUDE, POSITION, STABILIZED, HOLD, RTL = (2, 0), (3, 0), (7, 0), (4, 3), (4, 
 
 
 class Pilot(Client):
-    """Sends MANUAL_CONTROL ten times a second while it runs."""
+    """Sends MANUAL_CONTROL at 10 Hz while it runs."""
 
     def fly(
         self,
@@ -46,7 +46,7 @@ def ready(**parameters: float) -> tuple[SimulatedPx4, Pilot]:
 
 
 def flying(mode: tuple[int, int] = POSITION) -> tuple[SimulatedPx4, Pilot]:
-    """In the air, by hand."""
+    """Take off manually."""
     px4, pilot = ready()
     pilot.fly(0.2, throttle=0)
     assert pilot.set_mode(*POSITION) == [MavResult.ACCEPTED] * 2
@@ -57,7 +57,7 @@ def flying(mode: tuple[int, int] = POSITION) -> tuple[SimulatedPx4, Pilot]:
     return px4, pilot
 
 
-def test_a_mode_flown_by_hand_needs_sticks_to_be_armed() -> None:
+def test_arming_in_manual_mode_needs_sticks() -> None:
     px4, pilot = ready()
     pilot.set_mode(*POSITION)
     pilot.run(1.1)
@@ -73,7 +73,7 @@ def test_a_mode_flown_by_hand_needs_sticks_to_be_armed() -> None:
 @pytest.mark.parametrize(
     ("mode", "throttle", "armed"), [(POSITION, 500, True), (POSITION, 700, False), (STABILIZED, 150, False)]
 )
-def test_the_throttle_must_be_low(mode: tuple[int, int], throttle: int, armed: bool) -> None:
+def test_arming_needs_low_throttle(mode: tuple[int, int], throttle: int, armed: bool) -> None:
     px4, pilot = ready()
     pilot.fly(0.2, throttle=throttle)
     pilot.set_mode(*mode)
@@ -82,7 +82,7 @@ def test_the_throttle_must_be_low(mode: tuple[int, int], throttle: int, armed: b
     assert ("Arming denied: throttle not in safe position\t" in pilot.texts) == (not armed)
 
 
-def test_it_takes_off_flies_and_stays_where_the_sticks_let_go() -> None:
+def test_released_sticks_hold_the_position() -> None:
     px4, pilot = flying()
     motion = px4.motion
     assert px4.altitude_m > 5.0
@@ -100,7 +100,7 @@ def test_it_takes_off_flies_and_stays_where_the_sticks_let_go() -> None:
     assert motion.velocity_down == pytest.approx(-3.0, abs=0.2)
 
 
-def test_altitude_mode_leans_and_does_not_brake() -> None:
+def test_altitude_mode_does_not_brake() -> None:
     px4, pilot = flying(ALTITUDE)
     pilot.fly(2.0, right=1000)
     assert math.degrees(px4.motion.roll) == pytest.approx(35.0, abs=3.0)
@@ -118,7 +118,7 @@ def test_stabilized_throttle_is_thrust() -> None:
     assert px4.motion.velocity_down < -1.5
 
 
-def test_it_lands_by_the_stick() -> None:
+def test_throttle_stick_lands_the_vehicle() -> None:
     px4, pilot = flying()
     for _ in range(60):
         pilot.fly(1.0, throttle=0)
@@ -128,7 +128,7 @@ def test_it_lands_by_the_stick() -> None:
     assert pilot.texts[-2:] == ["Landing detected\t", "Disarmed by landing\t"]
 
 
-def test_moved_sticks_take_over_from_an_automatic_mode() -> None:
+def test_moved_sticks_override_automatic_modes() -> None:
     px4, pilot = flying()
     pilot.set_mode(*HOLD)
     pilot.fly(1.0)
@@ -146,13 +146,11 @@ def test_lost_sticks_hold_and_return() -> None:
     assert px4.mode == RTL
 
 
-def test_overridden_channels_fly_only_where_they_are_assigned() -> None:
+def test_channel_overrides_need_assigned_channels() -> None:
     override = m.RcChannelsOverride(1, 1, 1500, 1500, 1000, 1500, 0, 0, 0, 0)
     for assigned in (False, True):
         names = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_THROTTLE", "RC_MAP_YAW")
-        px4, pilot = ready(
-            **({name: number for number, name in enumerate(names, start=1)} if assigned else {})
-        )
+        px4, pilot = ready(**({name: number for number, name in enumerate(names, start=1)} if assigned else {}))
         pilot.send(override)
         assert px4.sticks.are_fresh == assigned
         pilot.run(0.2)

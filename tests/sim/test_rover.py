@@ -15,7 +15,7 @@ from aerokit.mavlink.enums import MavCmd, MavModeFlag, MavState, RoverMode
 from aerokit.missions import Mission
 from aerokit.missions.navigation import waypoint
 from aerokit.sim import SimulatedRover, simulated_link
-from aerokit.sim.ardupilot.telemetry_state import heartbeat
+from aerokit.sim.ardupilot.telemetry import heartbeat
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
@@ -43,7 +43,7 @@ def ahead(rover: SimulatedRover, north: float, east: float) -> Position:
     return Position(place.latitude_e7 / 1e7, place.longitude_e7 / 1e7)
 
 
-async def test_it_says_what_it_is() -> None:
+async def test_vehicle_identifies_itself() -> None:
     async with connected() as (rover, vehicle):
         assert (rover.mode.number, len(rover.parameters)) == (RoverMode.MANUAL, 1235)
         table = await vehicle.parameters.download()
@@ -51,7 +51,7 @@ async def test_it_says_what_it_is() -> None:
         assert table["CRUISE_SPEED"].value == 5.0
 
 
-async def test_modes_and_states_are_those_of_the_firmware() -> None:
+async def test_modes_and_states_match_firmware() -> None:
     async with connected() as (rover, vehicle):
         custom, manual, guided = (
             MavModeFlag.CUSTOM_MODE_ENABLED, MavModeFlag.MANUAL_INPUT_ENABLED, MavModeFlag.GUIDED_ENABLED,
@@ -67,7 +67,7 @@ async def test_modes_and_states_are_those_of_the_firmware() -> None:
         assert len(rover.available_modes()) == 14
 
 
-async def test_it_does_not_take_off_and_is_not_armed_in_rtl() -> None:
+async def test_take_off_and_arming_in_rtl_are_refused() -> None:
     async with connected() as (rover, vehicle):
         with pytest.raises(AerokitError):
             await vehicle.take_off(10.0)
@@ -78,7 +78,7 @@ async def test_it_does_not_take_off_and_is_not_armed_in_rtl() -> None:
         assert not rover.arming.arm()
 
 
-async def test_it_drives_to_a_place_and_stands_there() -> None:
+async def test_rover_drives_to_place_and_stops() -> None:
     async with armed() as (rover, vehicle):
         await vehicle.go_to(ahead(rover, 60.0, 20.0))
         await anyio.sleep(5.0)
@@ -87,7 +87,7 @@ async def test_it_drives_to_a_place_and_stands_there() -> None:
         assert rover.motion.down == 0.0
 
 
-async def test_it_is_bounded_in_speed_and_turn() -> None:
+async def test_rover_speed_and_turn_rate_are_limited() -> None:
     async with armed(parameters={"WP_SPEED": 3.0}) as (rover, _):
         rover.guided.go_to((-80.0, 0.0, 0.0))
         fastest, before = 0.0, rover.motion.yaw
@@ -100,7 +100,7 @@ async def test_it_is_bounded_in_speed_and_turn() -> None:
         assert 2.5 < fastest <= 3.001
 
 
-async def test_it_follows_velocities_for_three_seconds() -> None:
+async def test_velocity_target_expires_after_three_seconds() -> None:
     async with armed() as (rover, vehicle):
         async with vehicle.guided.velocity() as stream:
             await stream.fly(VelocitySetpoint(east_m_s=-2.0), 8.0)
@@ -110,7 +110,7 @@ async def test_it_follows_velocities_for_three_seconds() -> None:
         assert abs(rover.motion.speed_m_s) < 0.01
 
 
-async def test_holding_stands_and_rtl_leads_home() -> None:
+async def test_hold_stops_and_rtl_returns_home() -> None:
     async with armed() as (rover, vehicle):
         rover.guided.go_to((50.0, 0.0, 0.0))
         await anyio.sleep(10.0)
@@ -128,7 +128,7 @@ async def test_holding_stands_and_rtl_leads_home() -> None:
         assert rover.navigation.home[0] == pytest.approx(rover.motion.north)
 
 
-async def test_sticks_drive_it_in_manual() -> None:
+async def test_rover_follows_sticks_in_manual() -> None:
     async with connected() as (rover, vehicle):
         await vehicle.arm()
         rover.rc[2] = 1600
@@ -139,7 +139,7 @@ async def test_sticks_drive_it_in_manual() -> None:
         assert rover.motion.ground_speed_m_s < 0.01
 
 
-async def test_losing_the_ground_station_leads_to_hold() -> None:
+async def test_ground_station_failsafe_changes_to_hold() -> None:
     async with armed(parameters={"FS_GCS_ENABLE": 1}) as (rover, _):
         await anyio.sleep(2.0)
         rover.faults.drop_incoming = 1_000_000
@@ -147,13 +147,11 @@ async def test_losing_the_ground_station_leads_to_hold() -> None:
         assert rover.mode.number == RoverMode.HOLD
 
 
-async def test_it_drives_a_mission() -> None:
+async def test_rover_drives_mission() -> None:
     async with armed() as (rover, vehicle):
         places = [ahead(rover, 30.0, 0.0), ahead(rover, 30.0, 30.0)]
         await vehicle.mission.upload(
-            Mission(
-                [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=0) for each in places]
-            )
+            Mission([waypoint(place.latitude_deg, place.longitude_deg, altitude_relative_m=0) for place in places])
         )
         await vehicle.mission.start()
         await vehicle.mission.wait_finished(timeout=120.0)

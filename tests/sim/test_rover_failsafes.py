@@ -1,4 +1,4 @@
-"""ArduRover's failsafes: radio, ground station, battery, estimator, crash; each action, each text."""
+"""Actions and texts of ArduRover's failsafes: radio, ground station, battery, estimator, crash."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ACTIONS = [
 
 
 @pytest.mark.parametrize(("action", "mode"), ACTIONS)
-def test_a_lost_radio_does_what_is_configured(action: int, mode: int) -> None:
+def test_radio_failsafe_executes_configured_action(action: int, mode: int) -> None:
     rover, client = driving_rover(FS_ACTION=float(action))
     rover.faults.rc_lost = True
     client.run(1.9)
@@ -50,7 +50,7 @@ def test_a_lost_radio_does_what_is_configured(action: int, mode: int) -> None:
     assert healthy(client, Sensor.RC_RECEIVER)
 
 
-def test_a_lost_radio_may_disarm_it() -> None:
+def test_radio_failsafe_can_disarm() -> None:
     rover, client = driving_rover(FS_ACTION=5.0)
     rover.faults.rc_lost = True
     client.run(2.5)
@@ -58,14 +58,14 @@ def test_a_lost_radio_may_disarm_it() -> None:
     assert not rover.is_armed
 
 
-def test_a_low_battery_may_disarm_it() -> None:
+def test_battery_failsafe_can_disarm() -> None:
     rover, client = driving_rover(**BATTERY, BATT_FS_LOW_ACT=5.0)
     drain(rover, client, LOW)
     assert client.texts[1:] == ["Throttle disarmed"]
     assert client.command(MavCmd.DO_FLIGHTTERMINATION, 1) == MavResult.UNSUPPORTED
 
 
-def test_a_low_throttle_is_a_lost_radio_and_a_short_dip_is_none() -> None:
+def test_low_throttle_triggers_failsafe_but_short_dip_does_not() -> None:
     rover, client = driving_rover()
     rover.rc[2] = 900
     client.run(1.0)
@@ -78,7 +78,7 @@ def test_a_low_throttle_is_a_lost_radio_and_a_short_dip_is_none() -> None:
 
 
 @pytest.mark.parametrize("mode", [RoverMode.RTL, RoverMode.HOLD])
-def test_nothing_happens_in_rtl_and_hold(mode: int) -> None:
+def test_failsafe_in_rtl_and_hold_does_nothing(mode: int) -> None:
     rover, client = driving_rover(FS_ACTION=3.0)
     client.run(5.0)
     assert set_mode(client, mode) == MavResult.ACCEPTED
@@ -87,7 +87,7 @@ def test_nothing_happens_in_rtl_and_hold(mode: int) -> None:
     assert (client.texts, rover.mode.number) == ([], mode)
 
 
-def test_it_may_act_in_hold() -> None:
+def test_failsafe_option_acts_in_hold() -> None:
     rover, client = driving_rover(FS_ACTION=1.0, FS_OPTIONS=1.0)
     assert set_mode(client, RoverMode.HOLD) == MavResult.ACCEPTED
     rover.faults.rc_lost = True
@@ -95,7 +95,7 @@ def test_it_may_act_in_hold() -> None:
     assert rover.mode.number == RoverMode.RTL
 
 
-def test_it_acts_disarmed_too_and_is_not_armed_without_a_radio() -> None:
+def test_radio_failsafe_while_disarmed_acts_and_prevents_arming() -> None:
     rover, client = ready_rover()
     rover.faults.rc_lost = True
     client.run(4.0)
@@ -104,14 +104,14 @@ def test_it_acts_disarmed_too_and_is_not_armed_without_a_radio() -> None:
     assert rover.arming.reasons() == ["Radio failsafe on"]
 
 
-def test_without_the_failsafe_nothing_happens() -> None:
+def test_disabled_radio_failsafe_does_nothing() -> None:
     rover, client = driving_rover(FS_THR_ENABLE=0.0)
     rover.faults.rc_lost = True
     client.run(5.0)
     assert (client.texts, rover.mode.number) == ([], RoverMode.GUIDED)
 
 
-def test_a_lost_ground_station_is_told_as_a_lost_radio_while_that_is_watched() -> None:
+def test_ground_station_failsafe_is_reported_as_radio_if_enabled() -> None:
     rover, client = driving_rover(FS_GCS_ENABLE=1.0)
     lose_ground_station(client, 6.4)
     assert client.texts == []
@@ -123,13 +123,13 @@ def test_a_lost_ground_station_is_told_as_a_lost_radio_while_that_is_watched() -
     assert client.texts[1:] == ["GCS Failsafe Cleared"]
 
 
-def test_a_lost_ground_station_has_its_own_name_otherwise() -> None:
+def test_ground_station_failsafe_is_reported_as_gcs_alone() -> None:
     rover, client = driving_rover(FS_GCS_ENABLE=1.0, FS_THR_ENABLE=0.0, FS_ACTION=1.0)
     lose_ground_station(client, 7.0)
     assert (client.texts, rover.mode.number) == (["GCS Failsafe"], RoverMode.RTL)
 
 
-def test_a_mission_may_go_on() -> None:
+def test_failsafe_option_continues_mission() -> None:
     rover, client = driving_rover(FS_THR_ENABLE=2.0)
     place = rover.frame.to_global(300.0, 0.0, 0.0)
     item = MissionItem(16, 3, x=place.latitude_e7, y=place.longitude_e7)
@@ -141,7 +141,7 @@ def test_a_mission_may_go_on() -> None:
     assert rover.mode.number == RoverMode.AUTO
 
 
-def test_a_low_battery_holds_and_a_lesser_action_does_not_follow() -> None:
+def test_low_battery_holds_and_skips_less_severe_action() -> None:
     rover, client = driving_rover(**BATTERY, BATT_FS_LOW_ACT=2.0, BATT_FS_CRT_ACT=1.0)
     drain(rover, client, LOW)
     assert client.texts[0].startswith("Battery 1 is low 10.")
@@ -157,7 +157,7 @@ def test_a_low_battery_holds_and_a_lesser_action_does_not_follow() -> None:
 
 
 @pytest.mark.parametrize(("action", "mode"), ACTIONS)
-def test_the_action_of_a_low_battery_is_configured(action: int, mode: int) -> None:
+def test_battery_failsafe_executes_configured_action(action: int, mode: int) -> None:
     rover, client = driving_rover(**BATTERY, BATT_FS_LOW_ACT=float(action))
     drain(rover, client, LOW)
     assert rover.mode.number == mode
@@ -171,7 +171,7 @@ def test_the_action_of_a_low_battery_is_configured(action: int, mode: int) -> No
         (0, RoverMode.GUIDED, ["EKF variance"]),
     ],
 )
-def test_without_a_position_it_holds(action: int, mode: int, texts: list[str]) -> None:
+def test_estimator_failsafe_executes_configured_action(action: int, mode: int, texts: list[str]) -> None:
     rover, client = driving_rover(FS_EKF_ACTION=float(action))
     rover.faults.gps_lost = True
     client.run(12.0)
@@ -182,10 +182,8 @@ def test_without_a_position_it_holds(action: int, mode: int, texts: list[str]) -
     assert "EKF failsafe cleared" in client.texts
 
 
-@pytest.mark.parametrize(
-    ("action", "mode"), [(0, RoverMode.GUIDED), (1, RoverMode.HOLD), (2, RoverMode.HOLD)]
-)
-def test_one_that_is_stuck_holds(action: int, mode: int) -> None:
+@pytest.mark.parametrize(("action", "mode"), [(0, RoverMode.GUIDED), (1, RoverMode.HOLD), (2, RoverMode.HOLD)])
+def test_crash_check_executes_configured_action(action: int, mode: int) -> None:
     rover, client = driving_rover(FS_CRASH_CHECK=float(action))
     rover.faults.motor_failed = True
     client.run(8.0)

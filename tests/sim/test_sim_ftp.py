@@ -48,7 +48,7 @@ both = pytest.mark.parametrize("kind", ["copter", "px4"])
 
 
 @both
-def test_what_is_written_is_read_again(kind: str) -> None:
+def test_written_file_is_read_back(kind: str) -> None:
     vehicle, ftp = either(kind)
     ftp.upload("/notes.bin", TEXT)
     assert vehicle.files.get("/notes.bin") == TEXT
@@ -57,7 +57,7 @@ def test_what_is_written_is_read_again(kind: str) -> None:
 
 
 @both
-def test_files_and_folders_are_made_renamed_and_removed(kind: str) -> None:
+def test_files_and_folders_are_created_renamed_and_removed(kind: str) -> None:
     vehicle, ftp = either(kind)
     ftp.data(Op.CREATEDIRECTORY, "/a")
     assert ftp.refusal(Op.CREATEDIRECTORY, "/a") == (Err.FILEEXISTS,)
@@ -75,7 +75,7 @@ def test_files_and_folders_are_made_renamed_and_removed(kind: str) -> None:
 
 
 @both
-def test_the_checksum_is_neither_inverted_before_nor_after(kind: str) -> None:
+def test_checksum_has_no_inversions(kind: str) -> None:
     vehicle, ftp = either(kind)
     vehicle.files.put("/t", TEXT)
     checksum = zlib.crc32(TEXT, 0xFFFFFFFF) ^ 0xFFFFFFFF
@@ -83,7 +83,7 @@ def test_the_checksum_is_neither_inverted_before_nor_after(kind: str) -> None:
 
 
 @both
-def test_a_full_card_takes_no_more(kind: str) -> None:
+def test_full_card_refuses_writes(kind: str) -> None:
     vehicle, ftp = either(kind)
     vehicle.files.free_bytes = 100
     ftp.data(Op.CREATEFILE, "/t")
@@ -95,7 +95,7 @@ def test_a_full_card_takes_no_more(kind: str) -> None:
 
 
 @both
-def test_a_deaf_server_is_not_among_the_capabilities(kind: str) -> None:
+def test_no_ftp_fault_removes_the_capability(kind: str) -> None:
     vehicle, ftp = either(kind)
 
     def capabilities() -> int:
@@ -111,7 +111,7 @@ def test_a_deaf_server_is_not_among_the_capabilities(kind: str) -> None:
 
 
 @both
-def test_a_reboot_ends_sessions_and_keeps_files(kind: str) -> None:
+def test_reboot_ends_sessions_and_keeps_files(kind: str) -> None:
     vehicle, ftp = either(kind)
     ftp.upload("/t", TEXT)
     ftp.data(Op.OPENFILERO, "/t")
@@ -125,9 +125,7 @@ def test_a_reboot_ends_sessions_and_keeps_files(kind: str) -> None:
 Request = tuple[int, bytes, int, int, int, float]
 requests: st.SearchStrategy[Request] = st.tuples(
     st.sampled_from([*Op, 77]),
-    st.sampled_from(
-        [b"/", b"/a", b"/b/c", b"/b", b"@PARAM/param.pck", b"@MISSION/mission.dat", b"@SYS", b"/a\0/b"]
-    )
+    st.sampled_from([b"/", b"/a", b"/b/c", b"/b", b"@PARAM/param.pck", b"@MISSION/mission.dat", b"@SYS", b"/a\0/b"])
     | st.binary(max_size=BLOCK),
     st.integers(0, 3) | st.integers(0, 255),
     st.integers(0, 300) | st.integers(0, 0xFFFFFFFF),
@@ -139,14 +137,12 @@ requests: st.SearchStrategy[Request] = st.tuples(
 @both
 @settings(max_examples=30, deadline=None)
 @given(asked=st.lists(requests, max_size=25), sizes=st.lists(st.none() | st.integers(0, 255), min_size=25))
-def test_whatever_is_asked_nothing_breaks_and_no_session_remains(
-    kind: str, asked: list[Request], sizes: list[int | None]
-) -> None:
+def test_random_requests_leave_no_session_open(kind: str, asked: list[Request], sizes: list[int | None]) -> None:
     vehicle, ftp = either(kind)
     vehicle.files.free_bytes = 100_000
     for (opcode, data, step, offset, session, pause), size in zip(asked, sizes, strict=False):
         if offset > 100_000 and opcode in (Op.WRITEFILE, Op.TRUNCATEFILE):
-            offset = 100_000  # no test of this machine's memory
+            offset = 100_000  # Keeps the test small in memory.
         sequence = (ftp.sequence + step) & 0xFFFF
         ftp.send(opcode, data, size=size, offset=offset, session=session, sequence=sequence)
         ftp.wait(pause)
@@ -157,7 +153,7 @@ def test_whatever_is_asked_nothing_breaks_and_no_session_remains(
 # ------------------------------------------------------------------------------------- ArduPilot
 
 
-def test_ardupilot_lists_folders_with_two_zeros_and_the_root_with_its_mounts() -> None:
+def test_ardupilot_folder_list_ends_with_zeros_root_has_mounts() -> None:
     _, ftp = copter_ftp(logs=[SimulatedLog(500)])
     assert ftp.data(Op.LISTDIRECTORY, "/") == b"D.\0\0D..\0\0DAPM\0\0D@SYS\0\0"
     assert ftp.data(Op.LISTDIRECTORY, "/APM/LOGS/", offset=2) == b"F00000001.BIN\t500\0\0FLASTLOG.TXT\t3\0\0"
@@ -166,14 +162,14 @@ def test_ardupilot_lists_folders_with_two_zeros_and_the_root_with_its_mounts() -
     assert ftp.refusal(Op.LISTDIRECTORY, "") == (Err.INVALIDDATASIZE,)
 
 
-def test_ardupilot_answers_five_requests_of_a_burst() -> None:
+def test_ardupilot_queue_holds_five_requests() -> None:
     _, ftp = copter_ftp()
     for _ in range(12):
         ftp.send(Op.NONE)
     assert [answer.sequence for answer in ftp.answers()] == [2, 3, 4, 5, 6]
 
 
-def test_ardupilot_repeats_its_last_answer() -> None:
+def test_ardupilot_repeats_its_last_reply() -> None:
     vehicle, ftp = copter_ftp()
     ftp.upload("/t", b"123")
     first = ftp.ask(Op.REMOVEFILE, "/t")
@@ -182,7 +178,7 @@ def test_ardupilot_repeats_its_last_answer() -> None:
     assert "/t" not in vehicle.files
 
 
-def test_ardupilot_has_one_session_for_all() -> None:
+def test_ardupilot_has_a_single_session() -> None:
     vehicle, ftp = copter_ftp()
     vehicle.files.put("/t", TEXT)
     ftp.data(Op.OPENFILERO, "/t", session=3)
@@ -198,7 +194,7 @@ def test_ardupilot_has_one_session_for_all() -> None:
     assert vehicle.ftp.open_sessions == 1
 
 
-def test_ardupilot_bursts_in_the_size_that_is_asked_for() -> None:
+def test_ardupilot_burst_uses_the_requested_size() -> None:
     vehicle, ftp = copter_ftp()
     vehicle.files.put("/t", TEXT)
     ftp.data(Op.OPENFILERO, "/t")
@@ -210,7 +206,7 @@ def test_ardupilot_bursts_in_the_size_that_is_asked_for() -> None:
     assert end.sequence == blocks[-1].sequence + 1
 
 
-def test_ardupilots_burst_has_500_blocks_and_cannot_be_stopped() -> None:
+def test_ardupilot_burst_has_500_blocks() -> None:
     vehicle, ftp = copter_ftp()
     vehicle.files.put("/t", TEXT * 3)
     ftp.data(Op.OPENFILERO, "/t")
@@ -223,7 +219,7 @@ def test_ardupilots_burst_has_500_blocks_and_cannot_be_stopped() -> None:
     assert vehicle.ftp.open_sessions == 0
 
 
-def test_ardupilot_on_a_slow_link_takes_a_third_of_it() -> None:
+def test_ardupilot_burst_uses_third_of_slow_link() -> None:
     vehicle, ftp = copter_ftp(link_bytes_per_s=5760)
     vehicle.files.put("/t", bytes(10_000))
     ftp.data(Op.OPENFILERO, "/t")
@@ -231,7 +227,7 @@ def test_ardupilot_on_a_slow_link_takes_a_third_of_it() -> None:
     assert len(blocks) * 266 == pytest.approx(2 * 5760 / 3, rel=0.1)
 
 
-def test_ardupilot_knows_no_truncation_and_checks_paths() -> None:
+def test_ardupilot_checks_paths_and_cannot_truncate() -> None:
     vehicle, ftp = copter_ftp()
     vehicle.files.put("/t", TEXT)
     assert ftp.refusal(Op.TRUNCATEFILE, "/t", offset=3) == (Err.FAIL,)
@@ -246,7 +242,7 @@ def test_ardupilot_knows_no_truncation_and_checks_paths() -> None:
     assert ftp.data(Op.READFILE, size=BLOCK) == b"TasksV2\n"
 
 
-def test_ardupilots_missions_are_files() -> None:
+def test_ardupilot_serves_missions_as_files() -> None:
     vehicle, ftp = copter_ftp()
     assert ftp.data(Op.OPENFILERO, "@MISSION/mission.dat") == (1 << 20).to_bytes(4, "little")
     ftp.data(Op.TERMINATESESSION)
@@ -269,7 +265,7 @@ def test_ardupilots_missions_are_files() -> None:
 # ------------------------------------------------------------------------------------------ PX4
 
 
-def test_px4_lists_folders_with_places_for_what_it_skips() -> None:
+def test_px4_lists_skipped_entries() -> None:
     _, ftp = px4_ftp(logs=[SimulatedLog(500)])
     assert ftp.data(Op.LISTDIRECTORY, "/fs/microsd/log/2026-11-21") == b"S\0S\0F10_00_00.ulg\t500\0"
     assert ftp.data(Op.LISTDIRECTORY, "/fs/microsd", offset=2) == b"Dlog\0"
@@ -278,7 +274,7 @@ def test_px4_lists_folders_with_places_for_what_it_skips() -> None:
     assert ftp.refusal(Op.LISTDIRECTORY, "/fs/../..") == (Err.FILEPROTECTED,)
 
 
-def test_px4_calls_every_session_0() -> None:
+def test_px4_sessions_have_number_0() -> None:
     vehicle, ftp = px4_ftp()
     vehicle.files.put("/t", TEXT)
     assert ftp.ask(Op.OPENFILERO, "/t", session=3).session == 0
@@ -291,7 +287,7 @@ def test_px4_calls_every_session_0() -> None:
     assert vehicle.ftp.open_sessions == 0
 
 
-def test_each_port_of_px4_has_its_own_session() -> None:
+def test_px4_has_one_session_per_port() -> None:
     px4, ftp = px4_ftp()
     px4.files.put("/t", TEXT)
     other = px4.open_channel()
@@ -302,7 +298,7 @@ def test_each_port_of_px4_has_its_own_session() -> None:
     assert other.take_outbox()[7:10] != b"\x6e\0\0", "nobody asked there"
 
 
-def test_px4s_burst_ignores_the_size_and_pauses_after_35_kilobytes() -> None:
+def test_px4_burst_ignores_size_and_ends_at_35_kb() -> None:
     vehicle, ftp = px4_ftp()
     content = bytes(range(250)) * 200
     vehicle.files.put("/t", content)
@@ -315,7 +311,7 @@ def test_px4s_burst_ignores_the_size_and_pauses_after_35_kilobytes() -> None:
     assert b"".join(block.data[: block.size] for block in [*blocks, *more]) == content
 
 
-def test_px4_remembers_that_something_existed() -> None:
+def test_px4_keeps_reporting_eexist() -> None:
     _, ftp = px4_ftp()
     ftp.data(Op.CREATEDIRECTORY, "/a")
     assert ftp.refusal(Op.CREATEDIRECTORY, "/a") == (Err.FILEEXISTS,)
@@ -325,7 +321,7 @@ def test_px4_remembers_that_something_existed() -> None:
     assert ftp.refusal(Op.CALCFILECRC, "/none") == (Err.FILENOTFOUND,)
 
 
-def test_px4_truncates() -> None:
+def test_px4_truncates_files() -> None:
     vehicle, ftp = px4_ftp()
     vehicle.files.put("/t", b"hello")
     ftp.data(Op.TRUNCATEFILE, "/t", offset=3)

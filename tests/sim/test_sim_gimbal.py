@@ -1,4 +1,4 @@
-"""The gimbal of a simulated ArduCopter: where it points after which order, as seen on ArduCopter 4.7 in simulation."""
+"""Gimbal of a simulated ArduCopter, compared with ArduCopter 4.7 in simulation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOME_E7 = (-353632610, 1491652299)
 
 @pytest.fixture
 def client() -> Client:
-    """Of a copter on the ground that looks east."""
+    """A client of a copter on the ground that faces east."""
     _, each = ready_copter(parameters=WITH_GIMBAL, heading_deg=90.0)
     return each
 
@@ -35,7 +35,7 @@ def status(client: Client) -> m.GimbalDeviceAttitudeStatus:
 
 
 def angles(client: Client) -> list[int]:
-    """Roll, pitch and yaw from the nose, in whole degrees."""
+    """Return roll, pitch and yaw from the nose in whole degrees."""
     return [round(math.degrees(each)) for each in euler_from_quaternion(*status(client).q)]
 
 
@@ -50,7 +50,7 @@ def manage(client: Client, *params: float) -> int | None:
 # ------------------------------------------------------------------------------------ what it tells
 
 
-def test_without_a_gimbal_orders_fail_and_nothing_is_told() -> None:
+def test_commands_without_gimbal_fail() -> None:
     _, client = ready_copter()
     assert mount(client, MavMountMode.RC_TARGETING) == FAILED
     assert manage(client, -45, 0, NAN, NAN) == FAILED
@@ -61,14 +61,14 @@ def test_without_a_gimbal_orders_fail_and_nothing_is_told() -> None:
     assert client.all(m.GimbalDeviceAttitudeStatus) == []
 
 
-def test_its_parameters_are_listed_with_it() -> None:
+def test_parameters_are_listed_with_the_gimbal() -> None:
     assert len(SimulatedCopter().parameters) == 1349
     assert len(SimulatedCopter(parameters=WITH_GIMBAL).parameters) == 1368
     small = SimulatedCopter(parameters=WITH_GIMBAL, parameter_count=80)
     assert small.gimbal.angles == (0, -35, 0)
 
 
-def test_it_is_among_the_streams_and_can_be_asked_for(client: Client) -> None:
+def test_attitude_is_streamed_and_sent_on_request(client: Client) -> None:
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA3, 10, 1))
     client.run(1.0)
     assert len(client.all(m.GimbalDeviceAttitudeStatus)) >= 10
@@ -87,11 +87,11 @@ def test_it_is_among_the_streams_and_can_be_asked_for(client: Client) -> None:
 # -------------------------------------------------------------------------------------- orders
 
 
-def test_at_first_it_follows_the_sticks_which_rest_in_the_middle(client: Client) -> None:
+def test_initial_mode_follows_centred_sticks(client: Client) -> None:
     assert angles(client) == [0, -35, 0]
 
 
-def test_the_mount_command_turns_it_from_the_nose(client: Client) -> None:
+def test_mount_command_is_relative_to_the_nose(client: Client) -> None:
     assert mount(client, MavMountMode.MAVLINK_TARGETING, -45, 5, 30) == ACCEPTED
     assert angles(client) == [5, -45, 30]
     assert mount(client, MavMountMode.MAVLINK_TARGETING, -45, 50, 350) == ACCEPTED
@@ -104,7 +104,7 @@ def test_the_mount_command_turns_it_from_the_nose(client: Client) -> None:
     assert mount(client, 5) == FAILED
 
 
-def test_modes_of_the_mount(client: Client) -> None:
+def test_mount_modes(client: Client) -> None:
     mount(client, MavMountMode.MAVLINK_TARGETING, -45)
     assert mount(client, MavMountMode.RETRACT) == ACCEPTED
     assert angles(client) == [0, 0, 0]
@@ -117,7 +117,7 @@ def test_modes_of_the_mount(client: Client) -> None:
     assert angles(client) == [0, -35, 0]
 
 
-def test_the_manager_turns_it_from_the_nose_or_from_north(client: Client) -> None:
+def test_manager_angles_relative_to_nose_or_north(client: Client) -> None:
     assert manage(client, -90, 200, NAN, NAN, 0) == ACCEPTED
     assert angles(client)[1] == -90
     assert manage(client, -20, 30, NAN, NAN, LOCKED) == ACCEPTED
@@ -131,31 +131,32 @@ def test_the_manager_turns_it_from_the_nose_or_from_north(client: Client) -> Non
     assert client.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, 0, 0, NAN, NAN, 0, 0, 1) == ACCEPTED
 
 
-def test_the_manager_turns_it_at_a_rate_until_it_can_turn_no_further(client: Client) -> None:
+def test_manager_rates_stop_at_the_limit(client: Client) -> None:
     manage(client, 0, 0, NAN, NAN, 0)
     assert manage(client, NAN, NAN, -10, 20, 0) == ACCEPTED
     client.run(2.0)
     assert angles(client) == pytest.approx([0, -20, 41], abs=1)
     client.run(30.0)
-    assert angles(client)[1:] == [-90, 0]  # straight down all turning is about one axis
+    assert angles(client)[1:] == [-90, 0]  # Straight down, all rotations share one axis.
     assert client.vehicle.gimbal.angles[2] == 180  # type: ignore[attr-defined]
     assert manage(client, NAN, NAN, 0, 90, LOCKED) == ACCEPTED
     client.run(1.0)
     assert client.vehicle.gimbal.target.yaw == pytest.approx(0, abs=10)  # type: ignore[attr-defined]
 
 
-def test_all_unknown_locks_the_yaw_of_the_sticks(client: Client) -> None:
+def test_manager_command_of_nan_sets_yaw_lock(client: Client) -> None:
     assert manage(client, NAN, NAN, NAN, NAN, LOCKED) == ACCEPTED
     assert angles(client) == [0, -35, -90]
     assert manage(client, NAN, NAN, NAN, NAN, 0) == ACCEPTED
     assert angles(client) == [0, -35, 0]
 
 
-def test_the_managers_messages(client: Client) -> None:
+def test_manager_messages_control_the_gimbal(client: Client) -> None:
     q = quaternion_from_euler(math.radians(10), math.radians(-30), math.radians(100))
     client.send(m.GimbalManagerSetAttitude(1, 1, LOCKED, 0, q, NAN, NAN, NAN))
     assert angles(client) == [10, -30, 10]
-    client.send(m.GimbalManagerSetAttitude(1, 1, LOCKED, 0, q, 0.0, 0.0, 0.0))  # both: neither
+    # Angles together with rates are ignored.
+    client.send(m.GimbalManagerSetAttitude(1, 1, LOCKED, 0, q, 0.0, 0.0, 0.0))
     client.send(m.GimbalManagerSetPitchyaw(1, 1, 0, 0, math.radians(-15), math.radians(5), NAN, NAN))
     assert angles(client) == [0, -15, 5]
     client.send(m.GimbalManagerSetPitchyaw(1, 1, 0, 0, NAN, NAN, math.radians(-10), 0.0))
@@ -163,7 +164,7 @@ def test_the_managers_messages(client: Client) -> None:
     assert angles(client) == pytest.approx([0, -25, 5], abs=1)
 
 
-def test_control_is_noted_and_told(client: Client) -> None:
+def test_control_is_stored_and_reported(client: Client) -> None:
     def configure(system: float, component: float) -> list[tuple[int, int]]:
         client.forget()
         assert client.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, system, component) == ACCEPTED
@@ -185,7 +186,7 @@ def test_control_is_noted_and_told(client: Client) -> None:
 # -------------------------------------------------------------------------------------- places
 
 
-def test_it_keeps_looking_at_a_place_and_the_vehicle_need_not_turn() -> None:
+def test_gimbal_keeps_pointing_at_a_position() -> None:
     copter, client = flying_copter(20.0, parameters=WITH_GIMBAL, heading_deg=90.0)
     north = {"x": HOME_E7[0] + 2000, "y": HOME_E7[1]}  # 22 m
     roi = MavCmd.DO_SET_ROI_LOCATION
@@ -200,23 +201,23 @@ def test_it_keeps_looking_at_a_place_and_the_vehicle_need_not_turn() -> None:
     assert angles(client) == pytest.approx([0, -35, 0], abs=2)
 
 
-def test_without_a_gimbal_the_vehicle_turns() -> None:
+def test_without_gimbal_the_vehicle_turns() -> None:
     copter, client = flying_copter(20.0, heading_deg=90.0)
     client.command_int(MavCmd.DO_SET_ROI, MavFrame.GLOBAL_RELATIVE_ALT_INT, x=HOME_E7[0] + 2000, y=HOME_E7[1])
     client.run(5.0)
     assert math.degrees(copter.motion.yaw) == pytest.approx(0, abs=3)
 
 
-def test_the_mount_command_knows_places_too(client: Client) -> None:
+def test_mount_command_supports_positions(client: Client) -> None:
     params = (0, 0, 0, 100.0, HOME_E7[0], HOME_E7[1] + 10_000, MavMountMode.GPS_POINT)
     assert client.command(MavCmd.DO_MOUNT_CONTROL, *params) == ACCEPTED
-    assert angles(client)[1:] == pytest.approx([20, 0], abs=2)  # 45 degrees up, as far as it goes
+    assert angles(client)[1:] == pytest.approx([20, 0], abs=2)  # 45 degrees up, limited.
     assert client.command(MavCmd.DO_MOUNT_CONTROL, -35, 149, 0, 0, 0, 0, MavMountMode.GPS_POINT) == FAILED
     assert mount(client, MavMountMode.HOME_LOCATION) == ACCEPTED
     assert status(client).flags == LOCKS
 
 
-def test_a_reboot_gives_it_back_to_the_sticks(client: Client) -> None:
+def test_reboot_resets_to_stick_control(client: Client) -> None:
     mount(client, MavMountMode.MAVLINK_TARGETING, -45)
     assert client.command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1) == ACCEPTED
     client.run(10.0)

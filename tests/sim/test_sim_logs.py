@@ -48,7 +48,7 @@ both = pytest.mark.parametrize("kind", ["copter", "px4"])
 
 
 @both
-def test_logs_are_listed_and_read(kind: str) -> None:
+def test_logs_are_listed_and_downloaded(kind: str) -> None:
     vehicle, client = vehicle_with(kind)
     listed = entries(client)
     first = 1 if kind == "copter" else 0
@@ -61,7 +61,7 @@ def test_logs_are_listed_and_read(kind: str) -> None:
 
 
 @both
-def test_logs_are_files_too_until_they_are_erased(kind: str) -> None:
+def test_log_files_exist_until_erased(kind: str) -> None:
     vehicle, client = vehicle_with(kind)
     folder = "/APM/LOGS" if kind == "copter" else "/fs/microsd/log"
     path = f"{folder}/00000003.BIN" if kind == "copter" else f"{folder}/2026-11-21/12_00_00.ulg"
@@ -72,7 +72,7 @@ def test_logs_are_files_too_until_they_are_erased(kind: str) -> None:
 
 
 @both
-def test_a_part_of_a_log_is_read(kind: str) -> None:
+def test_part_of_a_log_is_downloaded(kind: str) -> None:
     _, client = vehicle_with(kind)
     log_id = entries(client)[2].id
     blocks = data(client, log_id, 900, 100)
@@ -84,7 +84,7 @@ def test_a_part_of_a_log_is_read(kind: str) -> None:
 
 
 @both
-def test_a_request_to_end_ends_it(kind: str) -> None:
+def test_end_request_stops_the_transfer(kind: str) -> None:
     vehicle, client = vehicle_with(kind)
     log_id = entries(client)[2].id
     client.send(m.LogRequestData(1, 1, log_id, 0, EVERYTHING))
@@ -93,13 +93,13 @@ def test_a_request_to_end_ends_it(kind: str) -> None:
     assert not vehicle.storage.logs.is_busy
 
 
-def test_ardupilot_says_so_when_there_is_no_log() -> None:
+def test_ardupilot_answers_list_request_without_logs() -> None:
     _, client = vehicle_with("copter", ())
     (entry,) = entries(client)
     assert (entry.id, entry.num_logs, entry.last_log_num, entry.size) == (0, 0, 0, 0)
 
 
-def test_px4_says_nothing_when_there_is_no_log() -> None:
+def test_px4_ignores_list_request_without_logs() -> None:
     _, client = vehicle_with("px4", ())
     assert entries(client) == []
     assert FtpClient(client).data(Op.LISTDIRECTORY, "/fs/microsd/log") == b"S\0S\0"
@@ -110,14 +110,14 @@ def test_ardupilot_lists_a_range_and_px4_to_the_end() -> None:
     assert [entry.id for entry in entries(vehicle_with("px4")[1], 1, 1)] == [1, 2]
 
 
-def test_ardupilot_ends_with_an_empty_block_where_there_is_nothing() -> None:
+def test_ardupilot_sends_empty_block_beyond_the_end() -> None:
     _, client = vehicle_with("copter")
     assert [(block.ofs, block.count) for block in data(client, 2, 180)] == [(180, 0)]
     assert [(block.ofs, block.count) for block in data(client, 2)] == [(0, 90), (90, 90)]
     assert data(client, 9) == []
 
 
-def test_ardupilot_does_one_thing_at_a_time() -> None:
+def test_ardupilot_ignores_requests_during_a_transfer() -> None:
     _, client = vehicle_with("copter")
     client.send(m.LogRequestData(1, 1, 3, 0, EVERYTHING))
     client.send(m.LogRequestData(1, 1, 1, 0, EVERYTHING))
@@ -127,7 +127,7 @@ def test_ardupilot_does_one_thing_at_a_time() -> None:
     assert "Log download in progress" in client.texts
 
 
-def test_px4_wants_a_list_first_and_does_the_newest_thing() -> None:
+def test_px4_needs_list_first_and_replaces_transfers() -> None:
     _, client = vehicle_with("px4")
     assert data(client, 0) == []
     entries(client)
@@ -141,7 +141,7 @@ def test_px4_wants_a_list_first_and_does_the_newest_thing() -> None:
     assert data(client, 0, 1000) == []
 
 
-def test_an_armed_ardupilot_gives_no_log() -> None:
+def test_armed_ardupilot_sends_no_logs() -> None:
     _, client = ready_copter(parameter_count=80, logs=LOGS, parameters={"DISARM_DELAY": 0})
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == 0
     assert entries(client) == []

@@ -1,4 +1,4 @@
-"""Missions flown in simulated time; what is said on the way is what real ArduCopter 4.7 and PX4 1.17 said."""
+"""Missions in simulated time; texts are compared with real ArduCopter 4.7 and PX4 1.17."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CLIMB = item(TAKE_OFF, 3, z=10.0)
 
 
 def start(*items: MissionItem, **parameters: float) -> tuple[SimulatedCopter, Client]:
-    """Armed in GUIDED, then AUTO by MISSION_START."""
+    """Arm in GUIDED, then start AUTO by MISSION_START."""
     copter, client = ready_copter(parameters=parameters)
     client.command(MavCmd.SET_MESSAGE_INTERVAL, m.MissionCurrent.ID, 200_000)
     assert upload(client, [HOME, *items]) == MavResult.ACCEPTED
@@ -67,7 +67,7 @@ def states(client: Client) -> list[int]:
 # ------------------------------------------------------------------------------------------ ArduCopter
 
 
-def test_a_mission_with_everything_is_flown_and_told_as_by_the_real_one() -> None:
+def test_copter_mission_matches_the_recording() -> None:
     east = EAST + round(20 * METRE / math.cos(math.radians(35.36)))
     copter, client = start(
         CLIMB,
@@ -119,7 +119,7 @@ def test_a_mission_with_everything_is_flown_and_told_as_by_the_real_one() -> Non
     assert math.hypot(copter.motion.north, copter.motion.east) < 1.0
 
 
-def test_waypoints_are_passed_in_order_and_near() -> None:
+def test_waypoints_are_passed_in_order() -> None:
     copter, client = start(CLIMB, fly_to(30), fly_to(60, 15.0), item(LAND, 3))
     places = []
     for seq in (2, 3):
@@ -129,7 +129,7 @@ def test_waypoints_are_passed_in_order_and_near() -> None:
     assert places[1] == pytest.approx((60.0, 15.0), abs=0.5)
 
 
-def test_a_landing_ends_the_mission_and_it_waits_to_begin_again() -> None:
+def test_landing_ends_the_mission() -> None:
     copter, client = start(CLIMB, fly_to(20), item(LAND, 3, x=north(20), y=EAST))
     client.run_until(lambda: not copter.is_armed, 120.0)
     client.run(1.0)
@@ -141,7 +141,7 @@ def test_a_landing_ends_the_mission_and_it_waits_to_begin_again() -> None:
     assert copter.is_landed
 
 
-def test_the_mission_goes_on_after_a_landing_when_it_may() -> None:
+def test_mission_continues_after_landing_if_allowed() -> None:
     copter, client = start(CLIMB, item(LAND, 3), CLIMB, fly_to(10), MIS_OPTIONS=4)
     client.run_until(lambda: 4 in reached(client), 200.0)
     assert copter.is_armed
@@ -165,7 +165,7 @@ def test_after_the_last_item_it_stays_in_auto() -> None:
     assert client.texts[-1] == "Mode change to AUTO failed: init failed"
 
 
-def test_a_mission_cannot_be_cleared_while_it_is_flown_but_changed() -> None:
+def test_flown_mission_can_be_changed_not_cleared() -> None:
     copter, client = start(CLIMB, fly_to(50), item(RETURN, 2))
     client.run_until(lambda: copter.mission.nav_index == 2, 60.0)
     client.send(m.MissionClearAll(1, 1, 0))
@@ -177,7 +177,7 @@ def test_a_mission_cannot_be_cleared_while_it_is_flown_but_changed() -> None:
     assert copter.motion.north == pytest.approx(-30.0, abs=1.0)
 
 
-def test_auto_is_armed_only_when_its_options_say_so() -> None:
+def test_arming_in_auto_needs_auto_options() -> None:
     _, client = ready_copter()
     assert set_mode(client, CopterMode.AUTO) == MavResult.ACCEPTED
     assert client.command(ARM, 1) == MavResult.FAILED
@@ -196,7 +196,7 @@ def test_auto_is_armed_only_when_its_options_say_so() -> None:
     client.run_until(lambda: copter.altitude_m > 9.5, 40.0)
 
 
-def test_on_the_ground_a_mission_must_take_off_and_waits_for_the_pilot() -> None:
+def test_mission_on_ground_needs_take_off_and_pilot() -> None:
     copter, client = ready_copter()
     upload(client, [HOME, fly_to(20)])
     set_mode(client, CopterMode.GUIDED)
@@ -213,7 +213,7 @@ def test_on_the_ground_a_mission_must_take_off_and_waits_for_the_pilot() -> None
     assert not copter.is_landed
 
 
-def test_pausing_stops_on_the_way_and_only_there() -> None:
+def test_pause_stops_between_waypoints() -> None:
     copter, client = start(CLIMB, fly_to(60), item(MavCmd.NAV_LOITER_UNLIM, 3, x=north(60), y=EAST, z=10.0))
     assert client.command(MavCmd.DO_PAUSE_CONTINUE, 0) == MavResult.FAILED
     client.run_until(lambda: copter.motion.north > 20, 60.0)
@@ -245,7 +245,7 @@ def test_the_current_item_can_be_chosen_in_flight_and_before() -> None:
     assert copter.mission.nav_index >= 3
 
 
-def test_leaving_and_entering_auto_resumes_or_restarts() -> None:
+def test_reentering_auto_resumes_or_restarts() -> None:
     for restart, index in ((0, 3), (1, 1)):
         copter, client = start(CLIMB, fly_to(10), fly_to(60), MIS_RESTART=restart)
         client.run_until(lambda copter=copter: copter.mission.nav_index == 3, 60.0)  # type: ignore[misc]
@@ -256,7 +256,7 @@ def test_leaving_and_entering_auto_resumes_or_restarts() -> None:
         assert copter.mission.nav_index == index
 
 
-def test_jumps_go_round_as_often_as_they_say_and_tags_too() -> None:
+def test_jumps_and_tags_repeat_as_specified() -> None:
     _, client = start(
         CLIMB,
         item(MavCmd.JUMP_TAG, 2, 7.0),
@@ -285,14 +285,21 @@ def test_jumps_go_round_as_often_as_they_say_and_tags_too() -> None:
     assert client.last(m.MissionCurrent).mission_state == MissionState.COMPLETE
 
 
-def test_an_endless_jump_without_a_way_does_not_hang() -> None:
+def test_endless_jump_without_waypoints_does_not_hang() -> None:
     copter, client = start(CLIMB, item(MavCmd.DO_JUMP, 2, 2.0, -1.0))
     client.run(30.0)
     assert client.last(m.MissionCurrent).mission_state == MissionState.COMPLETE
     assert not copter.is_landed
 
 
-def test_auto_in_the_air_begins_the_mission() -> None:
+def test_unlimited_jump_over_other_commands_does_not_hang() -> None:
+    copter, client = start(CLIMB, item(MavCmd.DO_CHANGE_SPEED, 2, 1.0, 3.0), item(MavCmd.DO_JUMP, 3, 2.0, -1.0))
+    client.run(30.0)
+    assert client.last(m.MissionCurrent).mission_state == MissionState.COMPLETE
+    assert not copter.is_landed
+
+
+def test_auto_in_flight_starts_the_mission() -> None:
     copter, client = flying_copter()
     upload(client, [HOME, fly_to(20), item(MavCmd.NAV_LOITER_TO_ALT, 3, x=north(20), y=EAST, z=20.0)])
     assert set_mode(client, CopterMode.AUTO) == MavResult.ACCEPTED
@@ -328,7 +335,7 @@ def start_px4(*items: MissionItem) -> tuple[SimulatedPx4, Client]:
     return px4, client
 
 
-def test_px4_flies_a_mission_and_tells_it_as_the_real_one() -> None:
+def test_px4_mission_matches_the_recording() -> None:
     px4, client = start_px4(
         PX4_CLIMB,
         go(20),
@@ -341,7 +348,7 @@ def test_px4_flies_a_mission_and_tells_it_as_the_real_one() -> None:
     )
     client.run_until(lambda: px4.mode == RTL_MODE, 150.0)
     client.run(3.0)
-    assert list(dict.fromkeys(reached(client))) == [0, 2, 3, 4, 5, 7]  # 1 is overtaken by 2
+    assert list(dict.fromkeys(reached(client))) == [0, 2, 3, 4, 5, 7]  # Item 2 follows item 1 at once.
     assert reached(client).count(7) == 4
     assert states(client) == [MissionState.ACTIVE, MissionState.COMPLETE]
     assert [one.seq for one in client.all(m.MissionItemInt)] == [6]
@@ -354,7 +361,7 @@ def test_px4_flies_a_mission_and_tells_it_as_the_real_one() -> None:
     assert px4.mode == HOLD_MODE
 
 
-def test_px4_holds_a_heading_and_a_place() -> None:
+def test_px4_holds_heading_and_position() -> None:
     px4, client = start_px4(PX4_CLIMB, go(20, hold=8.0, heading=90.0), go(30))
     client.run_until(lambda: px4.mission.current == 1 and px4.motion.north > 19.5, 60.0)
     client.run(4.0)
@@ -362,7 +369,7 @@ def test_px4_holds_a_heading_and_a_place() -> None:
     assert math.degrees(px4.motion.yaw) == pytest.approx(90.0, abs=3.0)
 
 
-def test_px4_loiters_at_the_end_and_begins_again_when_asked() -> None:
+def test_px4_loiters_at_end_and_restarts_on_request() -> None:
     px4, client = start_px4(PX4_CLIMB, go(15))
     client.run_until(lambda: px4.mode == HOLD_MODE, 60.0)
     client.run(1.5)
@@ -374,7 +381,7 @@ def test_px4_loiters_at_the_end_and_begins_again_when_asked() -> None:
     assert client.last(m.MissionCurrent).mission_state == MissionState.ACTIVE
 
 
-def test_px4_lands_at_the_end_and_stays_in_the_mode() -> None:
+def test_px4_lands_at_end_and_keeps_the_mode() -> None:
     px4, client = start_px4(PX4_CLIMB, item(LAND, 6, x=px4_north(10), y=PX4_EAST))
     client.run_until(lambda: not px4.is_armed, 90.0)
     client.run(1.5)
@@ -384,7 +391,7 @@ def test_px4_lands_at_the_end_and_stays_in_the_mode() -> None:
     assert "Mission finished, landed\t" in client.texts
 
 
-def test_px4_starts_only_what_it_has() -> None:
+def test_px4_mission_start_refusals() -> None:
     px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5, home=PX4_HOME)
     client = Client(px4)
     client.run(2.0)
@@ -398,7 +405,7 @@ def test_px4_starts_only_what_it_has() -> None:
     assert client.command(START) == MavResult.TEMPORARILY_REJECTED
 
 
-def test_px4_pauses_in_hold_and_goes_on() -> None:
+def test_px4_pauses_in_hold_and_resumes() -> None:
     px4, client = start_px4(PX4_CLIMB, go(60))
     client.run_until(lambda: px4.motion.north > 20, 60.0)
     client.command(MavCmd.DO_SET_MODE, 1, 4, 3)
@@ -410,7 +417,7 @@ def test_px4_pauses_in_hold_and_goes_on() -> None:
     assert px4.motion.north == pytest.approx(60.0, abs=2.0)
 
 
-def test_px4_takes_another_mission_in_flight_and_loses_one() -> None:
+def test_px4_handles_new_and_cleared_mission_in_flight() -> None:
     px4, client = start_px4(PX4_CLIMB, go(60))
     client.run_until(lambda: px4.motion.north > 10, 60.0)
     upload(client, [go(-20), go(-60)])
@@ -423,7 +430,7 @@ def test_px4_takes_another_mission_in_flight_and_loses_one() -> None:
     assert client.last(m.MissionCurrent).total == 65535
 
 
-def test_px4_climbs_first_when_the_mission_forgets_to() -> None:
+def test_px4_climbs_first_without_take_off_item() -> None:
     px4, client = start_px4(go(20))
     client.run_until(lambda: px4.mode == HOLD_MODE, 60.0)
     assert "Climb to 2.5 meters above home\t" in client.texts
@@ -446,7 +453,7 @@ def test_px4_climbs_first_when_the_mission_forgets_to() -> None:
         ([go(20), item(MavCmd.DO_LAND_START, 2)], "invalid land start."),
     ],
 )
-def test_px4_takes_a_mission_and_rejects_it_afterwards(items: list[MissionItem], reason: str) -> None:
+def test_px4_stores_an_invalid_mission_and_rejects_it(items: list[MissionItem], reason: str) -> None:
     px4 = SimulatedPx4(fast_rate_hz=1.0, boot_time_s=0.5, home=PX4_HOME)
     client = Client(px4)
     client.run(2.0)
@@ -458,7 +465,7 @@ def test_px4_takes_a_mission_and_rejects_it_afterwards(items: list[MissionItem],
     assert client.command(START) == MavResult.DENIED
 
 
-def test_px4_flies_to_null_island_when_told_so() -> None:
+def test_px4_flies_to_null_island() -> None:
     px4, client = start_px4(item(TAKE_OFF, 6, param4=math.nan, z=10.0), go(20))
     client.run_until(lambda: px4.altitude_m > 9.0, 40.0)
     client.run(15.0)

@@ -1,4 +1,4 @@
-"""The mission protocol of simulated vehicles, by single messages; the expectations were seen on real firmwares."""
+"""Mission protocol of simulated vehicles, message by message; expectations were observed on real firmware."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def square(radius: int = 1000) -> list[MissionItem]:
 # ------------------------------------------------------------------------------------------- ArduPilot
 
 
-def test_ardupilot_gives_a_mission_back_as_its_storage_has_it() -> None:
+def test_ardupilot_download_has_storage_precision() -> None:
     copter, client = copter_and_client()
     sent = [
         item(WAYPOINT, 0),
@@ -114,9 +114,7 @@ def test_ardupilot_gives_a_mission_back_as_its_storage_has_it() -> None:
         (item(MavCmd.DO_JUMP, 2, 1.0, 1.0), R.ACCEPTED),
     ],
 )
-def test_ardupilot_refuses_what_it_cannot_store_and_keeps_what_came_before(
-    sent: MissionItem, result: int
-) -> None:
+def test_ardupilot_refuses_invalid_item_and_keeps_previous_ones(sent: MissionItem, result: int) -> None:
     _, client = copter_and_client()
     assert upload(client, [HOME, item(RETURN, 0), item(RETURN, 0), item(RETURN, 0)]) == R.ACCEPTED
     assert upload(client, [HOME, item(TAKE_OFF, 3, z=5.0), sent]) == result
@@ -124,7 +122,7 @@ def test_ardupilot_refuses_what_it_cannot_store_and_keeps_what_came_before(
     assert download(client)[1].command == TAKE_OFF
 
 
-def test_ardupilot_has_no_room_before_it_is_ready_and_little_afterwards() -> None:
+def test_ardupilot_capacity_before_and_after_boot() -> None:
     copter = SimulatedCopter(boot_time_s=100.0)
     client = Client(copter)
     client.run(3.0)
@@ -141,7 +139,7 @@ def test_ardupilot_has_no_room_before_it_is_ready_and_little_afterwards() -> Non
         assert client.last(m.MissionAck).type == R.NO_SPACE
 
 
-def test_ardupilot_counts_its_home_and_forgets_that_with_the_mission() -> None:
+def test_ardupilot_count_includes_home() -> None:
     _, client = copter_and_client()
     client.send(m.MissionRequestList(1, 1, 0))
     assert client.last(m.MissionCount).count == 1
@@ -149,12 +147,12 @@ def test_ardupilot_counts_its_home_and_forgets_that_with_the_mission() -> None:
     client.send(m.MissionRequestList(1, 1, 0))
     assert client.last(m.MissionCount).count == 0
     assert upload(client, [HOME]) == R.ACCEPTED
-    assert [one.command for one in download(client)] == [16, 16]  # home appears twice
+    assert [one.command for one in download(client)] == [16, 16]  # Home appears twice.
     assert upload(client, [HOME, item(RETURN, 0)]) == R.ACCEPTED
     assert [one.command for one in download(client)] == [16, 20]
 
 
-def test_ardupilot_asks_each_second_and_gives_up_after_eight() -> None:
+def test_ardupilot_retries_each_second_for_eight_seconds() -> None:
     copter, client = copter_and_client()
     client.send(m.MissionCount(1, 1, 2, 0))
     client.run(5.0)
@@ -174,7 +172,7 @@ def item_message(seq: int, mission_type: int = 0, command: int = RETURN) -> m.Mi
     return m.MissionItemInt(1, 1, seq, 0, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 0, 0, 0.0, mission_type)
 
 
-def test_ardupilot_lets_nobody_else_in_while_somebody_uploads() -> None:
+def test_ardupilot_denies_others_during_an_upload() -> None:
     copter, client = copter_and_client()
     other = Client(copter, system_id=255, component_id=77)
     client.send(m.MissionCount(1, 1, 2, 0))
@@ -192,11 +190,11 @@ def test_ardupilot_lets_nobody_else_in_while_somebody_uploads() -> None:
     assert other.last(m.MissionAck).type == R.DENIED
     other.send(m.MissionCount(1, 1, 2, RALLY_TYPE))
     assert (other.last(m.MissionRequest).seq, other.last(m.MissionRequest).mission_type) == (0, RALLY_TYPE)
-    client.send(m.MissionCount(1, 1, 3, 0))  # who began may begin again
+    client.send(m.MissionCount(1, 1, 3, 0))  # The uploader may restart.
     assert client.last(m.MissionRequest).target_component == 190
 
 
-def test_ardupilot_changes_a_part_of_a_mission() -> None:
+def test_ardupilot_accepts_partial_list() -> None:
     _, client = copter_and_client()
     upload(client, [HOME, item(TAKE_OFF, 3, z=5.0), item(RETURN, 0)])
     client.send(m.MissionWritePartialList(1, 1, 1, 3, 0))
@@ -209,7 +207,7 @@ def test_ardupilot_changes_a_part_of_a_mission() -> None:
     assert client.last(m.MissionAck).type == R.ERROR
 
 
-def test_ardupilot_speaks_floats_under_protest() -> None:
+def test_ardupilot_warns_about_float_messages() -> None:
     _, client = copter_and_client()
     client.send(m.MissionCount(1, 1, 2, 0))
     for seq in (0, 1):
@@ -226,7 +224,7 @@ def test_ardupilot_speaks_floats_under_protest() -> None:
     ]
 
 
-def test_ardupilot_takes_a_fence_only_as_a_whole() -> None:
+def test_ardupilot_accepts_complete_fences_only() -> None:
     copter, client = copter_and_client()
     fence = [*square(), item(CIRCLE, 6, 20.5, x=NORTH, y=EAST, z=3.0)]
     assert upload(client, fence, FENCE_TYPE) == R.ACCEPTED
@@ -260,14 +258,14 @@ def test_ardupilot_takes_a_fence_only_as_a_whole() -> None:
         ([item(VERTEX, 0, 70.0)] * 70, "Fence exceeds storage size"),
     ],
 )
-def test_ardupilot_says_what_is_wrong_with_a_fence(fence: list[MissionItem], text: str) -> None:
+def test_ardupilot_reports_invalid_fences(fence: list[MissionItem], text: str) -> None:
     _, client = copter_and_client()
     assert upload(client, fence, FENCE_TYPE) == R.ERROR
     client.run(0.1)
     assert text in client.texts
 
 
-def test_ardupilot_keeps_rally_points_in_whole_metres() -> None:
+def test_ardupilot_rounds_rally_altitudes() -> None:
     _, client = copter_and_client()
     points = [item(RALLY, 6, 1.0, x=NORTH, y=EAST, z=20.9), item(RALLY, 0, x=NORTH, y=EAST, z=600.0)]
     assert upload(client, points, RALLY_TYPE) == R.ACCEPTED
@@ -278,7 +276,7 @@ def test_ardupilot_keeps_rally_points_in_whole_metres() -> None:
     assert upload(client, [item(WAYPOINT, 3)], RALLY_TYPE) == R.UNSUPPORTED
 
 
-def test_ardupilot_knows_three_types_and_two_only_by_mavlink_2() -> None:
+def test_ardupilot_fence_and_rally_need_mavlink_2() -> None:
     copter, client = copter_and_client()
     client.send(m.MissionCount(1, 1, 1, 3))
     client.send(m.MissionRequestList(1, 1, 9))
@@ -294,7 +292,7 @@ def test_ardupilot_knows_three_types_and_two_only_by_mavlink_2() -> None:
     assert client.texts[-1] == "Need mavlink2 for item transfer"
 
 
-def test_ardupilot_answers_a_wrong_number_with_the_right_count() -> None:
+def test_ardupilot_answers_wrong_index_with_the_count() -> None:
     _, client = copter_and_client()
     upload(client, [HOME, item(RETURN, 0)])
     client.send(m.MissionRequestInt(1, 1, 5, 0))
@@ -314,7 +312,7 @@ def test_an_item_with_current_2_is_a_guided_target() -> None:
 # ------------------------------------------------------------------------------------------------- PX4
 
 
-def test_px4_gives_items_back_with_frames_for_integers_and_what_it_has_a_use_for() -> None:
+def test_px4_download_has_int_frames_and_stored_params() -> None:
     px4, client = px4_and_client()
     sent = [
         item(TAKE_OFF, 3, 1.0, 2.0, 3.0, math.nan, NORTH, EAST, 10.0),
@@ -346,21 +344,21 @@ def test_px4_gives_items_back_with_frames_for_integers_and_what_it_has_a_use_for
         (item(RALLY, 3), R.ERROR),
     ],
 )
-def test_px4_refuses_an_item_and_keeps_its_old_mission(sent: MissionItem, result: int) -> None:
+def test_px4_refused_item_keeps_the_old_mission(sent: MissionItem, result: int) -> None:
     _, client = px4_and_client()
     assert upload(client, [item(RETURN, 2)]) == R.ACCEPTED
     assert upload(client, [item(TAKE_OFF, 3, z=5.0), sent, item(RETURN, 2)]) == result
     assert download(client) == [item(RETURN, 2)]
 
 
-def test_px4_has_room_for_so_many() -> None:
+def test_px4_capacities() -> None:
     _, client = px4_and_client()
     for mission_type, capacity in ((0, 10_000), (FENCE_TYPE, 64), (RALLY_TYPE, 32), (3, 0)):
         client.send(m.MissionCount(1, 1, capacity + 1, mission_type))
     assert results(client) == [R.NO_SPACE] * 4
 
 
-def test_px4_fills_in_an_id_of_the_list() -> None:
+def test_px4_sends_opaque_ids() -> None:
     _, client = px4_and_client()
     upload(client, [item(RETURN, 2)])
     opaque_id = client.last(m.MissionAck).opaque_id
@@ -369,7 +367,7 @@ def test_px4_fills_in_an_id_of_the_list() -> None:
     assert client.last(m.MissionCount).opaque_id == opaque_id
 
 
-def test_px4_asks_four_times_a_second_and_gives_up_after_five() -> None:
+def test_px4_retries_four_times_a_second_for_five_seconds() -> None:
     px4, client = px4_and_client()
     client.send(m.MissionCount(1, 1, 2, 0))
     client.run(5.2)
@@ -395,7 +393,7 @@ def test_px4_repeats_its_count_until_the_first_request() -> None:
     assert not is_open(px4)
 
 
-def test_px4_downloads_strictly_in_order() -> None:
+def test_px4_downloads_in_order_only() -> None:
     px4, client = px4_and_client()
     upload(client, [item(RETURN, 2)] * 3)
     client.forget()
@@ -413,7 +411,7 @@ def test_px4_downloads_strictly_in_order() -> None:
     assert client.all(m.MissionItemInt) == []
 
 
-def test_px4_refuses_a_second_station_and_whoever_is_not_its_partner() -> None:
+def test_px4_refuses_other_stations_during_a_transfer() -> None:
     px4, client = px4_and_client()
     upload(client, [item(RETURN, 2)])
     client.send(m.MissionCount(1, 1, 2, 0))
@@ -447,7 +445,7 @@ def test_px4_repeats_a_lost_last_acknowledgement() -> None:
     assert results(client) == [R.ACCEPTED]
 
 
-def test_px4_switches_to_the_other_form_when_asked_and_cancels() -> None:
+def test_px4_switches_item_type_and_cancels_on_request() -> None:
     px4, client = px4_and_client()
     client.send(m.MissionCount(1, 1, 2, 0))
     client.send(m.MissionAck(1, 1, R.UNSUPPORTED, 0))
@@ -461,11 +459,11 @@ def test_px4_switches_to_the_other_form_when_asked_and_cancels() -> None:
     assert old.last(m.MissionRequest).seq == 0
 
 
-def test_a_list_asked_for_in_the_middle_of_an_upload_can_block_px4() -> None:
+def test_px4_list_request_during_upload_can_block() -> None:
     px4, client = px4_and_client()
     upload(client, [item(RETURN, 2)] * 2)
     client.send(m.MissionCount(1, 1, 3, 0))
-    client.send(item_message(0))  # frame 0 is refused
+    client.send(item_message(0))  # Frame 0 is refused.
     assert not is_open(px4)
     client.send(m.MissionCount(1, 1, 3, 0))
     for seq in (0, 1):
@@ -481,7 +479,7 @@ def test_a_list_asked_for_in_the_middle_of_an_upload_can_block_px4() -> None:
     assert upload(client, [item(RETURN, 2)]) == R.ACCEPTED
 
 
-def test_px4_fence_loses_the_kind_of_altitude() -> None:
+def test_px4_fence_drops_the_altitude_frame() -> None:
     _, client = px4_and_client()
     fence = [one.replace(frame=6, z=30.0) for one in square()]
     assert upload(client, fence, FENCE_TYPE) == R.ACCEPTED
@@ -498,7 +496,7 @@ def both() -> list[tuple[Vehicle, Client]]:
     return [copter_and_client(), px4_and_client()]
 
 
-def test_items_survive_a_reboot_and_transfers_do_not() -> None:
+def test_reboot_keeps_items_and_drops_transfers() -> None:
     for vehicle, client in both():
         upload(client, [HOME, item(RETURN, 2)] if isinstance(vehicle, SimulatedCopter) else [item(RETURN, 2)])
         before = vehicle.missions.items(0)
@@ -510,7 +508,7 @@ def test_items_survive_a_reboot_and_transfers_do_not() -> None:
         assert [one.command for one in vehicle.missions.items(0)] == [one.command for one in before]
 
 
-def test_lists_can_be_replaced_at_once() -> None:
+def test_replace_stores_a_whole_list() -> None:
     for vehicle, client in both():
         mission = [HOME, item(TAKE_OFF, 3, z=5.0)]
         fence = square()
@@ -574,7 +572,7 @@ def hold(vehicle: Vehicle, client: Client, talk: Sequence[tuple[Message, bool, f
 
 @settings(max_examples=25)
 @given(conversation)
-def test_ardupilot_survives_any_conversation_and_nothing_stays_open(
+def test_ardupilot_handles_random_messages_without_open_transfers(
     talk: list[tuple[Message, bool, float]],
 ) -> None:
     copter, client = copter_and_client()
@@ -585,12 +583,12 @@ def test_ardupilot_survives_any_conversation_and_nothing_stays_open(
 
 @settings(max_examples=25)
 @given(conversation)
-def test_px4_survives_any_conversation_and_nothing_stays_open(
+def test_px4_handles_random_messages_without_open_transfers(
     talk: list[tuple[Message, bool, float]],
 ) -> None:
     px4, client = px4_and_client()
     hold(px4, client, talk)
-    client.send(m.MissionRequestList(1, 1, 0))  # given up, it also ends a block
+    client.send(m.MissionRequestList(1, 1, 0))  # The time-out also ends a block.
     client.run(6.0)
     assert not is_open(px4)
     assert upload(client, [item(RETURN, 2)]) == R.ACCEPTED

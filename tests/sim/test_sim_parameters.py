@@ -20,9 +20,9 @@ from aerokit.parameters import (
 )
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.sim.ardupilot.kinds import KINDS, parameters_of
-from aerokit.sim.file_tree import FileFault
+from aerokit.sim.ftp import FileFault
 from aerokit.sim.parameter_server import rounded
-from aerokit.sim.parameters import ParameterPackMount, Parameters
+from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.storage import px4_parameters
 
 REAL, INT8, INT16, INT32 = MavParamType.REAL32, MavParamType.INT8, MavParamType.INT16, MavParamType.INT32
@@ -60,7 +60,7 @@ def bits_of(message: m.ParamValue) -> int:
 # ---------------------------------------------------------------------------------------- tables
 
 
-def test_the_tables_are_those_of_the_firmwares() -> None:
+def test_tables_match_the_firmwares() -> None:
     assert (len(parameters_of("copter")), len(px4_parameters())) == (1349, 910)
     assert len(parameters_of("copter", 100)) == 100
     assert px4_parameters().names == tuple(sorted(px4_parameters().names))
@@ -82,7 +82,7 @@ def test_each_ardupilot_firmware_has_a_table() -> None:
     assert len(tables["plane"]) == 1415
 
 
-def test_switching_a_feature_on_changes_the_count() -> None:
+def test_enabling_a_feature_changes_the_count() -> None:
     copter = parameters_of("copter")
     assert copter["BATT2_CAPACITY"] == 3300, "there by name at any time"
     assert "BATT2_CAPACITY" not in copter.names
@@ -102,7 +102,7 @@ def test_switching_a_feature_on_changes_the_count() -> None:
     [(INT8, 20.7, 20), (INT8, 20.995, 21), (INT8, 300, 127), (INT8, -300, -128), (INT8, -2.5, -2),
      (INT16, 70_000, 32_767), (INT32, 16_777_217, 16_777_216), (REAL, 0.1, pytest.approx(0.1, rel=1e-6))],
 )  # fmt: skip
-def test_ardupilot_keeps_what_a_float_gives(type_: int, value: float, kept: float) -> None:
+def test_ardupilot_stores_single_precision(type_: int, value: float, kept: float) -> None:
     copter, client = a_copter(parameter_count=80)
     copter.parameters.add("X", 0, type_)
     (echo,) = told(client, m.ParamSet(1, 1, "X", value, REAL))
@@ -113,7 +113,7 @@ def test_ardupilot_keeps_what_a_float_gives(type_: int, value: float, kept: floa
 # ------------------------------------------------------------------------------------- ArduPilot
 
 
-def test_ardupilots_list_begins_anew_and_comes_at_2000_a_second() -> None:
+def test_ardupilot_list_restarts_and_runs_at_2000_hz() -> None:
     copter, client = a_copter()
     client.send(m.ParamRequestList(1, 1))
     client.run(0.2)
@@ -127,13 +127,13 @@ def test_ardupilots_list_begins_anew_and_comes_at_2000_a_second() -> None:
     assert client.texts.count("Frame: QUAD/PLUS") == 2
 
 
-def test_on_a_slow_link_the_list_takes_30_percent() -> None:
+def test_ardupilot_list_uses_30_percent_of_slow_link() -> None:
     _, client = a_copter(link_bytes_per_s=5760)
     values = told(client, m.ParamRequestList(1, 1), 2.0)
     assert len(values) * 37 == pytest.approx(2 * 0.3 * 5760, rel=0.05)
 
 
-def test_ardupilot_forgets_reads_beyond_twenty() -> None:
+def test_ardupilot_queues_twenty_reads() -> None:
     _, client = a_copter(parameter_count=100)
     for index in range(50):
         client.vehicle.receive(client._encoder.encode(m.ParamRequestRead(1, 1, "", index)), client.now)
@@ -142,7 +142,7 @@ def test_ardupilot_forgets_reads_beyond_twenty() -> None:
     assert [v.param_index for v in told(client, m.ParamRequestRead(1, 1, "RTL_ALT", -1))] == [0xFFFF]
 
 
-def test_the_development_version_says_nothing_and_the_released_one_an_error() -> None:
+def test_ardupilot_released_version_sends_parameter_errors() -> None:
     questions = (
         (m.ParamSet(1, 1, "NOPE", 1.0, REAL), MavParamError.DOES_NOT_EXIST, -1),
         (m.ParamSet(1, 1, "RTL_ALT", math.nan, REAL), MavParamError.VALUE_OUT_OF_RANGE, -1),
@@ -160,7 +160,7 @@ def test_the_development_version_says_nothing_and_the_released_one_an_error() ->
     assert len(told(frank, m.ParamSet(1, 1, "RTL_ALT", 1000.0, REAL))) == 2
 
 
-def test_faults_clamp_protect_and_mute() -> None:
+def test_faults_clamp_protect_and_mute_parameters() -> None:
     copter, client = a_copter(parameter_count=100, parameter_errors=True)
     copter.faults.parameter_limits["RTL_ALT"] = (300.0, 8000.0)
     assert told(client, m.ParamSet(1, 1, "RTL_ALT", 10.0, REAL))[0].param_value == 300.0
@@ -178,7 +178,7 @@ def test_faults_clamp_protect_and_mute() -> None:
 
 
 @pytest.mark.parametrize("block", [239, 80, 100, 17])
-def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
+def test_pack_equals_the_firmwares_pack(block: int) -> None:
     parameters = parameters_of("copter")
     rows = [parameters.row(name) for name in parameters.names]
     for fixed in (None, block):
@@ -188,10 +188,8 @@ def test_the_pack_is_what_the_firmware_packs(block: int) -> None:
             assert (table[row.name].value, table[row.name].default) == (row.value, row.default)
 
 
-def served(
-    parameters: Parameters, path: str = "param.pck", block: int = 239, fixed: int | None = None
-) -> bytes:
-    """What a vehicle gives to who reads in such blocks."""
+def served(parameters: SimParameters, path: str = "param.pck", block: int = 239, fixed: int | None = None) -> bytes:
+    """Return the pack, read in blocks of this size."""
     file = ParameterPackMount(parameters, lambda *_: None, block=fixed).open(path, writing=False)
     content = b""
     while piece := file.read(len(content), block):
@@ -199,7 +197,7 @@ def served(
     return content
 
 
-def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
+def test_pack_reads_need_one_block_size() -> None:
     copter, client = a_copter(parameter_count=100)
     ftp = FtpClient(client)
     assert ftp.data(Op.OPENFILERO, "@PARAM/param.pck?start=98&count=5") == (1200).to_bytes(4, "little")
@@ -214,7 +212,7 @@ def test_a_pack_is_read_by_parts_and_in_one_block_size() -> None:
         assert ftp.refusal(Op.OPENFILERO, path) == (Err.FILENOTFOUND,)
 
 
-def test_an_uploaded_pack_takes_effect_at_its_end() -> None:
+def test_uploaded_pack_is_applied_on_close() -> None:
     copter, client = a_copter(parameter_count=100)
     ftp = FtpClient(client)
     table = unpack_parameters(served(copter.parameters))
@@ -232,7 +230,7 @@ def test_an_uploaded_pack_takes_effect_at_its_end() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=200), st.integers(0, 5))
-def test_no_uploaded_bytes_break_the_vehicle(noise: bytes, count: int) -> None:
+def test_random_uploads_are_handled(noise: bytes, count: int) -> None:
     copter = SimulatedCopter(parameter_count=70)
     file = copter.files.open("@PARAM/param.pck", writing=True)
     file.write(0, struct.pack("<HHH", 0x671B, count, 6 + len(noise)) + noise)
@@ -243,7 +241,7 @@ def test_no_uploaded_bytes_break_the_vehicle(noise: bytes, count: int) -> None:
 # ------------------------------------------------------------------------------------------ PX4
 
 
-def test_px4s_hash_is_of_all_but_the_volatile_ones() -> None:
+def test_px4_hash_excludes_volatile_parameters() -> None:
     px4, client = a_px4()
     rows = [px4.parameters.row(name) for name in px4.parameters.names]
     crc = 0xFFFFFFFF
@@ -264,7 +262,7 @@ def test_px4s_hash_is_of_all_but_the_volatile_ones() -> None:
     assert told_hash() != crc ^ 0xFFFFFFFF
 
 
-def test_px4_sends_its_hash_first_and_a_second_request_begins_without() -> None:
+def test_px4_sends_hash_first_except_on_restart() -> None:
     _, client = a_px4()
     client.send(m.ParamRequestList(1, 1))
     client.run(0.2)
@@ -278,7 +276,7 @@ def test_px4_sends_its_hash_first_and_a_second_request_begins_without() -> None:
 
 
 @pytest.mark.parametrize("value", [0, 1, -1, -5_000_000, 0x7F800001, -(2**31), 2**31 - 1])
-def test_px4_keeps_every_bit(value: int) -> None:
+def test_px4_stores_every_bit(value: int) -> None:
     px4, client = a_px4(parameter_count=70)
     px4.parameters["COM_LOW_BAT_ACT"] = value
     (echo,) = told(client, m.ParamRequestRead(1, 1, "COM_LOW_BAT_ACT", -1))
@@ -287,14 +285,12 @@ def test_px4_keeps_every_bit(value: int) -> None:
     payload[:4] = struct.pack("<i", value)
     message = m.ParamSet.decode(bytes(payload))
     frame = client._encoder.encode(message)
-    if struct.pack("<f", message.param_value) == struct.pack(
-        "<i", value
-    ):  # as many bits as a float keeps here
+    if struct.pack("<f", message.param_value) == struct.pack("<i", value):  # As many bits as a float has here.
         px4.receive(frame, client.now)
         assert px4.parameters["COM_RC_IN_MODE"] == value
 
 
-def test_px4_tells_a_change_twice_and_the_same_value_once() -> None:
+def test_px4_confirms_a_change_twice() -> None:
     px4, client = a_px4(parameter_count=70)
     index = px4.parameters.index("MIS_TAKEOFF_ALT")
     first, second = told(client, m.ParamSet(1, 1, "MIS_TAKEOFF_ALT", 3.0, REAL))
@@ -305,7 +301,7 @@ def test_px4_tells_a_change_twice_and_the_same_value_once() -> None:
     assert math.isnan(px4.parameters["MIS_TAKEOFF_ALT"])
 
 
-def test_px4_says_what_is_wrong_and_its_older_version_does_not() -> None:
+def test_px4_sends_parameter_errors_since_1_17() -> None:
     questions = (
         (m.ParamSet(1, 1, "NOPE", 1.0, REAL), MavParamError.DOES_NOT_EXIST),
         (m.ParamSet(1, 1, "COM_LOW_BAT_ACT", 1.0, REAL), 7),
@@ -324,7 +320,7 @@ def test_px4_says_what_is_wrong_and_its_older_version_does_not() -> None:
         assert old.all(m.ParamError) == []
 
 
-def test_px4_has_the_file_when_it_is_new_enough() -> None:
+def test_px4_serves_the_pack_if_enabled() -> None:
     px4, client = a_px4(parameter_count=100)
     assert FtpClient(client).refusal(Op.OPENFILERO, "@PARAM/param.pck") == (Err.FILENOTFOUND,)
     px4, client = a_px4(parameter_count=100, parameter_file=True)
@@ -338,7 +334,7 @@ def test_px4_has_the_file_when_it_is_new_enough() -> None:
     assert table["CA_ROTOR_COUNT" if "CA_ROTOR_COUNT" in table else "BAT1_N_CELLS"].default == 0
 
 
-def test_px4_takes_a_pack_in_order_only() -> None:
+def test_px4_accepts_packs_in_order_only() -> None:
     px4, client = a_px4(parameter_count=100, parameter_file=True)
     ftp = FtpClient(client)
     content = pack_parameters(unpack_parameters(served(px4.parameters)))
@@ -360,6 +356,6 @@ def test_px4_takes_a_pack_in_order_only() -> None:
 
 
 @given(st.floats(-200, 200), st.sampled_from([INT8, INT16, INT32]))
-def test_rounding_is_towards_zero_but_for_a_hundredth(value: float, type_: int) -> None:
+def test_rounding_truncates_after_adding_a_hundredth(value: float, type_: int) -> None:
     assert abs(rounded(value, type_)) <= abs(value) + 0.011
     assert abs(rounded(value, type_) - value) < 1.0

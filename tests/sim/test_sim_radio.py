@@ -1,4 +1,4 @@
-"""The radio, the calibrations and the buzzer of a simulated ArduCopter, as seen on ArduCopter 4.7 in simulation."""
+"""RC channels and calibrations of a simulated ArduCopter, as measured on ArduCopter 4.7 in SITL."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ REJECTED = MavResult.TEMPORARILY_REJECTED
 def channels(client: Client) -> tuple[int, ...]:
     assert client.command(MavCmd.REQUEST_MESSAGE, m.RcChannels.ID) == ACCEPTED
     client.run(0.05)
-    told = client.last(m.RcChannels)
-    assert told.chancount == 8
-    return tuple(getattr(told, f"chan{number}_raw") for number in range(1, 19))
+    message = client.last(m.RcChannels)
+    assert message.chancount == 8
+    return tuple(getattr(message, f"chan{number}_raw") for number in range(1, 19))
 
 
 def override(client: Client, *values: int) -> None:
@@ -31,7 +31,7 @@ def override(client: Client, *values: int) -> None:
 # ----------------------------------------------------------------------------------- overrides
 
 
-def test_overrides_are_heard_in_place_of_the_radio() -> None:
+def test_rc_override_replaces_transmitter_channels() -> None:
     copter, client = ready_copter()
     assert channels(client) == (*RESTING, *(0,) * 10)
     override(client, 1600, 0, SAME, 1400)
@@ -43,7 +43,7 @@ def test_overrides_are_heard_in_place_of_the_radio() -> None:
     assert channels(client)[2] == 1700
 
 
-def test_channels_above_eight_are_released_by_a_number_of_their_own() -> None:
+def test_upper_channels_are_released_by_special_value() -> None:
     _, client = ready_copter()
     override(client, *(0,) * 8, 1234, 1300, *(0,) * 7, 1700)
     assert channels(client)[8:] == (1234, 1300, *(0,) * 8), "17 and 18 cannot be overridden"
@@ -53,7 +53,7 @@ def test_channels_above_eight_are_released_by_a_number_of_their_own() -> None:
     assert channels(client)[0] == RELEASE
 
 
-def test_overrides_end_by_themselves() -> None:
+def test_rc_override_expires() -> None:
     copter, client = ready_copter()
     override(client, 1600)
     client.run(2.8)
@@ -68,15 +68,15 @@ def test_overrides_end_by_themselves() -> None:
     assert channels(client)[0] == 1500
 
 
-def test_only_its_own_ground_station_overrides() -> None:
+def test_rc_override_of_other_ground_station_is_ignored() -> None:
     copter, client = ready_copter()
     copter.parameters["MAV_GCS_SYSID"] = 42
     override(client, 1600)
     assert channels(client)[0] == 1500
 
 
-def test_the_old_message_is_for_mavlink_1_only() -> None:
-    heard = {}
+def test_rc_channels_raw_is_sent_in_mavlink_1_only() -> None:
+    received = {}
     for version in (1, 2):
         copter = SimulatedCopter(boot_time_s=0.0)
         channel = copter.open_channel(version=version)
@@ -86,16 +86,16 @@ def test_the_old_message_is_for_mavlink_1_only() -> None:
         client.now = 1.0
         client.run(1.0)
         frames = Framer().receive(channel.take_outbox(), 2.0)
-        heard[version] = {frame.message_id for frame in frames}
-    assert m.RcChannelsRaw.ID in heard[1]
-    assert heard[2] == heard[1] - {m.RcChannelsRaw.ID}
+        received[version] = {frame.message_id for frame in frames}
+    assert m.RcChannelsRaw.ID in received[1]
+    assert received[2] == received[1] - {m.RcChannelsRaw.ID}
 
 
 # -------------------------------------------------------------------------------- calibrations
 
 
 def calibrate(client: Client, *params: float) -> tuple[int | None, list[str]]:
-    """The answer, which may take a second, and what is said meanwhile."""
+    """Return the result of a calibration and the texts until then."""
     client.forget()
     result = client.command(MavCmd.PREFLIGHT_CALIBRATION, *params)
     client.run(1.5)
@@ -103,7 +103,7 @@ def calibrate(client: Client, *params: float) -> tuple[int | None, list[str]]:
     return result, client.texts
 
 
-def test_each_calibration_answers_when_it_is_done() -> None:
+def test_calibration_is_acknowledged_at_its_end() -> None:
     _, client = ready_copter()
     begins = "Initialising ArduPilot"
     assert calibrate(client, 1) == (ACCEPTED, [begins])
@@ -119,7 +119,7 @@ def test_each_calibration_answers_when_it_is_done() -> None:
     assert calibrate(client, 0, 76)[0] == ACCEPTED
 
 
-def test_nothing_is_calibrated_while_armed() -> None:
+def test_calibration_while_armed_is_refused() -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == ACCEPTED
     assert calibrate(client, 1) == (FAILED, ["Disarm to allow calibration"])
@@ -129,10 +129,8 @@ def test_nothing_is_calibrated_while_armed() -> None:
     assert client.texts == ["Disarm to allow compass calibration"]
 
 
-@pytest.mark.parametrize(
-    "end", [(MavCmd.DO_CANCEL_MAG_CAL, 0, 0.1), (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1, 10.0)]
-)
-def test_a_calibration_of_the_compasses_keeps_it_from_arming(end: tuple[int, int, float]) -> None:
+@pytest.mark.parametrize("end", [(MavCmd.DO_CANCEL_MAG_CAL, 0, 0.1), (MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, 1, 10.0)])
+def test_running_compass_calibration_prevents_arming(end: tuple[int, int, float]) -> None:
     _, client = ready_copter()
     assert client.command(MavCmd.DO_START_MAG_CAL, 300) == FAILED
     assert client.command(MavCmd.DO_START_MAG_CAL, 0, 1, 1) == ACCEPTED

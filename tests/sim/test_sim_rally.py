@@ -1,4 +1,4 @@
-"""Rally points: where Plane, Copter and Rover return to."""
+"""Rally points as destinations of Plane, Copter and Rover."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from aerokit.sim.ardupilot.navigation import best_return_place
 HOME = (0.0, 0.0, 0.0)
 
 
-def test_home_when_there_are_none() -> None:
+def test_without_rally_points_return_goes_home() -> None:
     plane, _ = ready_plane()
     assert best_return_place(plane, HOME) == HOME
 
 
-def test_the_nearest_with_its_height() -> None:
+def test_return_uses_nearest_rally_point_and_its_altitude() -> None:
     plane, _ = ready_plane()
     rally_points(plane, (1000.0, 300.0, 80.0), (-2000.0, 0.0, 70.0))
     assert best_return_place(plane, HOME) == pytest.approx((1000.0, 300.0, -80.0), abs=0.1)
@@ -27,7 +27,7 @@ def test_the_nearest_with_its_height() -> None:
     assert best_return_place(plane, HOME) == pytest.approx((-2000.0, 0.0, -70.0), abs=0.1)
 
 
-def test_one_beyond_the_limit_is_none() -> None:
+def test_rally_point_beyond_the_limit_is_ignored() -> None:
     plane, _ = ready_plane(RALLY_LIMIT_KM=0.5)
     rally_points(plane, (1000.0, 0.0, 80.0))
     assert best_return_place(plane, HOME) == HOME
@@ -35,7 +35,7 @@ def test_one_beyond_the_limit_is_none() -> None:
     assert best_return_place(plane, HOME) != HOME, "0 is no limit"
 
 
-def test_home_may_be_one_of_them() -> None:
+def test_home_is_a_rally_point_if_configured() -> None:
     plane, _ = ready_plane(RALLY_INCL_HOME=1.0)
     rally_points(plane, (1000.0, 0.0, 80.0))
     assert best_return_place(plane, HOME) == HOME
@@ -43,14 +43,14 @@ def test_home_may_be_one_of_them() -> None:
     assert best_return_place(plane, HOME) != HOME
 
 
-def test_one_that_is_not_allowed_is_none() -> None:
+def test_disallowed_rally_point_is_ignored() -> None:
     plane, _ = ready_plane()
     rally_points(plane, (100.0, 0.0, 80.0), (-200.0, 0.0, 70.0))
     place = best_return_place(plane, HOME, is_allowed=lambda point: point[0] < 0.0)
     assert place == pytest.approx((-200.0, 0.0, -70.0), abs=0.1)
 
 
-def test_a_plane_circles_above_it_at_its_height() -> None:
+def test_plane_circles_above_rally_point() -> None:
     plane, client = flying_plane()
     rally_points(plane, (300.0, 300.0, 80.0))
     assert set_mode(client, PlaneMode.RTL) == MavResult.ACCEPTED
@@ -60,7 +60,7 @@ def test_a_plane_circles_above_it_at_its_height() -> None:
     assert plane.altitude_m == pytest.approx(80.0, abs=2.0)
 
 
-def test_a_copter_lands_there_unless_the_fence_forbids_it() -> None:
+def test_copter_lands_at_rally_point_inside_fence() -> None:
     parameters = {"RTL_LOIT_TIME": 0.0, "RTL_ALT": 1200.0, "FENCE_RADIUS": 50.0, "RALLY_INCL_HOME": 0.0}
     copter, client = flying_copter(parameters=parameters)
     rally_points(copter, (25.0, 10.0, 15.0), (-5.0, 0.0, 200.0))
@@ -79,7 +79,7 @@ def test_a_copter_lands_there_unless_the_fence_forbids_it() -> None:
     assert (copter.motion.north, copter.motion.east) == pytest.approx((25.0, 10.0), abs=1.0)
 
 
-def test_a_rover_drives_there_when_it_is_nearer_than_home() -> None:
+def test_rover_drives_to_rally_point_nearer_than_home() -> None:
     rover, client = driving_rover(30.0)
     rally_points(rover, (25.0, 10.0, 0.0))
     client.run_until(lambda: rover.motion.north > 20.0)

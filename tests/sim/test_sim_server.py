@@ -23,8 +23,8 @@ from aerokit.transport import Link, Peer, TcpConnect, TcpListen, UdpConnect, Udp
 pytestmark = pytest.mark.anyio
 
 
-class Ground:
-    """The receiver of a test: decodes what comes."""
+class DecodingReceiver:
+    """Receiver that decodes messages."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -57,13 +57,13 @@ class Ground:
             await self._heard.wait()
 
 
-async def opened(link: Link) -> Ground:
-    ground = Ground(link)
+async def opened(link: Link) -> DecodingReceiver:
+    ground = DecodingReceiver(link)
     await link.open(ground)
     return ground
 
 
-async def test_a_flight_in_memory_takes_its_time_on_the_loops_clock() -> None:
+async def test_flight_in_memory_runs_on_loop_time() -> None:
     copter = SimulatedCopter(boot_time_s=1.0)
     tasks = asyncio.all_tasks()
     async with simulated_link(copter) as link:
@@ -80,7 +80,7 @@ async def test_a_flight_in_memory_takes_its_time_on_the_loops_clock() -> None:
     assert asyncio.all_tasks() == tasks
 
 
-async def test_speedup_makes_more_simulated_seconds() -> None:
+async def test_speedup_multiplies_simulated_time() -> None:
     copter = SimulatedCopter(boot_time_s=5.0)
     async with simulated_link(copter, speedup=10.0) as link:
         ground = await opened(link)
@@ -108,15 +108,13 @@ async def test_several_vehicles_share_a_link() -> None:
         await asyncio.sleep(2.5)
         ground.command(2, MavCmd.DO_SET_MODE, 1, 4)
         await ground.wait_for(lambda x: isinstance(x, m.CommandAck))
-        senders = {
-            f.system_id for x in ground.messages if isinstance(x, m.Heartbeat) and (f := x.received_frame)
-        }
+        senders = {f.system_id for x in ground.messages if isinstance(x, m.Heartbeat) and (f := x.received_frame)}
         assert senders == {1, 2, 3}
         assert [copter.mode.number for copter in fleet] == [0, 4, 0]
         link.close()
 
 
-async def test_a_vehicle_on_two_links_keeps_their_rates_apart() -> None:
+async def test_vehicle_on_two_links_has_separate_rates() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     (near, far), (other_near, other_far) = memory_link_pair(), memory_link_pair()
     async with SimulatorServer(copter, [far, other_far]):
@@ -135,7 +133,7 @@ async def test_a_vehicle_on_two_links_keeps_their_rates_apart() -> None:
         other_near.close()
 
 
-async def test_the_vehicle_flies_on_when_the_client_leaves() -> None:
+async def test_vehicle_continues_without_client() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         await opened(link)
@@ -144,7 +142,7 @@ async def test_the_vehicle_flies_on_when_the_client_leaves() -> None:
         assert copter.now == pytest.approx(5.0, abs=1.1)
 
 
-async def test_leaving_closes_the_link_and_can_be_cancelled() -> None:
+async def test_exit_closes_the_link_and_is_cancellable() -> None:
     tasks = asyncio.all_tasks()
     near, far = memory_link_pair()
     async with SimulatorServer(SimulatedCopter(), far):
@@ -175,7 +173,7 @@ class TestOnSockets:
     def anyio_backend(self) -> tuple[str, dict[str, Any]]:
         return "asyncio", {}
 
-    async def test_over_tcp_with_boot_text(self) -> None:
+    async def test_tcp_client_receives_the_boot_text(self) -> None:
         listener = TcpListen("127.0.0.1", 0)
         async with SimulatorServer(SimulatedCopter(boot_time_s=0.0), listener, speedup=20.0) as server:
             assert server.addresses == (listener.address,)
@@ -186,19 +184,17 @@ class TestOnSockets:
             ground.link.close()
             await ground.link.wait_closed()
 
-    async def test_over_udp_in_both_directions(self) -> None:
+    async def test_udp_works_in_both_directions(self) -> None:
         ground = await opened(UdpListen("127.0.0.1", 0))
         port = ground.link.local_address[1]  # type: ignore[attr-defined]
-        async with SimulatorServer(
-            SimulatedCopter(boot_time_s=0.0), UdpConnect("127.0.0.1", port), speedup=20.0
-        ):
+        async with SimulatorServer(SimulatedCopter(boot_time_s=0.0), UdpConnect("127.0.0.1", port), speedup=20.0):
             await ground.wait_for(lambda x: isinstance(x, m.Heartbeat))
             ground.command(1, MavCmd.DO_SEND_BANNER)
             await ground.wait_for(lambda x: isinstance(x, m.CommandAck))
         ground.link.close()
         await ground.link.wait_closed()
 
-    async def test_many_share_datagrams(self) -> None:
+    async def test_many_vehicles_share_datagrams(self) -> None:
         ground = await opened(UdpListen("127.0.0.1", 0))
         port = ground.link.local_address[1]  # type: ignore[attr-defined]
         fleet = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in range(1, 13)]
@@ -213,13 +209,11 @@ class TestOnSockets:
         assert max(map(len, senders)) > 1
         assert set().union(*senders) == set(range(1, 13))
         assert max(map(len, sent)) <= 1200
-        assert [copter.mode.number for copter in fleet] == [
-            4 if number == 7 else 0 for number in range(1, 13)
-        ]
+        assert [copter.mode.number for copter in fleet] == [4 if number == 7 else 0 for number in range(1, 13)]
         ground.link.close()
         await ground.link.wait_closed()
 
-    async def test_an_address_in_use_leaves_nothing_behind(self) -> None:
+    async def test_address_in_use_closes_other_links(self) -> None:
         first = TcpListen("127.0.0.1", 0)
         async with SimulatorServer(SimulatedCopter(), first):
             second = TcpListen("127.0.0.1", first.local_address[1])

@@ -1,4 +1,4 @@
-"""Simulated vehicles with a key for signing: as ArduPilot and PX4 were seen to take, use, keep and drop it."""
+"""Message signing of simulated vehicles, compared with ArduPilot and PX4."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from aerokit.sim.channel import Channel
 
 KEY = SigningKey.from_passphrase("right")
 WRONG = SigningKey.from_passphrase("wrong")
+# Later than the GPS time of the vehicles.
 STAMP = 37_000_000_000_000
-"""Later than what the vehicles' GPS says."""
 
 
 class Station:
@@ -37,31 +37,31 @@ class Station:
 
     def send(self, message: Message) -> bytes:
         raw = self.encoder.encode(message)
-        self.hear(raw)
+        self.receive(raw)
         return raw
 
-    def hear(self, raw: bytes) -> None:
-        """Bytes for the vehicle, from whomever."""
+    def receive(self, raw: bytes) -> None:
+        """Pass bytes of any sender to the vehicle."""
         self.vehicle.receive(raw, self.vehicle.now, None, self.channel)
 
     def setup(self, key: bytes, timestamp: int) -> None:
         self.send(m.SetupSigning(1, 1, key, timestamp))
 
-    def is_heard(self) -> bool:
-        """Whether the vehicle answers a command."""
+    def answers_command(self) -> bool:
+        """Return True if the vehicle answers a command."""
         self.read()
         self.send(m.CommandLong(1, 1, MavCmd.REQUEST_MESSAGE, 0, 148, *(0.0,) * 6))
         answers = [STANDARD.decode(frame) for frame in self.read() if frame.message_id == m.CommandAck.ID]
         return any(isinstance(ack, m.CommandAck) and ack.result == MavResult.ACCEPTED for ack in answers)
 
     def read(self) -> list[Frame]:
-        """What the vehicle has sent since the last time."""
+        """Return what the vehicle has sent since the last call."""
         found = self.framer.receive(self.channel.take_outbox())
         self.frames += found
         return found
 
     def run(self, seconds: float) -> list[Frame]:
-        """What the vehicle sends in this time."""
+        """Return what the vehicle sends in this time."""
         self.read()
         self.vehicle.step(self.vehicle.now + seconds)
         return self.read()
@@ -90,14 +90,14 @@ def px4_with_station(**options: Any) -> tuple[SimulatedPx4, Station]:
     px4 = SimulatedPx4(boot_time_s=0.0, **options)
     px4.step(5.0)
     station = Station(px4, px4.channels[0])
-    station.send(m.Heartbeat(MavType.GCS, MavAutopilot.INVALID, 0, 0, 4, 3))  # texts go to ground stations
+    station.send(m.Heartbeat(MavType.GCS, MavAutopilot.INVALID, 0, 0, 4, 3))  # PX4 sends texts to ground stations only.
     return px4, station
 
 
 # -------------------------------------------------------------------------------------- ArduPilot
 
 
-def test_a_key_is_used_on_all_ports_from_a_minute_later_on() -> None:
+def test_key_is_used_on_all_ports_with_offset() -> None:
     _, usb, radio = copter_on_two_ports()
     assert not any(frame.signature for frame in usb.run(2.0))
     usb.setup(KEY.secret, STAMP)
@@ -112,21 +112,21 @@ def test_a_key_is_used_on_all_ports_from_a_minute_later_on() -> None:
         assert station.stamps()[0] == STAMP + ONE_MINUTE
 
 
-def test_only_the_first_port_lets_in_what_is_not_signed_with_the_key() -> None:
+def test_only_first_port_accepts_unsigned_frames() -> None:
     copter, usb, radio = copter_on_two_ports()
-    assert radio.is_heard()
+    assert radio.answers_command()
     usb.setup(KEY.secret, STAMP)
     for signing, expected in ((None, False), (Signing(WRONG), False), (Signing(KEY, timestamp=STAMP), True)):
         radio.encoder.signing = usb.encoder.signing = signing
-        assert usb.is_heard()
-        assert radio.is_heard() is expected
+        assert usb.answers_command()
+        assert radio.answers_command() is expected
     copter.signing.trusts_first_port = False
     copter.signing.load()
     usb.encoder.signing = None
-    assert not usb.is_heard()
+    assert not usb.answers_command()
 
 
-def test_an_old_frame_is_refused_on_every_port() -> None:
+def test_old_frame_is_refused_on_every_port() -> None:
     copter, usb, radio = copter_on_two_ports()
     third = Station(copter, copter.open_channel())
     usb.setup(KEY.secret, STAMP)
@@ -135,22 +135,22 @@ def test_an_old_frame_is_refused_on_every_port() -> None:
     assert copter.parameters["RTL_ALT"] == 1234.0
     copter.parameters["RTL_ALT"] = 1500.0
     for station in (radio, third):
-        station.hear(raw)
+        station.receive(raw)
         assert copter.parameters["RTL_ALT"] == 1500.0
-    usb.hear(raw)  # that port trusts whoever is connected to it
+    usb.receive(raw)  # That port accepts unsigned frames.
     assert copter.parameters["RTL_ALT"] == 1234.0
 
 
-def test_a_new_sender_must_not_be_more_than_a_minute_behind() -> None:
+def test_new_sender_may_lag_a_minute() -> None:
     _, usb, radio = copter_on_two_ports()
     usb.setup(KEY.secret, STAMP)
     radio.encoder.signing = Signing(KEY, timestamp=STAMP - 1)
-    assert not radio.is_heard()
+    assert not radio.answers_command()
     radio.encoder.signing = Signing(KEY, timestamp=STAMP + 100)
-    assert radio.is_heard()
+    assert radio.answers_command()
 
 
-def test_no_change_while_armed() -> None:
+def test_key_cannot_change_while_armed() -> None:
     copter, usb, _ = copter_on_two_ports()
     usb.send(m.CommandLong(1, 1, MavCmd.COMPONENT_ARM_DISARM, 0, 1, 21196, *(0.0,) * 5))
     assert copter.is_armed
@@ -164,7 +164,7 @@ def test_key_and_time_stamp_survive_a_reboot() -> None:
     copter, usb, radio = copter_on_two_ports()
     usb.setup(KEY.secret, STAMP)
     radio.encoder.signing = Signing(KEY, timestamp=STAMP + 20 * ONE_MINUTE)
-    assert radio.is_heard()
+    assert radio.answers_command()
     radio.run(35.0)
     last = radio.stamps()[-1]
     assert last > STAMP + 20 * ONE_MINUTE
@@ -173,16 +173,16 @@ def test_key_and_time_stamp_survive_a_reboot() -> None:
     frames = radio.run(5.0)
     assert all(radio.encoder.signing.accepts(frame) for frame in frames)
     assert last < radio.stamps()[0] < last + 2 * ONE_MINUTE
-    assert radio.is_heard()
+    assert radio.answers_command()
     radio.encoder.signing = None
-    assert not radio.is_heard()
+    assert not radio.answers_command()
 
 
-def test_gps_moves_the_time_stamps_on() -> None:
+def test_gps_time_advances_the_time_stamps() -> None:
     _, usb, _ = copter_on_two_ports()
     usb.setup(KEY.secret, 1)
     usb.run(1.0)
-    assert usb.stamps()[0] == 1 + ONE_MINUTE  # the clock was heard before
+    assert usb.stamps()[0] == 1 + ONE_MINUTE  # The clock was received before.
     copter = SimulatedCopter(boot_time_s=10.0, unix_time_at_boot=1_800_000_000.0)
     station = Station(copter, copter.channels[0])
     copter.step(1.0)
@@ -192,7 +192,7 @@ def test_gps_moves_the_time_stamps_on() -> None:
     assert station.stamps()[-1] >= (1_800_000_000 - 1_420_070_400) * 100_000
 
 
-def test_zeros_take_the_key_away() -> None:
+def test_key_of_zeros_removes_the_key() -> None:
     copter, usb, radio = copter_on_two_ports(signing_key=KEY)
     assert all(frame.signature for frame in usb.run(2.0))
     radio.setup(bytes(32), 0)
@@ -201,53 +201,53 @@ def test_zeros_take_the_key_away() -> None:
     radio.setup(bytes(32), 0)
     assert not copter.signing.key
     radio.encoder.signing = None
-    assert radio.is_heard()
+    assert radio.answers_command()
     copter.restart()
     assert not any(frame.signature for frame in usb.run(5.0))
 
 
-def test_a_port_can_do_without() -> None:
+def test_signing_can_be_off_on_a_port() -> None:
     copter, usb, radio = copter_on_two_ports(signing_key=KEY)
     copter.parameters["MAV2_OPTIONS"] = 1
-    assert not radio.is_heard()
+    assert not radio.answers_command()
     copter.restart()
     assert not any(frame.signature for frame in radio.run(5.0))
     assert all(frame.signature for frame in usb.read())
-    assert radio.is_heard()
+    assert radio.answers_command()
 
 
-def test_a_port_that_speaks_mavlink_1_has_no_signatures() -> None:
+def test_mavlink_1_port_does_not_sign() -> None:
     copter, _, _ = copter_on_two_ports(signing_key=KEY)
     old = Station(copter, copter.open_channel(version=1))
     frames = old.run(2.0)
     assert frames
     assert {frame.version for frame in frames} == {1}
-    assert old.is_heard()
+    assert old.answers_command()
 
 
-def test_pymavlink_sets_up_a_key_and_is_understood() -> None:
+def test_pymavlink_sets_up_a_key() -> None:
     copter, usb, radio = copter_on_two_ports()
     mav = peer.MAVLink(None, srcSystem=255, srcComponent=190)
-    usb.hear(mav.setup_signing_encode(1, 1, list(KEY.secret), STAMP).pack(mav))
+    usb.receive(mav.setup_signing_encode(1, 1, list(KEY.secret), STAMP).pack(mav))
     mav.signing.secret_key, mav.signing.timestamp = KEY.secret, STAMP + 1
     mav.signing.sign_outgoing = True
     for frame in radio.run(1.0):
         message = mav.parse_char(frame.raw)
         assert message is not None
         assert message.get_signed()
-    radio.hear(mav.param_set_encode(1, 1, b"RTL_ALT", 1234.0, 9).pack(mav))
+    radio.receive(mav.param_set_encode(1, 1, b"RTL_ALT", 1234.0, 9).pack(mav))
     assert copter.parameters["RTL_ALT"] == 1234.0
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.integers(0, 5), max_size=12))
-def test_whatever_is_played_again_sets_nothing(order: list[int]) -> None:
+def test_replayed_setup_changes_nothing(order: list[int]) -> None:
     copter, _, radio = copter_on_two_ports(signing_key=KEY, parameter_count=20)
     radio.encoder.signing = Signing(KEY, timestamp=STAMP)
     sets = [radio.encoder.encode(m.ParamSet(1, 1, "RTL_ALT", 1000.0 + n, 9)) for n in range(6)]
     newest = -1
     for number in order:
-        radio.hear(sets[number])
+        radio.receive(sets[number])
         newest = max(newest, number)
         assert copter.parameters["RTL_ALT"] == (1000.0 + newest)
 
@@ -255,7 +255,7 @@ def test_whatever_is_played_again_sets_nothing(order: list[int]) -> None:
 # -------------------------------------------------------------------------------------------- PX4
 
 
-def test_px4_says_that_it_has_taken_a_key_and_that_it_has_dropped_it() -> None:
+def test_px4_announces_key_changes() -> None:
     _, station = px4_with_station()
     station.setup(KEY.secret, STAMP)
     frames = station.run(1.0)
@@ -267,22 +267,22 @@ def test_px4_says_that_it_has_taken_a_key_and_that_it_has_dropped_it() -> None:
     assert not any(frame.signature for frame in station.run(1.0))
     assert station.texts()[-1] == (6, "MAVLink signing disabled")
     station.encoder.signing = None
-    assert station.is_heard()
+    assert station.answers_command()
 
 
-def test_px4_lets_only_heartbeats_in_without_a_signature() -> None:
+def test_px4_accepts_unsigned_heartbeats_only() -> None:
     px4, station = px4_with_station(signing_key=KEY)
     heard: list[int] = []
     px4.handlers[m.Heartbeat.ID] = lambda message, _: heard.append(message.ID)
     for signing in (None, Signing(WRONG)):
         station.encoder.signing = signing
-        assert not station.is_heard()
+        assert not station.answers_command()
         station.send(m.Heartbeat(6, 8, 0, 0, 4))
     assert len(heard) == 2
     station.setup(bytes(32), 0)
     assert px4.signing.key == KEY
     station.encoder.signing = Signing(KEY, timestamp=STAMP)
-    assert station.is_heard()
+    assert station.answers_command()
 
 
 def test_px4_refuses_a_key_while_armed() -> None:
@@ -304,8 +304,8 @@ def test_px4_keeps_the_key() -> None:
 
 
 @pytest.mark.parametrize("key", [KEY, None])
-def test_px4_1_16_knows_no_signing(key: SigningKey | None) -> None:
+def test_px4_1_16_does_not_sign(key: SigningKey | None) -> None:
     _, station = px4_with_station(version="1.16.1", signing_key=key)
     station.setup(KEY.secret, STAMP)
     assert not any(frame.signature for frame in station.run(1.0))
-    assert station.is_heard()
+    assert station.answers_command()

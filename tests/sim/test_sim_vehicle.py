@@ -1,4 +1,4 @@
-"""What all simulated vehicles share, tried on the copter."""
+"""Behaviour that all simulated vehicles share, tested with a copter."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavType
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
-from aerokit.sim import ExtraComponent, SimulatedCopter, Wind
+from aerokit.sim import ExtraComponent, SimulatedCopter, SimulatedWind
 
 
 def recorded(steps: list[float]) -> bytes:
-    """Everything a copter sends while it is told to take off at fixed times, stepped as given in between."""
-    copter = SimulatedCopter(boot_time_s=1.0, seed=7, wind=Wind(3.0, 1.0, gusts_m_s=1.0))
+    """Return everything that a copter sends during a take-off at fixed times, with these steps in between."""
+    copter = SimulatedCopter(boot_time_s=1.0, seed=7, wind=SimulatedWind(3.0, 1.0, gusts_m_s=1.0))
     encoder = FrameEncoder(255, 190)
     commands = [
         (1.5, m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1)),
@@ -42,7 +42,7 @@ def recorded(steps: list[float]) -> bytes:
 
 @settings(max_examples=10)
 @given(st.lists(st.floats(0.001, 3.0), max_size=10))
-def test_the_size_of_the_steps_changes_nothing(steps: list[float]) -> None:
+def test_step_size_changes_nothing(steps: list[float]) -> None:
     assert recorded(steps) == recorded([0.013] * 620)
 
 
@@ -55,28 +55,26 @@ def test_next_due_is_never_in_the_past() -> None:
         copter.step(due)
 
 
-def test_a_disarmed_vehicle_sleeps_between_its_heartbeats() -> None:
+def test_disarmed_vehicle_is_idle_between_heartbeats() -> None:
     copter, client = ready_copter()
     wakes = 0
     while copter.now < client.now + 10.0:
         copter.step(copter.next_due)
         wakes += 1
-    assert wakes < 350  # failsafes at 10 Hz, GPS at 10 Hz, heartbeat and arming checks at 1 Hz
+    assert wakes < 350  # Failsafes and GPS at 10 Hz, heartbeat and arming checks at 1 Hz.
 
 
-def test_only_hears_what_is_addressed_to_it() -> None:
+def test_messages_to_others_are_ignored() -> None:
     _, client = ready_copter(components=[ExtraComponent(154)])
     for target in ((2, 1), (1, 154), (2, 0)):
         client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
     assert client.all(m.CommandAck) == []
     for target in ((1, 1), (1, 0), (0, 0), (1, 99)):
         client.send(m.CommandLong(*target, MavCmd.DO_SEND_BANNER, 0, 0, 0, 0, 0, 0, 0, 0))
-    assert len(client.all(m.CommandAck)) == 4, (
-        "ArduPilot takes what is for a component that is not there, too"
-    )
+    assert len(client.all(m.CommandAck)) == 4, "ArduPilot takes what is for a component that is not there, too"
 
 
-def test_answers_go_to_who_asked() -> None:
+def test_answers_are_addressed_to_the_sender() -> None:
     copter, client = ready_copter()
     other = Client(copter, system_id=42, component_id=191)
     other.now = client.now
@@ -85,7 +83,7 @@ def test_answers_go_to_who_asked() -> None:
     assert (ack.target_system, ack.target_component) == (42, 191)
 
 
-def test_long_texts_come_in_chunks_the_last_of_which_is_not_full() -> None:
+def test_long_texts_are_sent_in_chunks() -> None:
     copter, client = ready_copter()
     copter.send_text(4, "a" * 100)
     copter.send_text(4, "b" * 60)
@@ -97,7 +95,7 @@ def test_long_texts_come_in_chunks_the_last_of_which_is_not_full() -> None:
     assert texts[5:] == [("c" * 50, 0, 0)]
 
 
-def test_channels_have_rates_of_their_own() -> None:
+def test_channels_have_separate_rates() -> None:
     copter, client = ready_copter()
     second = copter.open_channel(version=1)
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 10, 1))
@@ -120,7 +118,7 @@ def test_datagrams_hold_whole_frames() -> None:
     assert sum(len(Framer().receive(data)) for data in datagrams) == 100
 
 
-def test_other_components_and_systems_show_up() -> None:
+def test_extra_components_send_heartbeats() -> None:
     gimbal = ExtraComponent(154)
     tracker = ExtraComponent(1, type=MavType.ANTENNA_TRACKER, system_id=7)
     _, client = ready_copter(components=(gimbal, tracker))
@@ -143,7 +141,7 @@ def test_lost_frames_leave_gaps_in_the_sequence() -> None:
     assert sum(source.lost for source in statistics.sources.values()) == 3
 
 
-def test_random_loss_is_the_same_for_the_same_seed() -> None:
+def test_seed_determines_random_loss() -> None:
     counts = []
     for _ in range(2):
         copter, client = ready_copter(seed=3)
@@ -155,7 +153,7 @@ def test_random_loss_is_the_same_for_the_same_seed() -> None:
     assert 0.6 < counts[0] / (10 * 10 * 27) < 0.8
 
 
-def test_silence_and_freezing() -> None:
+def test_silent_and_frozen_faults() -> None:
     copter, client = flying_copter()
     copter.faults.silent = True
     client.run(3.0)
@@ -181,7 +179,7 @@ def test_heartbeats_stop_alone() -> None:
     assert len(client.all(m.Attitude)) >= 12
 
 
-def test_a_command_can_be_mistreated_in_every_way() -> None:
+def test_command_faults() -> None:
     copter, client = ready_copter()
     banner = MavCmd.DO_SEND_BANNER
     copter.faults.refuse(banner, 1, "PreArm: not today", times=1)
@@ -200,7 +198,7 @@ def test_a_command_can_be_mistreated_in_every_way() -> None:
     assert len(client.all(m.CommandAck)) == 2
 
 
-def test_answers_can_be_late_and_report_progress() -> None:
+def test_delayed_and_progressing_answers() -> None:
     copter, client = ready_copter()
     banner = MavCmd.DO_SEND_BANNER
     copter.faults.delay_ack(banner, 2.0, times=1)
@@ -223,7 +221,7 @@ def test_answers_can_be_late_and_report_progress() -> None:
 
 @settings(max_examples=30)
 @given(st.binary(max_size=400))
-def test_any_bytes_are_survived(data: bytes) -> None:
+def test_random_bytes_are_handled(data: bytes) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.receive(data, 1.0)
     copter.receive(data, 2.0, peer="other")
@@ -257,7 +255,7 @@ def test_any_command_is_answered_once(command: int, numbers: tuple[float, ...], 
 )
 @example(mask=9, frame=0, numbers=(*(0.0,) * 6, math.inf, *(0.0,) * 4))
 @example(mask=9, frame=18, numbers=(0.0, 0.0, 0.0, -6e16, 6e16, -4e16, math.nan, 6e16, 0.0, 8e37, -5e16))
-def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
+def test_any_setpoint_is_handled(mask: int, frame: int, numbers: tuple[float, ...]) -> None:
     rates_and_thrust = numbers[4], numbers[5], numbers[6], numbers[7]
     copter, client = flying_copter()
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, frame, mask, *numbers))
@@ -265,5 +263,5 @@ def test_any_setpoint_is_survived(mask: int, frame: int, numbers: tuple[float, .
     client.send(m.SetPositionTargetGlobalInt(0, 1, 1, frame, mask, 473_000_000, 85_000_000, *numbers[2:]))
     client.send(m.RequestDataStream(1, 1, MavDataStream.ALL, 4, 1))
     client.run(2.0)
-    assert copter.motion.north == pytest.approx(copter.motion.north)  # no NaN
+    assert copter.motion.north == pytest.approx(copter.motion.north)  # Not NaN.
     assert client.all(m.GlobalPositionInt)

@@ -1,4 +1,4 @@
-"""SMART_RTL's path: what is recorded, what is left of it, and how Copter and Rover go back on it."""
+"""Recording, simplification and use of the path of SMART_RTL."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vehicles import driving_rover, ready_rover
 
 from aerokit.mavlink.enums import CopterMode, MavResult, RoverMode
 from aerokit.sim import SimulatedRover
-from aerokit.sim.ardupilot.smart_path import SmartPath, prune, simplify
+from aerokit.sim.ardupilot.navigation import SmartPath, prune, simplify
 
 Ned = tuple[float, float, float]
 
@@ -22,25 +22,25 @@ def line(*places: tuple[float, float]) -> list[Ned]:
 # ---------------------------------------------------------------------------------- pure functions
 
 
-def test_points_on_a_line_go_and_corners_stay() -> None:
+def test_simplify_removes_points_on_line_and_keeps_corners() -> None:
     path = line((0, 0), (5, 0.4), (10, 0), (10, 5), (10, 10))
     assert simplify(path, 1.0) == line((0, 0), (10, 0), (10, 10))
     assert simplify(path, 0.1) == line((0, 0), (5, 0.4), (10, 0), (10, 10))
     assert simplify(path[:2], 1.0) == path[:2]
 
 
-def test_a_loop_goes() -> None:
+def test_prune_removes_loop() -> None:
     path = line((0, 0), (10, 0), (10, 10), (5, 10), (5, -10), (0, -10))
     assert prune(path, 1.0) == line((0, 0), (5, 0), (5, -10), (0, -10))
     assert prune(line((0, 0), (10, 0), (10, 10), (0, 10)), 1.0) == line((0, 0), (10, 0), (10, 10), (0, 10))
 
 
-def test_a_loop_at_another_height_stays() -> None:
+def test_prune_keeps_loop_at_another_height() -> None:
     path = [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (10.0, 10.0, -9.0), (5.0, 10.0, -9.0), (5.0, -10.0, -9.0)]
     assert prune(path, 1.98) == path
 
 
-def test_ways_that_nearly_touch_are_joined() -> None:
+def test_prune_joins_parts_that_nearly_touch() -> None:
     path = line((0, 0), (10, 0), (10, 10), (5, 10), (5, 1))
     assert prune(path, 1.5) == line((0, 0), (5, 0.5), (5, 1))
     assert prune(path, 0.5) == path
@@ -55,21 +55,21 @@ def drive(rover: SimulatedRover, client: Client, *places: tuple[float, float]) -
         client.run_until(lambda: rover.has_arrived((north, east, 0.0)))  # noqa: B023
 
 
-def test_points_are_two_metres_apart_and_begin_where_it_was_armed() -> None:
+def test_path_starts_at_arming_with_points_two_metres_apart() -> None:
     rover, client = driving_rover(10.0)
     client.run_until(lambda: rover.motion.north > 9.0)
     assert 4 <= len(rover.path) <= 6
-    way = rover.path.take_all()
+    way = rover.path.take_way_back()
     assert way[-1] == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
     assert way[0][0] == pytest.approx(rover.motion.north, abs=3.0)
-    assert len(way) == 2, "it was a straight line"
+    assert len(way) == 2, "a straight line has two points"
 
 
-def test_without_a_position_the_path_is_given_up() -> None:
+def test_path_without_position_is_deactivated() -> None:
     rover, client = driving_rover()
     rover.faults.gps_lost = True
     client.run(21.0)
-    assert rover.path.is_active, "seven seconds are estimated, fifteen forgiven"
+    assert rover.path.is_active, "7 s of dead reckoning and 15 s of grace"
     client.run(3.0)
     assert "SmartRTL deactivated: bad position" in client.texts
     rover.faults.gps_lost = False
@@ -79,10 +79,10 @@ def test_without_a_position_the_path_is_given_up() -> None:
     assert client.texts == ["Flight mode change failed"]
 
 
-def test_a_path_without_room_is_given_up() -> None:
+def test_path_without_space_is_deactivated() -> None:
     rover, client = ready_rover(SRTL_POINTS=14.0)
     path = SmartPath(rover, only_armed=False)
-    path.begin()
+    path.reset()
     for index in range(60):
         rover.motion.north, rover.motion.east = 5.0 * index, 5.0 * (index % 2)
         path.update()
@@ -93,14 +93,14 @@ def test_a_path_without_room_is_given_up() -> None:
     assert client.texts[-1] == "SmartRTL deactivated: buffer full"
 
 
-def test_it_may_be_switched_off() -> None:
+def test_path_can_be_disabled_by_parameters() -> None:
     copter, client = flying_copter(parameters={"SRTL_POINTS": 0.0})
     assert set_mode(client, CopterMode.SMART_RTL) == MavResult.FAILED
     assert client.texts == ["Mode change to SMARTRTL failed: init failed"]
     assert copter.mode.number == CopterMode.GUIDED
 
 
-def test_a_copter_on_the_ground_records_nothing() -> None:
+def test_disarmed_copter_records_no_path() -> None:
     copter, client = ready_copter()
     copter.motion.north = 20.0
     client.run(2.0)
@@ -110,14 +110,14 @@ def test_a_copter_on_the_ground_records_nothing() -> None:
 # -------------------------------------------------------------------------------------- going back
 
 
-def test_a_rover_goes_back_on_its_way_without_the_loop() -> None:
+def test_rover_smart_rtl_returns_without_loop() -> None:
     rover, client = driving_rover(15.0)
     drive(rover, client, (15, 0), (15, 15), (5, 15), (5, 5), (10, 5))
     assert set_mode(client, RoverMode.SMART_RTL) == MavResult.ACCEPTED
     farthest = 0.0
     corners = {(15.0, 0.0): 99.0, (15.0, 15.0): 99.0}
 
-    def look() -> bool:
+    def has_returned() -> bool:
         nonlocal farthest
         here = (rover.motion.north, rover.motion.east)
         farthest = max(farthest, here[1])
@@ -125,13 +125,13 @@ def test_a_rover_goes_back_on_its_way_without_the_loop() -> None:
             corners[corner] = min(corners[corner], math.dist(here, corner))
         return "Reached destination" in client.texts
 
-    client.run_until(look)
-    assert all(away < 4.0 for away in corners.values()), "around the same corners"
+    client.run_until(has_returned)
+    assert all(away < 4.0 for away in corners.values()), "returns around the same corners"
     assert math.hypot(rover.motion.north, rover.motion.east) < 1.0
     assert rover.is_armed
 
 
-def test_a_way_back_that_is_broken_off_is_not_forgotten() -> None:
+def test_interrupted_smart_rtl_keeps_remaining_path() -> None:
     rover, client = driving_rover(15.0)
     drive(rover, client, (15, 0), (15, 15))
     assert set_mode(client, RoverMode.SMART_RTL) == MavResult.ACCEPTED
@@ -139,10 +139,10 @@ def test_a_way_back_that_is_broken_off_is_not_forgotten() -> None:
     assert len(rover.path) == 0
     assert set_mode(client, RoverMode.HOLD) == MavResult.ACCEPTED
     assert len(rover.path) >= 2
-    assert rover.path.take_all()[-1] == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
+    assert rover.path.take_way_back()[-1] == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
 
 
-def test_a_copter_flies_back_and_lands_where_it_began() -> None:
+def test_copter_smart_rtl_lands_at_start() -> None:
     copter, client = flying_copter()
     copter.guided.go_to((20.0, 0.0, -10.0))
     client.run(12.0)
@@ -151,11 +151,11 @@ def test_a_copter_flies_back_and_lands_where_it_began() -> None:
     assert set_mode(client, CopterMode.SMART_RTL) == MavResult.ACCEPTED
     nearest = 99.0
 
-    def look() -> bool:
+    def has_returned() -> bool:
         nonlocal nearest
         nearest = min(nearest, math.dist((copter.motion.north, copter.motion.east), (20.0, 0.0)))
         return not copter.is_armed
 
-    client.run_until(look)
+    client.run_until(has_returned)
     assert nearest < 3.0, "not straight home"
     assert math.hypot(copter.motion.north, copter.motion.east) < 1.0

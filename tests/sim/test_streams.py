@@ -15,7 +15,7 @@ def test_nothing_is_streamed_at_first() -> None:
     assert streams.interval(30) == 0.0
 
 
-def test_starts_now_and_repeats() -> None:
+def test_stream_starts_now_and_repeats() -> None:
     streams = Streams()
     streams.set_interval(30, 0.25, 10.0)
     assert streams.next_due == 10.0
@@ -25,7 +25,7 @@ def test_starts_now_and_repeats() -> None:
     assert streams.take_due(10.25) == [30]
 
 
-def test_a_new_interval_replaces_the_old_one() -> None:
+def test_new_interval_replaces_the_old_one() -> None:
     streams = Streams()
     streams.set_interval(30, 1.0, 0.0)
     streams.set_interval(30, 0.5, 0.0)
@@ -36,7 +36,7 @@ def test_a_new_interval_replaces_the_old_one() -> None:
     assert streams.ids() == frozenset()
 
 
-def test_falling_behind_skips_instead_of_bursting() -> None:
+def test_late_stream_skips_messages() -> None:
     streams = Streams()
     streams.set_interval(30, 0.1, 0.0)
     assert streams.take_due(5.0) == [30]
@@ -44,7 +44,7 @@ def test_falling_behind_skips_instead_of_bursting() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([0.1, 0.25, 1.0])), min_size=1, max_size=6))
-def test_each_comes_at_its_rate(requests: list[tuple[int, float]]) -> None:
+def test_streams_have_their_own_rates(requests: list[tuple[int, float]]) -> None:
     streams = Streams()
     for message_id, interval in requests:
         streams.set_interval(message_id, interval, 0.0)

@@ -15,7 +15,7 @@ from aerokit.mavlink.enums import MavModeFlag, MavState, SubMode
 from aerokit.missions import Mission
 from aerokit.missions.navigation import waypoint
 from aerokit.sim import SimulatedSub, simulated_link
-from aerokit.sim.ardupilot.telemetry_state import heartbeat
+from aerokit.sim.ardupilot.telemetry import heartbeat
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
@@ -50,16 +50,14 @@ def where(sub: SimulatedSub) -> tuple[float, float, float]:
     return (sub.motion.north, sub.motion.east, sub.motion.down)
 
 
-async def test_it_says_what_it_is() -> None:
+async def test_vehicle_identifies_itself() -> None:
     async with connected() as (sub, vehicle):
         assert (sub.mode.number, len(sub.parameters), len(sub.available_modes())) == (
             SubMode.MANUAL,
             1386,
             11,
         )
-        custom = int(
-            MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
-        )
+        custom = int(MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED)
         assert (heartbeat(sub).base_mode, heartbeat(sub).system_status) == (custom, MavState.STANDBY)
         await vehicle.set_mode("POSHOLD")
         assert heartbeat(sub).base_mode == custom | MavModeFlag.GUIDED_ENABLED
@@ -69,7 +67,7 @@ async def test_it_says_what_it_is() -> None:
             await vehicle.take_off(10.0)
 
 
-async def test_it_is_armed_without_a_position_in_manual() -> None:
+async def test_arming_in_manual_needs_no_position() -> None:
     sub = SimulatedSub(boot_time_s=40.0)
     async with simulated_link(sub) as link, aerokit.connect(link) as vehicle:
         await anyio.sleep(14.0)
@@ -79,7 +77,7 @@ async def test_it_is_armed_without_a_position_in_manual() -> None:
         assert not sub.set_mode(SubMode.GUIDED)
 
 
-async def test_it_dives_to_a_place_and_stays() -> None:
+async def test_sub_dives_to_place_and_stays() -> None:
     async with diving() as (sub, vehicle):
         assert math.dist(where(sub), (0.0, 0.0, 5.0)) < 0.2
         await vehicle.go_to(place(sub, 10.0, 5.0, 8.0))
@@ -89,7 +87,7 @@ async def test_it_dives_to_a_place_and_stays() -> None:
         assert sub.motion.ground_speed_m_s < 0.05
 
 
-async def test_it_stays_in_the_water() -> None:
+async def test_sub_target_above_surface_stays_at_surface() -> None:
     async with diving(1.0) as (sub, _):
         sub.guided.go_to((3.0, 0.0, -10.0))
         await anyio.sleep(20.0)
@@ -100,7 +98,7 @@ async def test_it_stays_in_the_water() -> None:
         assert sub.motion.down <= 6.0
 
 
-async def test_it_follows_velocities_for_three_seconds() -> None:
+async def test_velocity_target_expires_after_three_seconds() -> None:
     async with diving() as (sub, vehicle):
         async with vehicle.guided.velocity() as stream:
             await stream.fly(VelocitySetpoint(north_m_s=0.5, down_m_s=0.2), 5.0)
@@ -110,7 +108,7 @@ async def test_it_follows_velocities_for_three_seconds() -> None:
         assert sub.motion.ground_speed_m_s < 0.02
 
 
-async def test_holding_keeps_place_and_depth() -> None:
+async def test_poshold_keeps_place_and_depth() -> None:
     async with diving() as (sub, vehicle):
         sub.guided.go_to((30.0, 0.0, 5.0))
         await anyio.sleep(5.0)
@@ -122,7 +120,7 @@ async def test_holding_keeps_place_and_depth() -> None:
         assert math.dist(where(sub), held) < 0.1
 
 
-async def test_surfacing_ends_in_alt_hold() -> None:
+async def test_surface_mode_ends_in_alt_hold() -> None:
     async with diving() as (sub, vehicle):
         await vehicle.set_mode("SURFACE")
         await anyio.sleep(10.0)
@@ -131,7 +129,7 @@ async def test_surfacing_ends_in_alt_hold() -> None:
         assert sub.is_armed
 
 
-async def test_buoyancy_lifts_it_when_it_is_disarmed() -> None:
+async def test_buoyancy_lifts_disarmed_sub() -> None:
     async with diving() as (sub, vehicle):
         await vehicle.disarm()
         await anyio.sleep(20.0)
@@ -140,11 +138,11 @@ async def test_buoyancy_lifts_it_when_it_is_disarmed() -> None:
         assert sub.motion.is_still
 
 
-async def test_it_dives_a_mission() -> None:
+async def test_sub_dives_mission() -> None:
     async with diving() as (sub, vehicle):
         legs = [place(sub, 8.0, 0.0, 4.0), place(sub, 8.0, 8.0, 6.0)]
-        items = [waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=-depth)
-                 for each, depth in zip(legs, (4.0, 6.0), strict=True)]  # fmt: skip
+        items = [waypoint(leg.latitude_deg, leg.longitude_deg, altitude_relative_m=-depth)
+                 for leg, depth in zip(legs, (4.0, 6.0), strict=True)]  # fmt: skip
         await vehicle.mission.upload(Mission(items))
         await vehicle.mission.start()
         await vehicle.mission.wait_finished(timeout=120.0)
@@ -152,7 +150,7 @@ async def test_it_dives_a_mission() -> None:
         assert sub.mode.number == SubMode.AUTO
 
 
-async def test_losing_the_ground_station_disarms() -> None:
+async def test_ground_station_failsafe_disarms() -> None:
     async with diving() as (sub, _):
         sub.faults.drop_incoming = 1_000_000
         await anyio.sleep(8.0)

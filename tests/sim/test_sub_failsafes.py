@@ -1,4 +1,4 @@
-"""ArduSub's failsafes: ground station, pilot, radio, battery, hull; each action, each text."""
+"""Actions and texts of ArduSub's failsafes: ground station, pilot, radio, battery, hull."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_PILOT = {"FS_PILOT_INPUT": 0.0}
     ("action", "mode"),
     [(1, SubMode.MANUAL), (2, SubMode.MANUAL), (3, SubMode.ALT_HOLD), (4, SubMode.SURFACE)],
 )
-def test_a_lost_ground_station_does_what_is_configured(action: int, mode: int) -> None:
+def test_ground_station_failsafe_executes_configured_action(action: int, mode: int) -> None:
     sub, client = armed_sub(SubMode.MANUAL, FS_GCS_ENABLE=float(action))
     lose_ground_station(client, 4.9)
     assert client.texts == []
@@ -41,7 +41,7 @@ def test_a_lost_ground_station_does_what_is_configured(action: int, mode: int) -
     assert client.texts[-1] == "GCS Failsafe Cleared"
 
 
-def test_the_ground_station_is_warned_of_every_half_minute() -> None:
+def test_lost_ground_station_is_reported_every_half_minute() -> None:
     _, client = armed_sub(FS_GCS_ENABLE=1.0, **NO_PILOT)
     lose_ground_station(client, 34.0)
     assert client.texts == ["MYGCS: 255, heartbeat lost"]
@@ -49,7 +49,7 @@ def test_the_ground_station_is_warned_of_every_half_minute() -> None:
     assert client.texts == ["MYGCS: 255, heartbeat lost"] * 2
 
 
-def test_armed_without_a_ground_station_it_is_disarmed_at_once() -> None:
+def test_arming_without_ground_station_disarms_immediately() -> None:
     sub, client = ready_sub(FS_GCS_ENABLE=2.0)
     lose_ground_station(client, 8.0)
     assert client.texts == ["MYGCS: 255, heartbeat lost"]
@@ -60,7 +60,7 @@ def test_armed_without_a_ground_station_it_is_disarmed_at_once() -> None:
 
 
 @pytest.mark.parametrize("action", [0, 1, 2])
-def test_a_pilot_who_is_silent(action: int) -> None:
+def test_pilot_input_failsafe_centres_sticks_or_disarms(action: int) -> None:
     sub, client = armed_sub(FS_PILOT_INPUT=float(action))
     sub.rc[4] = 1700
     sub.faults.rc_lost = True
@@ -75,7 +75,7 @@ def test_a_pilot_who_is_silent(action: int) -> None:
 
 
 @pytest.mark.parametrize("action", [0, 1, 2])
-def test_a_lost_radio(action: int) -> None:
+def test_radio_failsafe_warns_or_surfaces(action: int) -> None:
     sub, client = armed_sub(FS_THR_ENABLE=float(action), **NO_PILOT)
     sub.faults.rc_lost = True
     client.run(1.3)
@@ -88,7 +88,7 @@ def test_a_lost_radio(action: int) -> None:
     assert healthy(client, Sensor.RC_RECEIVER)
 
 
-def test_it_is_not_armed_without_a_radio_that_is_watched() -> None:
+def test_lost_radio_prevents_arming() -> None:
     sub, client = ready_sub(FS_THR_ENABLE=1.0)
     sub.faults.rc_lost = True
     client.run(3.0)
@@ -97,7 +97,7 @@ def test_it_is_not_armed_without_a_radio_that_is_watched() -> None:
     assert client.texts[-1] == "Arm: Radio failsafe on"
 
 
-def test_a_low_battery_surfaces_and_a_critical_one_disarms() -> None:
+def test_low_battery_surfaces_and_critical_disarms() -> None:
     sub, client = armed_sub(**BATTERY, BATT_FS_LOW_ACT=3.0, BATT_FS_CRT_ACT=2.0)
     drain(sub, client, LOW)
     assert client.texts[0].startswith("Battery 1 is low 10.")
@@ -110,7 +110,7 @@ def test_a_low_battery_surfaces_and_a_critical_one_disarms() -> None:
 
 
 @pytest.mark.parametrize("action", [0, 1])
-def test_a_low_battery_may_only_warn(action: int) -> None:
+def test_low_battery_can_only_warn(action: int) -> None:
     sub, client = armed_sub(**BATTERY, BATT_FS_LOW_ACT=float(action))
     drain(sub, client, LOW)
     assert len(client.texts) == 1
@@ -118,7 +118,7 @@ def test_a_low_battery_may_only_warn(action: int) -> None:
 
 
 @pytest.mark.parametrize("action", [0, 1, 2])
-def test_a_leak(action: int) -> None:
+def test_leak_failsafe_warns_or_surfaces(action: int) -> None:
     sub, client = armed_sub(FS_LEAK_ENABLE=float(action))
     sub.faults.leak = True
     client.run(1.5)
@@ -129,7 +129,7 @@ def test_a_leak(action: int) -> None:
     assert client.texts == ["Leak Detected"] * 2 * (action > 0)
 
 
-def test_pressure_in_the_hull() -> None:
+def test_hull_pressure_failsafe_warns() -> None:
     sub, client = armed_sub(FS_PRESS_ENABLE=1.0)
     client.run(1.0)
     sub.hull_pressure_pa = 106_000.0
@@ -143,7 +143,7 @@ def test_pressure_in_the_hull() -> None:
     assert client.last(m.Heartbeat).system_status == MavState.ACTIVE
 
 
-def test_temperature_in_the_hull_is_told_at_once_when_it_is_looked_at_late() -> None:
+def test_hull_temperature_check_enabled_late_reports_immediately() -> None:
     sub, client = armed_sub(**NO_PILOT)
     sub.hull_temperature_c = 70.0
     client.run(35.0)

@@ -11,9 +11,9 @@ from simulated_client import flying_copter, ready_copter
 
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.sim import SimulatedPx4, SimulatedVehicle
-from aerokit.sim.picture import check_picture, draw_svg, save_picture
-from aerokit.sim.track import Track, record_track
-from aerokit.sim.track_points import TrackPoint
+from aerokit.testing.picture import check_picture, draw_svg, save_picture
+from aerokit.testing.track import Track, record_track
+from aerokit.testing.track_points import TrackPoint
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -27,7 +27,7 @@ def flown_track() -> Track:
     return track
 
 
-def test_a_track_is_where_the_vehicle_was() -> None:
+def test_track_has_true_positions() -> None:
     track = flown_track()
     assert track.name == "system 1"
     assert [point.time_s for point in track[:4]] == pytest.approx([3.0, 3.5, 4.0, 4.5])
@@ -37,7 +37,7 @@ def test_a_track_is_where_the_vehicle_was() -> None:
     assert track.length_m == pytest.approx(51.4, abs=2.0)
 
 
-def test_recording_changes_no_byte() -> None:
+def test_recording_does_not_change_the_bytes() -> None:
     def told(*, recorded: bool) -> list[object]:
         copter, client = flying_copter()
         if recorded:
@@ -65,9 +65,9 @@ def test_every_autopilot_has_a_track() -> None:
     assert track.end.mode == "LOITER"
 
 
-def test_what_is_nowhere_has_no_track() -> None:
+def test_vehicle_without_position_has_no_track() -> None:
     nowhere = SimulatedVehicle(system_id=1, component_id=1, seed=0, components=())
-    with pytest.raises(InvalidArgument, match="no true place"):
+    with pytest.raises(InvalidArgument, match="no true position"):
         record_track(nowhere)
 
 
@@ -88,7 +88,7 @@ def test_an_interval_must_be_above_0() -> None:
 # ------------------------------------------------------------------------------------------- pictures
 
 
-def test_the_svg_has_a_line_for_each_vehicle_above_and_in_profile() -> None:
+def test_svg_has_two_lines_per_vehicle() -> None:
     tracks = [flown_track(), flown_track()]
     tracks[1].name = "system <2>"
     root = ElementTree.fromstring(draw_svg(tracks))
@@ -103,7 +103,7 @@ def test_the_svg_has_a_line_for_each_vehicle_above_and_in_profile() -> None:
             assert 0 <= y <= 680
 
 
-def test_a_hundred_metres_north_is_as_long_as_a_hundred_metres_east() -> None:
+def test_map_has_equal_scale_in_both_axes() -> None:
     track = flown_track()
     first, place = track[0], track.home.offset(north_m=100)
     north = TrackPoint(9.0, place.latitude_deg, place.longitude_deg, 0.0, first.armed, first.mode)
@@ -113,23 +113,23 @@ def test_a_hundred_metres_north_is_as_long_as_a_hundred_metres_east() -> None:
     assert y1 - y2 == pytest.approx(460 / 1.1, abs=1)
 
 
-def test_a_picture_of_nothing(tmp_path: Path) -> None:
+def test_picture_without_tracks_is_empty(tmp_path: Path) -> None:
     save_picture([], tmp_path / "empty.svg")
     assert ElementTree.parse(tmp_path / "empty.svg").getroot().tag == f"{SVG}svg"
 
 
-def test_other_names_are_refused() -> None:
+def test_other_file_suffixes_are_refused() -> None:
     with pytest.raises(InvalidArgument, match=r"\.svg or \.png"):
         check_picture("track.jpeg")
 
 
-def test_png_without_pillow_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_png_without_pillow_explains_the_installation(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "PIL.Image", None)
     with pytest.raises(AerokitError, match="pip install pillow"):
         save_picture([], tmp_path / "track.png")
 
 
-def test_a_png_shows_the_same(tmp_path: Path) -> None:
+def test_png_shows_the_same_as_svg(tmp_path: Path) -> None:
     from PIL import Image
 
     flown_track().save(tmp_path / "track.png")

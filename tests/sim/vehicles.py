@@ -1,4 +1,4 @@
-"""Simulated planes, rovers and submarines, ready or on the way, for tests of what they do by themselves."""
+"""Simulated planes, rovers and submarines in the states that tests of failsafes and modes start from."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GROUND_STATION = m.Heartbeat(6, 8, 0, 0, 4, 3)
 
 
 def ready(vehicle: ArduPilotVehicle) -> Client:
-    """Booted, disarmed, with a position."""
+    """Boot the vehicle until it has a position."""
     client = Client(vehicle)
     client.run(3.0)
     client.forget()
@@ -33,7 +33,7 @@ def ready_plane(**parameters: float) -> tuple[SimulatedPlane, Client]:
 
 
 def flying_plane(mode: int = PlaneMode.LOITER, /, **parameters: float) -> tuple[SimulatedPlane, Client]:
-    """50 m above the ground in a mode."""
+    """Return a plane 50 m above the ground in this mode."""
     plane, client = ready_plane(**parameters)
     arm(client, PlaneMode.TAKEOFF)
     client.run_until(lambda: plane.altitude_m > 45.0 and not plane.mode.is_taking_off)
@@ -50,10 +50,8 @@ def ready_rover(**parameters: float) -> tuple[SimulatedRover, Client]:
     return rover, ready(rover)
 
 
-def driving_rover(
-    north: float = 200.0, east: float = 0.0, /, **parameters: float
-) -> tuple[SimulatedRover, Client]:
-    """In GUIDED on the way to a place."""
+def driving_rover(north: float = 200.0, east: float = 0.0, /, **parameters: float) -> tuple[SimulatedRover, Client]:
+    """Return a rover in GUIDED that drives to a position."""
     rover, client = ready_rover(**parameters)
     arm(client, RoverMode.GUIDED)
     rover.guided.go_to((north, east, 0.0))
@@ -68,7 +66,7 @@ def ready_sub(**parameters: float) -> tuple[SimulatedSub, Client]:
 
 
 def armed_sub(mode: int = SubMode.ALT_HOLD, /, **parameters: float) -> tuple[SimulatedSub, Client]:
-    """Five metres deep."""
+    """Return an armed submarine five metres deep."""
     sub, client = ready_sub(**parameters)
     sub.motion.down = 5.0
     arm(client, mode)
@@ -78,31 +76,31 @@ def armed_sub(mode: int = SubMode.ALT_HOLD, /, **parameters: float) -> tuple[Sim
 
 
 def lose_ground_station(client: Client, seconds: float) -> None:
-    """It is heard once more, then it is silent."""
+    """Send a last heartbeat, then stay silent."""
     client.send(GROUND_STATION)
     client.run(seconds)
 
 
 def drain(vehicle: ArduPilotVehicle, client: Client, percent: float) -> None:
-    """The battery has so much left, for longer than BATT_LOW_TIMER of these tests."""
+    """Set the charge for longer than BATT_LOW_TIMER of these tests."""
     vehicle.battery.percent = percent
     client.run(3.0)
 
 
 BATTERY = {"BATT_LOW_VOLT": 10.5, "BATT_CRT_VOLT": 9.5, "BATT_LOW_TIMER": 2.0}
+# Per cent of charge below which the voltage is low or critical.
 LOW, CRITICAL = 10.0, 2.0
-"""Per cent at which the voltage is below these."""
 
 
 def healthy(client: Client, bit: int) -> bool:
-    """Whether SYS_STATUS calls it so."""
+    """Return True if SYS_STATUS reports this sensor as healthy."""
     client.command(MavCmd.REQUEST_MESSAGE, m.SysStatus.ID)
     client.run(0.1)
     return bool(client.last(m.SysStatus).onboard_control_sensors_health & bit)
 
 
 def rally_points(vehicle: ArduPilotVehicle, *places: tuple[float, float, float]) -> None:
-    """Metres north and east of where it was switched on, and metres above home."""
+    """Places are metres north and east of the start, and metres above home."""
     points = vehicle.missions.rally
     points.clear()
     for index, (north, east, height) in enumerate(places):

@@ -1,4 +1,4 @@
-"""One round of a day's work: connect, fly, lose the radio, reboot, unplug, plug in again; and what is left of it."""
+"""One round of a day's work: connect, fly, lose the radio, reboot, unplug, plug in again; and the remaining objects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import anyio
 import aerokit
 from aerokit.events import LinkRestored
 from aerokit.sim import SimulatedCopter, SimulatedPx4, open_simulator
-from aerokit.sim.kinds import wait_longer
+from aerokit.sim.kinds import scale_timeouts
 
 __all__ = ["Left", "fly_round", "left"]
 
@@ -27,7 +27,7 @@ LIMIT_S = 200.0
 
 @dataclass(frozen=True)
 class Left:
-    """What the process holds between two rounds."""
+    """Objects of the process between two rounds."""
 
     tasks: int
     threads: int
@@ -37,19 +37,17 @@ class Left:
 
 
 def left() -> Left:
-    """What there is now; to be called on the loop."""
+    """Count the present objects; call it on the loop."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1]) if Path("/proc").is_dir() else 0
     folder = Path("/proc/self/fd")
     descriptors = len(list(folder.iterdir())) if folder.is_dir() else 0
     resident_kb = pages * os.sysconf("SC_PAGE_SIZE") // 1024
-    return Left(
-        len(asyncio.all_tasks()), threading.active_count(), descriptors, len(gc.get_objects()), resident_kb
-    )
+    return Left(len(asyncio.all_tasks()), threading.active_count(), descriptors, len(gc.get_objects()), resident_kb)
 
 
 async def fly_round(number: int) -> None:
-    """By turns a copter and a PX4, over TCP, on a link that is opened again."""
+    """Fly a copter and a PX4 alternately, over TCP, on a reconnecting link."""
     port = _free_port()
     with anyio.fail_after(LIMIT_S):
         simulator = open_simulator(_vehicle(number), f"tcpin:127.0.0.1:{port}", speedup=SPEEDUP)
@@ -74,7 +72,7 @@ async def _fly(vehicle: aerokit.Vehicle) -> None:
 
 
 async def _plug_in_again(number: int, port: int) -> None:
-    """The other end goes away and comes back; the same connection goes on."""
+    """Close and reopen the other end; the same connection continues."""
     address, again = f"tcp:127.0.0.1:{port}", f"tcpin:127.0.0.1:{port}"
     async with AsyncExitStack() as far, AsyncExitStack() as near:
         await far.enter_async_context(open_simulator(_vehicle(number), again, speedup=SPEEDUP))
@@ -103,7 +101,7 @@ async def _silence_and_reboot(number: int) -> None:
 
 def _vehicle(number: int) -> SimulatedCopter | SimulatedPx4:
     vehicle = SimulatedPx4(boot_time_s=1.0) if number % 2 else SimulatedCopter(boot_time_s=0.0)
-    wait_longer([vehicle], SPEEDUP)
+    scale_timeouts([vehicle], SPEEDUP)
     return vehicle
 
 

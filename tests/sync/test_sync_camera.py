@@ -13,7 +13,7 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter
 BOTH = CameraCapFlags.CAPTURE_IMAGE | CameraCapFlags.CAPTURE_VIDEO
 
 
-def test_a_camera_without_async() -> None:
+def test_camera() -> None:
     camera = SimulatedCamera(capabilities=BOTH, shutter_s=0.02)
     copter = SimulatedCopter(boot_time_s=0.0, components=[camera])
     with served([copter]) as address, aerokit.sync.connect(address) as vehicle:

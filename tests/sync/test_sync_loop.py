@@ -1,4 +1,4 @@
-"""The loop's thread: what many threads ask of it at once, what they cancel, its end, and children of the process."""
+"""The loop thread: concurrent calls, cancellation, closing, forked processes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ async def nothing() -> None:
     pass
 
 
-def test_the_loop_may_ask_itself_while_others_ask_it(loop: LoopThread) -> None:
+def test_call_soon_on_loop_during_calls_of_other_threads(loop: LoopThread) -> None:
     end = time.monotonic() + 0.3
     asked: list[int] = []
 
@@ -59,7 +59,7 @@ def test_the_loop_may_ask_itself_while_others_ask_it(loop: LoopThread) -> None:
     assert asked
 
 
-def test_the_loop_may_close_itself_while_others_ask_it(loop: LoopThread) -> None:
+def test_close_on_loop_during_calls_of_other_threads(loop: LoopThread) -> None:
     ends: list[type[BaseException]] = []
 
     def ask() -> None:
@@ -78,7 +78,7 @@ def test_the_loop_may_close_itself_while_others_ask_it(loop: LoopThread) -> None
     assert ends == [ConnectionClosed] * 3
 
 
-def test_what_waits_ends_with_the_loop_and_cleans_up(loop: LoopThread) -> None:
+def test_waiting_calls_clean_up_when_loop_closes(loop: LoopThread) -> None:
     ended, started = [], threading.Event()
 
     async def wait() -> None:
@@ -104,7 +104,7 @@ def test_what_waits_ends_with_the_loop_and_cleans_up(loop: LoopThread) -> None:
     assert (ended, errors) == ([1], [ConnectionClosed])
 
 
-def test_an_exit_of_the_program_in_a_coroutine_is_the_callers(loop: LoopThread) -> None:
+def test_system_exit_in_coroutine_is_raised_in_caller(loop: LoopThread) -> None:
     async def leave() -> None:
         sys.exit(3)
 
@@ -115,7 +115,7 @@ def test_an_exit_of_the_program_in_a_coroutine_is_the_callers(loop: LoopThread) 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_a_child_of_the_process_neither_uses_nor_waits_for_it(loop: LoopThread) -> None:
+def test_forked_child_does_not_use_the_loop(loop: LoopThread) -> None:
     child = os.fork()
     if child == 0:  # pragma: no cover - another process
         errors = 0
@@ -161,18 +161,16 @@ for spare in range(4):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of descriptors to set")
-def test_a_loop_that_cannot_start_is_an_error() -> None:
-    """It needs several descriptors; however many there are, connecting does not wait for what never begins."""
+def test_loop_start_failure_raises() -> None:
+    """The loop needs several file descriptors; connecting fails at once with any smaller number."""
     done = subprocess.run(
         [sys.executable, "-c", NO_DESCRIPTORS], capture_output=True, text=True, timeout=200, check=False
     )
-    assert done.stdout.startswith(
-        f"0 {errno.EMFILE} the event loop's thread cannot start: Too many open files"
-    )
+    assert done.stdout.startswith(f"0 {errno.EMFILE} the event loop's thread cannot start: Too many open files")
     assert done.returncode in (0, 1)
 
 
-def test_a_thread_that_cannot_start_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thread_start_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     def start(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -182,11 +180,11 @@ def test_a_thread_that_cannot_start_is_an_error(monkeypatch: pytest.MonkeyPatch)
 
 
 def uses_of_the_loop(loops: list[LoopThread]) -> None:
-    """What a blocking program does, in short."""
+    """A short blocking program."""
     loop = LoopThread()
     loops.append(loop)
     try:
-        held = loop.hold_open(contextlib.AsyncExitStack())
+        held = loop.open_context(contextlib.AsyncExitStack())
         loop.run(nothing)
         loop.call(len, "")
         with pytest.raises(ConnectionClosed):
@@ -204,9 +202,7 @@ async def fail() -> None:
 Place = tuple[str, int]
 
 
-def interrupted_at(
-    place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop
-) -> set[Place]:
+def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object] = uses_of_the_loop) -> set[Place]:
     """Raise KeyboardInterrupt where the main thread first comes to this place; the places where it has been."""
     seen: set[Place] = set()
 
@@ -230,17 +226,17 @@ def interrupted_at(
     return seen
 
 
-def test_what_is_run_to_its_end_is_run_wherever_ctrl_c_comes() -> None:
+def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
     """At every line of ours but those before it can be noticed: the calls themselves."""
     done: list[int] = []
 
     async def work() -> None:
-        with anyio.CancelScope(shield=True):  # as what puts values back
+        with anyio.CancelScope(shield=True):  # like code that restores values
             await asyncio.sleep(0)
             done.append(1)
 
     def use(loops: list[LoopThread]) -> None:
-        loops[0].run_to_its_end(work)
+        loops[0].run_shielded(work)
 
     def interrupted(place: Place | None) -> set[Place]:
         loop = LoopThread()
@@ -249,7 +245,7 @@ def test_what_is_run_to_its_end_is_run_wherever_ctrl_c_comes() -> None:
         finally:
             loop.close()
 
-    places = {place for place in interrupted(None) if place[0].endswith(("loop_thread.py", "reply.py"))}
+    places = {place for place in interrupted(None) if place[0].endswith(("loop_thread.py", "thread_future.py"))}
     assert len(places) > 20
     left_undone, was_come_to = set(), set()
     for place in places:
@@ -268,9 +264,9 @@ def test_what_is_run_to_its_end_is_run_wherever_ctrl_c_comes() -> None:
     }
 
 
-def test_ctrl_c_is_never_lost_and_leaves_nothing_behind() -> None:
+def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
     """At every line that the main thread runs, ours and those of threading; contextlib and pytest are not meant."""
-    ours = ("loop_thread.py", "reply.py", "threading.py")
+    ours = ("loop_thread.py", "thread_future.py", "threading.py")
     places = sorted(place for place in interrupted_at(None) if place[0].endswith(ours))
     assert len(places) > 80
     lost = []

@@ -29,7 +29,7 @@ def vehicle(copter: SimulatedCopter) -> Iterator[aerokit.sync.Vehicle]:
         yield vehicle
 
 
-def test_reading_and_writing(vehicle: aerokit.sync.Vehicle) -> None:
+def test_parameters_are_read_and_written(vehicle: aerokit.sync.Vehicle) -> None:
     parameters = vehicle.parameters
     assert len(parameters.download()) == len(parameters.table) == 100
     assert parameters.set("RTL_ALT", 2000).outcome == "set"
@@ -40,7 +40,7 @@ def test_reading_and_writing(vehicle: aerokit.sync.Vehicle) -> None:
     assert parameters.set_many({"NO_SUCH_ONE": 1})["NO_SUCH_ONE"].outcome == "failed"
 
 
-def test_blocks_put_back(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
+def test_parameter_blocks_restore_values(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
     with vehicle.parameters.temporarily({"RTL_ALT": 2000}) as results:
         assert results["RTL_ALT"].value == copter.parameters["RTL_ALT"] == 2000
     assert copter.parameters["RTL_ALT"] == 1500
@@ -52,7 +52,7 @@ def test_blocks_put_back(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter)
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
-def test_ctrl_c_in_a_block_puts_back(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
+def test_ctrl_c_in_block_restores_values(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
     main = threading.main_thread().ident
     assert main is not None
     with pytest.raises(KeyboardInterrupt), vehicle.parameters.temporarily({"RTL_ALT": 2000}):
@@ -62,9 +62,7 @@ def test_ctrl_c_in_a_block_puts_back(vehicle: aerokit.sync.Vehicle, copter: Simu
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
-def test_ctrl_c_while_values_are_put_back_waits_for_it(
-    vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter
-) -> None:
+def test_ctrl_c_during_restore_waits_for_it(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
     def back() -> None:
         copter.faults.silent = False
 
@@ -78,12 +76,10 @@ def test_ctrl_c_while_values_are_put_back_waits_for_it(
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
-def test_ctrl_c_does_not_hide_what_could_not_be_put_back(
-    vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter
-) -> None:
+def test_ctrl_c_does_not_hide_restore_errors(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
     with (
         pytest.raises(KeyboardInterrupt) as interrupted,
-        vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=1.0),
+        vehicle.parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=1.0),
     ):
         copter.faults.silent = True
         interrupt_soon()
@@ -92,7 +88,7 @@ def test_ctrl_c_does_not_hide_what_could_not_be_put_back(
     assert failed.not_restored == {"RTL_ALT": 1500}
 
 
-def test_settings_of_a_camera() -> None:
+def test_camera_settings() -> None:
     camera = SimulatedCamera()
     with (
         served([SimulatedCopter(boot_time_s=0.0, components=[camera])]) as address,

@@ -12,7 +12,7 @@ from wrong_types import Misuse, misuses, misuses_of, refusal_of
 import aerokit.sync
 from aerokit.mavlink import messages as m
 from aerokit.sim import SimulatedCopter
-from aerokit.sim.journal import Journal
+from aerokit.testing.journal import Journal
 
 OWNERS: dict[str, Callable[[aerokit.sync.Vehicle], Any]] = {
     "vehicle": lambda vehicle: vehicle,
@@ -32,7 +32,7 @@ OWNERS: dict[str, Callable[[aerokit.sync.Vehicle], Any]] = {
 }
 LEFT_OUT = {"subscription": frozenset({"close"}), "connection": frozenset({"counts"})}
 ASKED_BY_ITSELF = (m.Heartbeat, m.CommandLong, m.Timesync)
-"""What a vehicle object sends on its own: it asks for the version and for rates."""
+"""Messages that a vehicle object sends by itself: requests of version and rates."""
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +55,16 @@ def misuse_it(misuse: Misuse) -> BaseException | None:
 
 
 @pytest.mark.parametrize("owner", OWNERS)
-def test_nothing_is_done(owner: str, flight: tuple[aerokit.sync.Vehicle, Journal]) -> None:
+def test_wrong_types_are_rejected_and_nothing_sent(owner: str, flight: tuple[aerokit.sync.Vehicle, Journal]) -> None:
     vehicle, journal = flight
     left_out = LEFT_OUT.get(owner, frozenset())
-    wrong = [
-        refusal_of(each, misuse_it(each)) for each in misuses(OWNERS[owner](vehicle), leave_out=left_out)
-    ]
+    wrong = [refusal_of(each, misuse_it(each)) for each in misuses(OWNERS[owner](vehicle), leave_out=left_out)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)
     kinds = {type(heard.message) for heard in journal.messages}
     assert kinds <= set(ASKED_BY_ITSELF)
 
 
 @pytest.mark.parametrize("function", [aerokit.sync.connect, aerokit.sync.open_connection])
-def test_nothing_is_opened(function: Callable[..., Any]) -> None:
+def test_wrong_types_open_no_link(function: Callable[..., Any]) -> None:
     wrong = [refusal_of(each, misuse_it(each)) for each in misuses_of(function, function.__name__)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)

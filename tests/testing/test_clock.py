@@ -60,7 +60,7 @@ async def test_the_clock_stands_still_while_an_executor_works() -> None:
 
 
 @pytest.mark.anyio
-async def test_real_sockets_are_heard() -> None:
+async def test_real_sockets_are_polled() -> None:
     left, right = socket.socketpair()
     with left, right:
         left.setblocking(False)
@@ -77,7 +77,7 @@ async def test_another_thread_can_wake_the_loop() -> None:
     thread.join()
 
 
-def test_time_begins_at_zero_and_results_come_back() -> None:
+def test_time_starts_at_zero_and_result_is_returned() -> None:
     async def clock_after(seconds: float) -> float:
         begin = asyncio.get_running_loop().time()
         await asyncio.sleep(seconds)
@@ -86,38 +86,39 @@ def test_time_begins_at_zero_and_results_come_back() -> None:
     assert run_virtual(clock_after(12.5)) == 12.5
 
 
-def test_an_hour_costs_no_real_time() -> None:
+def test_virtual_hour_takes_no_real_time() -> None:
     spent = time.process_time()
     run_virtual(asyncio.sleep(1e6))
     assert time.process_time() - spent < 1e4
 
 
-def test_a_function_is_no_coroutine() -> None:
+def test_run_virtual_refuses_a_function() -> None:
     with pytest.raises(TypeError, match=r"takes a coroutine, as main\(\) gives one"):
-        run_virtual(test_a_function_is_no_coroutine)  # type: ignore[arg-type]
+        run_virtual(test_run_virtual_refuses_a_function)  # type: ignore[arg-type]
 
 
-def test_a_deadlock_is_an_error_that_names_the_waiting_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def wait_for_nobody() -> None:
+def test_deadlock_error_names_the_waiting_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait_forever() -> None:
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(threading, "active_count", lambda: 1)  # a test before may have left one of a package
+    # An earlier test may have left a thread of another package.
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
     with pytest.raises(DeadlockError, match="nothing left to wait for") as caught:
-        run_virtual(wait_for_nobody())
+        run_virtual(wait_forever())
     assert "locks.py" in str(caught.value)
     assert "Event.wait" in str(caught.value)
 
 
-def test_a_silent_socket_is_an_error_after_real_patience() -> None:
+def test_silent_socket_raises_after_deadlock_timeout() -> None:
     async def listen_in_vain() -> None:
         left, right = socket.socketpair()
         with left, right:
             left.setblocking(False)
             await asyncio.get_running_loop().sock_recv(left, 1)
 
-    loop = VirtualClockLoop(patience_s=0.01)
+    loop = VirtualClockLoop(deadlock_timeout_s=0.01)
     task = loop.create_task(listen_in_vain())
-    with pytest.raises(DeadlockError, match="nothing came from outside"):
+    with pytest.raises(DeadlockError, match="no socket or thread woke the loop"):
         loop.run_until_complete(task)
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -143,7 +144,7 @@ def test_leftover_tasks_are_cancelled() -> None:
     assert ends == ["cancelled"]
 
 
-def test_errors_and_executor_shutdown_pass_through() -> None:
+def test_errors_and_executor_shutdown() -> None:
     async def fail() -> None:
         await asyncio.to_thread(int, "1")
         raise LookupError("mine")
@@ -153,7 +154,7 @@ def test_errors_and_executor_shutdown_pass_through() -> None:
 
 
 async def _jumps(prepare: Callable[[VirtualClockLoop], object] = lambda _: None) -> bool:
-    """Whether a jump of one second succeeds inside a callback; the clock has moved if it has, and only then."""
+    """Return True if a jump of one second succeeds inside a callback; the clock has advanced only then."""
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualClockLoop)
     found: asyncio.Future[bool] = loop.create_future()
@@ -171,31 +172,31 @@ async def _jumps(prepare: Callable[[VirtualClockLoop], object] = lambda _: None)
 
 
 @pytest.mark.anyio
-async def test_a_callback_may_jump_while_nothing_else_happens() -> None:
+async def test_callback_may_jump_while_idle() -> None:
     assert await _jumps()
     assert await _jumps(lambda loop: loop.call_later(1.5, lambda: None))
 
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("delay", [0.5, 1.0], ids=["before", "at the same instant"])
-async def test_a_timer_on_the_way_forbids_a_jump(delay: float) -> None:
+async def test_earlier_timer_prevents_jump(delay: float) -> None:
     assert not await _jumps(lambda loop: loop.call_later(delay, lambda: None))
 
 
 @pytest.mark.anyio
-async def test_a_cancelled_timer_forbids_nothing() -> None:
+async def test_cancelled_timer_allows_jump() -> None:
     assert await _jumps(lambda loop: loop.call_later(0.5, lambda: None).cancel())
     assert asyncio.get_running_loop().time() == pytest.approx(1.0)
     await asyncio.sleep(1.0)
 
 
 @pytest.mark.anyio
-async def test_a_ready_callback_forbids_a_jump() -> None:
+async def test_ready_callback_prevents_jump() -> None:
     assert not await _jumps(lambda loop: loop.call_soon(lambda: None))
 
 
 @pytest.mark.anyio
-async def test_a_foreign_socket_forbids_a_jump() -> None:
+async def test_foreign_socket_prevents_jump() -> None:
     near, far = socket.socketpair()
     loop = asyncio.get_running_loop()
     with near, far:
@@ -207,7 +208,7 @@ async def test_a_foreign_socket_forbids_a_jump() -> None:
 
 
 @pytest.mark.anyio
-async def test_a_working_executor_forbids_a_jump() -> None:
+async def test_running_executor_prevents_jump() -> None:
     go_on = threading.Event()
     work = asyncio.get_running_loop().run_in_executor(None, go_on.wait, 10.0)
     assert not await _jumps()

@@ -1,4 +1,4 @@
-"""What a failing simulated test leaves behind: recording, report, and a picture with modes, failed point and limit."""
+"""Files of a failed test: recording, report, and picture with modes, failed point and limit."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 
 from aerokit.logs.flights import read_flight
 from aerokit.position import Position
-from aerokit.sim.picture import draw_svg
-from aerokit.sim.track import Track
-from aerokit.sim.track_points import TrackPoint
+from aerokit.testing.picture import draw_svg
+from aerokit.testing.track import Track
+from aerokit.testing.track_points import TrackPoint
 
 pytest_plugins = ["pytester"]
 
@@ -40,7 +40,7 @@ def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunRe
     return pytester.runpytest_inprocess(*plugins, "-p", "no:cacheprovider", "--assert=plain", *arguments)
 
 
-def test_a_failure_leaves_its_recording_and_report(pytester: pytest.Pytester) -> None:
+def test_failed_test_saves_recording_and_report(pytester: pytest.Pytester) -> None:
     pytest.importorskip("plotly")
     result = run(pytester, FAILING, "--flight-pictures", "kept")
     result.assert_outcomes(failed=2, passed=1)
@@ -55,23 +55,19 @@ def test_a_failure_leaves_its_recording_and_report(pytester: pytest.Pytester) ->
     ]
     flight = read_flight(kept / "test_it.py-test_one.tlog")
     assert [change.name for change in flight.modes] == ["STABILIZE", "GUIDED"]
-    assert flight.modes[-1].reason == "ordered"  # what the program sent is in it, too
+    assert flight.modes[-1].reason == "ordered"  # The messages of the program are included.
     assert max(flight.track["altitude_relative_m"]) == pytest.approx(10, abs=1)
     assert read_flight(kept / "test_it.py-test_two.tlog", system_id=2).system_id == 2
 
 
-def test_without_the_extra_one_line_says_so(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_report_extra_is_reported(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
     result = run(pytester, FAILING, "--flight-pictures", "kept", "-k", "test_one")
-    result.stdout.fnmatch_lines(
-        ["recording in *.tlog", "no report of it: pip install 'aerokit-mavlink?report?'"]
-    )
+    result.stdout.fnmatch_lines(["recording in *.tlog", "no report: pip install 'aerokit-mavlink?report?'"])
     assert not list((pytester.path / "kept").glob("*.html"))
 
 
-def test_nothing_is_recorded_unasked(pytester: pytest.Pytester) -> None:
+def test_nothing_is_recorded_by_default(pytester: pytest.Pytester) -> None:
     source = """
     import pytest
     async def test_it(flight):
@@ -86,7 +82,7 @@ HOME = Position(47.0, 8.0)
 
 
 def flown() -> Track:
-    """100 m to the north in ten seconds, 30 m high, and from the middle on in another mode."""
+    """Return a track of 100 m to the north in ten seconds at 30 m, with a mode change halfway."""
     points = []
     for i in range(11):
         place = HOME.offset(north_m=10 * i)
@@ -95,13 +91,13 @@ def flown() -> Track:
     return Track(HOME, points)
 
 
-def test_the_picture_names_the_modes_where_they_begin() -> None:
+def test_picture_labels_mode_changes() -> None:
     svg = draw_svg([flown()])
-    assert re.findall(r">(AUTO|RTL)<", svg) == ["AUTO", "RTL"] * 2  # on the map, and over time
+    assert re.findall(r">(AUTO|RTL)<", svg) == ["AUTO", "RTL"] * 2  # On the map and in the profile.
     assert "failed" not in svg
 
 
-def test_the_picture_shows_the_circle_that_was_left_and_where_it_failed(tmp_path: Path) -> None:
+def test_picture_shows_circle_and_failed_point(tmp_path: Path) -> None:
     track = flown()
     with pytest.raises(AssertionError):
         track.assert_stayed_within(60)
@@ -111,22 +107,20 @@ def test_the_picture_shows_the_circle_that_was_left_and_where_it_failed(tmp_path
     assert "failed here" in svg
     (circle,) = re.findall(r'<polyline points="([^"]+)"[^>]*stroke-dasharray', svg)
     ys = [float(place.split(",")[1]) for place in circle.split()]
-    (track_line,) = (
-        line for line in re.findall(r'<polyline points="([^"]+)"', svg)[1:2]
-    )  # the circle is drawn first
+    (track_line,) = (line for line in re.findall(r'<polyline points="([^"]+)"', svg)[1:2])  # The circle is drawn first.
     flown_ys = [float(place.split(",")[1]) for place in track_line.split()]
     metre = (flown_ys[0] - flown_ys[-1]) / 100
     assert (max(ys) - min(ys)) / 2 == pytest.approx(60 * metre, rel=0.01)
-    assert flown_ys[-1] < min(ys)  # north of it
+    assert flown_ys[-1] < min(ys)  # North of the circle.
 
 
-def test_the_picture_shows_the_fence_and_the_height_that_were_left() -> None:
+def test_picture_shows_fence_and_altitude_limit() -> None:
     track = flown()
     corners = [HOME.offset(north_m=n, east_m=e) for n, e in ((-20, -20), (-20, 20), (55, 20), (55, -20))]
     with pytest.raises(AssertionError):
         track.assert_stayed_inside(corners)
     assert track.failure is not None
-    assert track.failure.point.time_s == 6.0  # the first one outside
+    assert track.failure.point.time_s == 6.0  # The first point outside.
     (fence,) = re.findall(r'<polyline points="([^"]+)"[^>]*stroke-dasharray', draw_svg([track]))
     assert len(fence.split()) == 5
     with pytest.raises(AssertionError):

@@ -1,4 +1,4 @@
-"""What a track says of a flight, and what its assertions say of another one than was expected."""
+"""Properties and assertions of a track."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from aerokit import Position
-from aerokit.sim.track import least_distance_m
 from aerokit.testing import Track, TrackPoint
+from aerokit.testing.track import min_distance_m
 
 HOME = Position(47.0, 8.0, 400.0)
 GROUND = Position(47.0, 8.0, altitude_relative_m=0.0)
@@ -26,14 +26,12 @@ def at(
 ) -> TrackPoint:
     place = HOME.offset(north_m=north_m, east_m=east_m)
     battery = 100 - time_s / 4
-    return TrackPoint(
-        time_s, place.latitude_deg, place.longitude_deg, altitude_m, armed, mode, speed_m_s, battery
-    )
+    return TrackPoint(time_s, place.latitude_deg, place.longitude_deg, altitude_m, armed, mode, speed_m_s, battery)
 
 
 @pytest.fixture
 def track() -> Track:
-    """100 m to the north at 20 m, and back to a place 5 m east of home."""
+    """Return a track of 100 m to the north at 20 m, and back to 5 m east of home."""
     return Track(
         HOME,
         [
@@ -46,7 +44,7 @@ def track() -> Track:
     )
 
 
-def test_what_was_flown(track: Track) -> None:
+def test_track_properties_of_a_flight(track: Track) -> None:
     assert track.max_altitude_m == 20
     assert track.max_distance_m == pytest.approx(100, abs=0.01)
     assert track.modes == ["STABILIZE", "AUTO", "RTL"]
@@ -56,14 +54,12 @@ def test_what_was_flown(track: Track) -> None:
     assert track.battery_used_percent == 10
     assert track.length_m == pytest.approx(20 + 100 + 100.1 + 20, abs=0.1)
     assert track.local()[2] == pytest.approx((100, 0, 20), abs=0.01)
-    assert track.nearest_m(HOME.offset(north_m=50, east_m=7)) == pytest.approx(
-        4.5, abs=0.01
-    )  # between two points
+    assert track.nearest_m(HOME.offset(north_m=50, east_m=7)) == pytest.approx(4.5, abs=0.01)  # Between two points.
     assert track.nearest_m(GROUND.offset(north_m=50, up_m=30)) == pytest.approx(10, abs=0.01)
     assert len(track[1:3]) == 2
 
 
-def test_what_is_true_passes(track: Track) -> None:
+def test_true_assertions_pass(track: Track) -> None:
     track.assert_reached_altitude(20)
     track.assert_stayed_below(20)
     track.assert_passed(GROUND.offset(north_m=100, up_m=20), within_m=1)
@@ -76,12 +72,12 @@ def test_what_is_true_passes(track: Track) -> None:
     track.assert_stayed_slower_than(10)
 
 
-def test_how_near_two_came_to_each_other_at_the_same_time(track: Track) -> None:
+def test_minimum_distance_of_two_tracks(track: Track) -> None:
     other = Track(HOME.offset(up_m=5), [at(9, 50, 0, 20), at(11, 50, 20, 20)])
-    distance, time_s = least_distance_m(other, track)
-    assert distance == pytest.approx(11.2, abs=0.1)  # 10 m before the place, and 5 m below
+    distance, time_s = min_distance_m(other, track)
+    assert distance == pytest.approx(11.2, abs=0.1)  # 10 m before the position and 5 m below it.
     assert time_s == 9
-    assert least_distance_m(track, Track(HOME, [at(50, 0, 0, 0)]))[0] == float("inf")
+    assert min_distance_m(track, Track(HOME, [at(50, 0, 0, 0)]))[0] == float("inf")
 
 
 SQUARE = [HOME.offset(north_m=n, east_m=e) for n, e in ((-9, -9), (50, -9), (50, 20), (-9, 20))]
@@ -111,6 +107,6 @@ WRONG: dict[str, Callable[[Track], None]] = {
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_what_is_wrong_says_what_was_flown(track: Track, text: str) -> None:
+def test_failed_assertions_describe_the_flight(track: Track, text: str) -> None:
     with pytest.raises(AssertionError, match=text):
         WRONG[text](track)

@@ -1,4 +1,4 @@
-"""What a vehicle said and heard, and faults that wait for their moment."""
+"""Journals of simulated vehicles, and conditional faults."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ async def fly(flight: Flight, altitude_m: float = 10.0) -> None:
     await flight.vehicle.take_off(altitude_m)
 
 
-async def test_what_was_said_and_heard() -> None:
+async def test_journal_has_texts_and_messages() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("GUIDED")
         await fly(flight)
     journal = flight.journal
-    journal.assert_said("Arming motors")
-    journal.assert_heard(MavCmd.NAV_TAKEOFF, times=1)
-    journal.assert_heard(MavCmd.COMPONENT_ARM_DISARM)
-    journal.assert_heard(MavCmd.NAV_LAND, times=0)
+    journal.assert_sent_text("Arming motors")
+    journal.assert_received_command(MavCmd.NAV_TAKEOFF, times=1)
+    journal.assert_received_command(MavCmd.COMPONENT_ARM_DISARM)
+    journal.assert_received_command(MavCmd.NAV_LAND, times=0)
     assert [order.param7 for order in journal.of(messages.CommandLong) if order.command == 22] == [10]
     assert len(journal.of(messages.Heartbeat)) >= 5
     times = [heard.time_s for heard in journal.messages]
@@ -38,10 +38,10 @@ async def test_px4_texts_are_whole_and_without_tabs() -> None:
     async with open_flight("px4") as flight:
         await fly(flight)
     assert all(text.text == text.text.strip() for text in flight.journal.texts)
-    flight.journal.assert_said("Armed by external command")
+    flight.journal.assert_sent_text("Armed by external command")
 
 
-async def test_a_reboot_does_not_end_it() -> None:
+async def test_reboot_does_not_end_the_journal() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         before = len(flight.journal.texts)
@@ -50,22 +50,26 @@ async def test_a_reboot_does_not_end_it() -> None:
         assert len(flight.journal.texts) > before
 
 
-def test_what_is_missing_is_told_with_what_was() -> None:
+def test_failed_assertions_list_the_journal() -> None:
     journal = Journal()
-    with pytest.raises(AssertionError, match=r"never said 'Crash'; it said: nothing"):
-        journal.assert_said("Crash")
-    journal.said(1.25, MavSeverity.CRITICAL, "Arm: Compass not healthy\t")
+    with pytest.raises(AssertionError, match=r"no text with 'Crash' was sent; sent texts: none"):
+        journal.assert_sent_text("Crash")
+    journal.on_text_sent(1.25, MavSeverity.CRITICAL, "Arm: Compass not healthy\t")
     with pytest.raises(AssertionError, match=r"1\.2 s CRITICAL 'Arm: Compass not healthy'"):
-        journal.assert_said("Crash")
-    journal.heard(2.0, messages.CommandLong(1, 1, MavCmd.NAV_LAND, 0, *[0.0] * 7))
-    with pytest.raises(AssertionError, match=r"heard NAV_LAND 1 times, not 2 times; it heard:\n +- NAV_LAND"):
-        journal.assert_heard(MavCmd.NAV_LAND, times=2)
-    journal.heard(3.0, messages.CommandLong(1, 1, MavCmd.NAV_LAND, 1, *[0.0] * 7))
-    with pytest.raises(AssertionError, match=r"heard NAV_TAKEOFF 0 times; it heard:\n +- NAV_LAND, 2 times"):
-        journal.assert_heard(MavCmd.NAV_TAKEOFF)
+        journal.assert_sent_text("Crash")
+    journal.on_message_received(2.0, messages.CommandLong(1, 1, MavCmd.NAV_LAND, 0, *[0.0] * 7))
+    with pytest.raises(
+        AssertionError, match=r"NAV_LAND was received 1 times, not 2 times; received commands:\n +- NAV_LAND"
+    ):
+        journal.assert_received_command(MavCmd.NAV_LAND, times=2)
+    journal.on_message_received(3.0, messages.CommandLong(1, 1, MavCmd.NAV_LAND, 1, *[0.0] * 7))
+    with pytest.raises(
+        AssertionError, match=r"NAV_TAKEOFF was received 0 times; received commands:\n +- NAV_LAND, 2 times"
+    ):
+        journal.assert_received_command(MavCmd.NAV_TAKEOFF)
 
 
-async def test_a_fault_waits_for_its_moment() -> None:
+async def test_fault_waits_for_its_condition() -> None:
     async with open_flight() as flight:
         high = flight.faults.when(lambda here: here.altitude_m > 8)
         high.lose_gps(for_s=2)
@@ -82,12 +86,12 @@ async def test_a_fault_waits_for_its_moment() -> None:
         assert (flight.faults.all.gps_lost, flight.faults.all.rc_lost) == (False, True)
 
 
-async def test_a_fleet_that_comes_near() -> None:
+async def test_fleet_reports_minimum_distance() -> None:
     async with open_fleet(count=2) as fleet, anyio.create_task_group() as group:
         for flight, altitude_m in zip(fleet, (10, 20), strict=True):
             await flight.vehicle.wait_ready()
             await flight.vehicle.set_mode("GUIDED")
             group.start_soon(fly, flight, altitude_m)
-    fleet.assert_stayed_apart(4.9)  # they began 5 m apart, eastwards
+    fleet.assert_stayed_apart(4.9)  # They start 5 m apart, to the east.
     with pytest.raises(AssertionError, match=r"system 1 and system 2 came nearer than 6 m: 5\.0 m at "):
         fleet.assert_stayed_apart(6)

@@ -1,4 +1,4 @@
-"""The pytest plugin in projects of its users, each in a folder of its own."""
+"""The pytest plugin in user projects, each in a folder of its own."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_plain(flight):
 
 def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunResult:
     pytester.makepyfile(source)
-    plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # whether it is installed as such or not
+    plugin = ("-p", "no:aerokit", "-p", "aerokit.testing.plugin")  # Also if the plugin is not installed.
     asyncio = () if "pytest_asyncio" in arguments else ("-p", "no:asyncio")
     return pytester.runpytest_inprocess(
         *plugin,
@@ -62,7 +62,7 @@ def test_flights_need_no_async_plugin(pytester: pytest.Pytester, kind: str) -> N
     run(pytester, ASYNC.format(kind=kind), "-p", "no:anyio").assert_outcomes(passed=2)
 
 
-def test_flights_share_the_loop_of_anyios_plugin(pytester: pytest.Pytester) -> None:
+def test_flights_share_loop_of_anyio_plugin(pytester: pytest.Pytester) -> None:
     source = """
     import asyncio, pytest
     from aerokit.testing import VIRTUAL_BACKEND
@@ -120,7 +120,7 @@ async def test_that_fails(flight):
 
 
 @pytest.mark.parametrize("mode", ["auto", "strict"])
-def test_tests_of_pytest_asyncio_fly_on_virtual_time(pytester: pytest.Pytester, mode: str) -> None:
+def test_pytest_asyncio_tests_run_on_virtual_time(pytester: pytest.Pytester, mode: str) -> None:
     pytest.importorskip("pytest_asyncio")
     options = ("-p", "pytest_asyncio", "-o", "asyncio_default_fixture_loop_scope=function")
     result = run(pytester, PYTEST_ASYNCIO, *options, f"--asyncio-mode={mode}")
@@ -128,7 +128,7 @@ def test_tests_of_pytest_asyncio_fly_on_virtual_time(pytester: pytest.Pytester, 
     assert "it did not reach 5 m" in result.stdout.str()
 
 
-def test_a_failure_tells_what_was_flown(pytester: pytest.Pytester) -> None:
+def test_failed_test_describes_the_flight(pytester: pytest.Pytester) -> None:
     source = """
     import pytest
 
@@ -150,15 +150,15 @@ def test_a_failure_tells_what_was_flown(pytester: pytest.Pytester) -> None:
             "*- what was flown -*",
             "system 1: STABILIZE, armed for 0.0 s, up to 0.0 m high and 0.0 m away",
             "  ended at *, disarmed, STABILIZE",
-            "  said at * INFO 'EKF3 IMU0 is using GPS'",
-            "track in pictures*test_a_failure_tells_what_was_flown.py-test_it-a-b.svg",
+            "  text at * INFO 'EKF3 IMU0 is using GPS'",
+            "track in pictures*test_failed_test_describes_the_flight.py-test_it-a-b.svg",
         ]
     )
     result.stdout.fnmatch_lines(["system 2: not switched on"])
     assert len(list((pytester.path / "pictures" / "of failures").glob("*.svg"))) == 3
 
 
-def test_a_mistake_in_a_simulated_vehicle_fails_the_test(pytester: pytest.Pytester) -> None:
+def test_vehicle_error_fails_the_test(pytester: pytest.Pytester) -> None:
     source = """
     import pytest, time
     from aerokit import messages
@@ -215,7 +215,7 @@ def test_a_fleet(pytester: pytest.Pytester) -> None:
     run(pytester, source).assert_outcomes(passed=2)
 
 
-def test_programs_that_connect_by_themselves(pytester: pytest.Pytester) -> None:
+def test_programs_that_connect_themselves(pytester: pytest.Pytester) -> None:
     source = """
     import aerokit, pytest
 
@@ -254,7 +254,7 @@ def test_blocking_and_classic(pytester: pytest.Pytester) -> None:
     run(pytester, source).assert_outcomes(passed=3)
 
 
-def test_mistakes_are_explained(pytester: pytest.Pytester) -> None:
+def test_invalid_use_is_explained(pytester: pytest.Pytester) -> None:
     source = """
     import pytest
 
@@ -274,7 +274,7 @@ def test_mistakes_are_explained(pytester: pytest.Pytester) -> None:
         assert text in told
 
 
-def test_a_fixture_of_ones_own_is_told_of_once(pytester: pytest.Pytester) -> None:
+def test_own_fixture_is_reported_once(pytester: pytest.Pytester) -> None:
     source = """
     import pytest
     from aerokit.testing import VIRTUAL_BACKEND, open_flight
@@ -302,7 +302,7 @@ def test_a_fixture_of_ones_own_is_told_of_once(pytester: pytest.Pytester) -> Non
     assert result.stdout.str().count("system 1: STABILIZE, armed for 0.0 s") == 1
 
 
-def test_other_projects_are_not_disturbed(pytester: pytest.Pytester) -> None:
+def test_other_projects_are_not_affected(pytester: pytest.Pytester) -> None:
     source = """
     import pytest, sys
 
@@ -338,5 +338,5 @@ def test_importing_it_is_cheap() -> None:
 
 
 def test_aerokit_itself_is_not_rewritten() -> None:
-    """Pytest rewrites every package that has a plugin: slow, and not safe in two threads that import at once."""
+    """Pytest rewrites every package with a plugin, which is slow and not thread-safe."""
     assert isinstance(aerokit.errors.__loader__, SourceFileLoader)

@@ -1,4 +1,4 @@
-"""Flights without pytest's fixtures: faults at once and at a simulated second, tracks that are up to date."""
+"""Flights without fixtures: immediate and scheduled faults, current tracks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ async def take_off(flight: Flight, altitude_m: float = 10.0) -> None:
     await flight.vehicle.take_off(altitude_m)
 
 
-async def test_faults_come_and_go_at_their_second() -> None:
+async def test_faults_start_and_end_on_time() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.faults.lose_gps(after_s=2, for_s=3)
@@ -33,7 +33,7 @@ async def test_faults_come_and_go_at_their_second() -> None:
         assert seen == [False, False, True, True, True, False]
 
 
-async def test_what_was_planned_happens_though_the_vehicle_hangs_or_reboots() -> None:
+async def test_scheduled_faults_survive_hang_and_reboot() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.faults.hang(for_s=4)
@@ -49,7 +49,7 @@ async def test_what_was_planned_happens_though_the_vehicle_hangs_or_reboots() ->
         await flight.vehicle.wait_ready()
 
 
-async def test_a_failed_motor_is_in_the_track_at_once() -> None:
+async def test_failed_motor_shows_in_the_track() -> None:
     async with open_flight() as flight:
         await take_off(flight)
         before = flight.track.end
@@ -67,9 +67,7 @@ async def test_low_battery_and_failing_checks() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.faults.set_battery(12)
-        await flight.vehicle.batteries.wait_until(
-            lambda packs: (packs[0].remaining_percent or 99) <= 12, timeout=10
-        )
+        await flight.vehicle.batteries.wait_until(lambda packs: (packs[0].remaining_percent or 99) <= 12, timeout=10)
         flight.faults.fail_prearm("Gyros still settling", for_s=5)
         with pytest.raises(CommandRejected, match="Gyros still settling"):
             await flight.vehicle.arm()
@@ -77,14 +75,14 @@ async def test_low_battery_and_failing_checks() -> None:
         assert flight.faults.all.prearm_failures == []
 
 
-async def test_who_waits_in_vain_hears_why() -> None:
+async def test_timeout_error_lists_failed_checks() -> None:
     async with open_flight() as flight:
         flight.faults.fail_prearm("Compass not healthy")
         with pytest.raises(OperationTimeout, match=r"still missing:(.|\n)*PreArm: Compass not healthy"):
             await flight.vehicle.wait_ready(timeout=40)
 
 
-async def test_a_fleet_stands_side_by_side() -> None:
+async def test_fleet_stands_in_a_row() -> None:
     async with open_fleet("px4", "copter", "rover", spacing_m=8) as fleet:
         pass
     first = fleet[0].track.home
@@ -93,7 +91,7 @@ async def test_a_fleet_stands_side_by_side() -> None:
         assert flight.track.home.longitude_deg >= first.longitude_deg
 
 
-async def test_an_unknown_parameter_is_said_with_its_like() -> None:
+async def test_unknown_parameter_lists_similar_names() -> None:
     with pytest.raises(InvalidArgument, match=r"no parameter 'RTL_ALT_MM'; similar: RTL_ALT\b"):
         async with open_flight(parameters={"RTL_ALT_MM": 15}):
             pass
@@ -121,13 +119,13 @@ def packets_through(seed: int) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("seed", [1])
-def test_dropped_packets_go_missing_both_ways_and_are_the_same_for_the_same_seed(seed: int) -> None:
+def test_dropped_packets_are_determined_by_the_seed(seed: int) -> None:
     first = packets_through(seed)
     assert packets_through(seed) == first
     assert all(60 < number < 95 for number in first)
 
 
-async def test_end_makes_everything_well() -> None:
+async def test_end_removes_all_faults() -> None:
     async with open_flight() as flight:
         flight.faults.drop_packets(1.0)
         flight.faults.lose_gps()
@@ -136,7 +134,7 @@ async def test_end_makes_everything_well() -> None:
         assert flight.simulated.now > 3
 
 
-async def test_mistakes() -> None:
+async def test_invalid_arguments_are_refused() -> None:
     async with open_flight(connect=False) as flight:
         wrongs: list[Callable[[], None]] = [
             lambda: flight.faults.drop_packets(20),
@@ -150,11 +148,11 @@ async def test_mistakes() -> None:
         assert not flight.faults.all.gps_lost
     with pytest.raises(RuntimeError, match="is not open"):
         _ = flight.vehicle
-    with pytest.raises(InvalidArgument, match="one kind"):
+    with pytest.raises(InvalidArgument, match="a single kind"):
         open_fleet("copter", "px4", count=2)
 
 
-async def test_a_fleet_flies_side_by_side() -> None:
+async def test_fleet_flies_in_a_row() -> None:
     async with open_fleet(count=2) as fleet, anyio.create_task_group() as group:
         for number, flight in enumerate(fleet):
             group.start_soon(take_off, flight, 10.0 + 10 * number)

@@ -1,4 +1,4 @@
-"""What the link tests share: each kind of event loop, a receiver that keeps all, a table of traffic."""
+"""Helpers of the link tests: event loops, a receiver that records everything, and a table of links."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ LOOPS: list[Any] = [
     pytest.param(
         ("asyncio", {"use_uvloop": True}),
         id="uvloop",
-        marks=pytest.mark.skipif(
-            importlib.util.find_spec("uvloop") is None, reason="uvloop is not installed"
-        ),
+        marks=pytest.mark.skipif(importlib.util.find_spec("uvloop") is None, reason="uvloop is not installed"),
     ),
 ]
 

@@ -1,4 +1,4 @@
-"""``peers=``: who is listened to, where anybody could send or connect."""
+"""``peers=``: accepted senders of links that receive from any host."""
 
 from __future__ import annotations
 
@@ -48,50 +48,48 @@ def test_addresses_and_networks(peers: Any, inside: list[str], outside: list[str
 
 
 @pytest.mark.parametrize("peers", ["", "10.0.0", "10.0.0.1/24", "copter", [], 7, [7], b"abcd", [None], 1.5])
-def test_what_is_no_address_is_an_error(peers: Any) -> None:
+def test_invalid_peers_are_refused(peers: Any) -> None:
     with pytest.raises(InvalidArgument, match="peers"):
         AllowedPeers(peers)
 
 
 @pytest.mark.parametrize("address", ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0", "udpbcast:127.255.255.255:1"])
-def test_links_to_which_anybody_can_send_take_peers(address: str) -> None:
+def test_open_links_accept_peers(address: str) -> None:
     link = create_link(address, peers="10.0.0.7")
     assert isinstance(link, (UdpListen, TcpListen, UdpBroadcast))
     assert not link._allowed.allows("10.0.0.8")
 
 
-@pytest.mark.parametrize(
-    "address", ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1", "/dev/ttyACM0", "a.tlog", "pty"]
-)
-def test_others_do_not(address: str) -> None:
-    with pytest.raises(InvalidArgument, match=r"peers = … is not allowed with .*udpin, udpbcast, tcpin"):
+@pytest.mark.parametrize("address", ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1", "/dev/ttyACM0", "a.tlog", "pty"])
+def test_other_links_refuse_peers(address: str) -> None:
+    with pytest.raises(InvalidArgument, match=r"peers = … is not allowed with .*only udpin, udpbcast and tcpin"):
         create_link(address, peers="10.0.0.7")
 
 
 @pytest.mark.anyio
-async def test_a_link_that_is_given_has_its_own() -> None:
-    with pytest.raises(InvalidArgument, match="give them to the link"):
+async def test_link_object_has_its_own_peers() -> None:
+    with pytest.raises(InvalidArgument, match="pass them to UdpListen"):
         async with aerokit.open_connection(UdpListen("127.0.0.1", 0), peers="10.0.0.7"):
             pytest.fail("not allowed")
-    with pytest.raises(InvalidArgument, match=r"peers: 'copter' is no IP address"):
+    with pytest.raises(InvalidArgument, match=r"peers: 'copter' is not an IP address"):
         async with aerokit.connect("udpin:127.0.0.1:0", peers="copter"):
             pytest.fail("no address")
-    with pytest.raises(InvalidArgument, match=r"peers: 'copter' is no IP address"):
+    with pytest.raises(InvalidArgument, match=r"peers: 'copter' is not an IP address"):
         aerokit.sync.connect("udpin:127.0.0.1:0", peers="copter")
 
 
 @pytest.mark.anyio
-async def test_an_open_connection_has_its_own() -> None:
+async def test_open_connection_has_its_own_peers() -> None:
     async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
         wrong: list[dict[str, Any]] = [{"peers": "10.0.0.7"}, {"may_move": True}]
         for options in wrong:
-            with pytest.raises(InvalidArgument, match="say it to open_connection"):
+            with pytest.raises(InvalidArgument, match="pass it to open_connection"):
                 async with aerokit.connect(connection, **options):
                     pytest.fail("not allowed")
 
 
 @each_loop
-async def test_udp_listens_to_nobody_else() -> None:
+async def test_udp_accepts_only_allowed_peers() -> None:
     link, heard = UdpListen("127.0.0.1", 0, peers="127.0.0.2"), Recorder()
     await link.open(heard)
     with socket.socket(type=socket.SOCK_DGRAM) as stranger, socket.socket(type=socket.SOCK_DGRAM) as vehicle:
@@ -106,7 +104,7 @@ async def test_udp_listens_to_nobody_else() -> None:
 
 
 @each_loop
-async def test_tcp_lets_nobody_else_in() -> None:
+async def test_tcp_accepts_only_allowed_peers() -> None:
     link, heard = TcpListen("127.0.0.1", 0, peers=["10.0.0.7", "fd00::/8"]), Recorder()
     await link.open(heard)
     client, answered = TcpConnect(*link.local_address), Recorder()
@@ -127,7 +125,7 @@ class Keeper(Recorder):
 
 @pytest.mark.parametrize("wrap", [lambda link: link, FaultyLink, lambda link: ReconnectingLink(lambda: link)])
 @each_loop
-async def test_only_who_is_kept_is_written_to(wrap: Any) -> None:
+async def test_only_kept_peers_are_written_to(wrap: Any) -> None:
     inner = UdpListen("127.0.0.1", 0)
     link: Link = wrap(inner)
     heard = Keeper()
@@ -154,7 +152,7 @@ async def test_only_who_is_kept_is_written_to(wrap: Any) -> None:
 
 
 @each_loop
-async def test_noise_pushes_no_vehicle_out_of_a_udp_port() -> None:
+async def test_noise_evicts_no_vehicle_from_udp_port() -> None:
     """300 one-byte datagrams from 300 ports, as the review sent them."""
     async with aerokit.open_connection("udpin:127.0.0.1:0") as connection:
         link = connection.link
@@ -163,7 +161,7 @@ async def test_noise_pushes_no_vehicle_out_of_a_udp_port() -> None:
             vehicle.bind(("127.0.0.1", 0))
             frame = FrameEncoder(1, 1).encode(aerokit.messages.Heartbeat(2, 3, 81, 0, 3))
             vehicle.sendto(frame, link.local_address)
-            await eventually(lambda: (1, 1) in connection.heard)
+            await eventually(lambda: (1, 1) in connection.heartbeats)
             for _ in range(300):
                 with socket.socket(type=socket.SOCK_DGRAM) as stranger:
                     stranger.sendto(b"\xfd", link.local_address)
@@ -173,7 +171,7 @@ async def test_noise_pushes_no_vehicle_out_of_a_udp_port() -> None:
 
 
 @each_loop
-async def test_who_says_nothing_makes_room_for_another_client(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_silent_client_makes_room_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
     link, heard = TcpListen("127.0.0.1", 0), Keeper()
     await link.open(heard)
@@ -203,7 +201,7 @@ async def test_who_says_nothing_makes_room_for_another_client(monkeypatch: pytes
 
 
 @each_loop
-async def test_a_broadcast_is_repeated_and_another_port_heard_when_the_first_is_silent(
+async def test_broadcast_resumes_after_silence_and_accepts_other_port(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as everybody, socket.socket(type=socket.SOCK_DGRAM) as first:
@@ -221,24 +219,24 @@ async def test_a_broadcast_is_repeated_and_another_port_heard_when_the_first_is_
             again.bind(("127.0.0.1", 0))
             again.setblocking(False)
             again.sendto(b"no", ("127.0.0.1", port))
-            monkeypatch.setattr(udp, "QUIET_AFTER_S", -1.0)
+            monkeypatch.setattr(udp, "REMOTE_TIMEOUT_S", -1.0)
             link.write(b"anybody?")
             await eventually(lambda: received(everybody) == b"anybody?")
             again.sendto(b"2", ("127.0.0.1", port))
             await heard.until(lambda: heard.data.endswith(b"2"))
-            monkeypatch.setattr(udp, "QUIET_AFTER_S", 3600.0)
+            monkeypatch.setattr(udp, "REMOTE_TIMEOUT_S", 3600.0)
             link.write(b"to again")
             await eventually(lambda: received(again) == b"to again")
         link.close()
         await link.wait_closed()
 
 
-def test_who_was_silent_for_as_long_as_a_vehicle_may_be_is_asked_for_by_broadcast() -> None:
-    assert udp.QUIET_AFTER_S == SILENT_AFTER_S
+def test_silent_vehicle_is_searched_by_broadcast() -> None:
+    assert udp.REMOTE_TIMEOUT_S == SILENT_AFTER_S
 
 
 @each_loop
-async def test_a_vehicle_on_a_broadcast_link_may_change_its_port() -> None:
+async def test_vehicle_on_broadcast_link_may_change_port() -> None:
     with socket.socket(type=socket.SOCK_DGRAM) as everybody:
         everybody.bind(("127.0.0.1", 0))
         link, heard = UdpBroadcast(*everybody.getsockname()), Keeper()
@@ -262,7 +260,7 @@ async def test_a_vehicle_on_a_broadcast_link_may_change_its_port() -> None:
 
 
 @each_loop
-async def test_what_is_for_a_vehicle_that_is_silent_is_not_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_message_for_silent_vehicle_is_not_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
     """Others of the same system id would obey."""
     with socket.socket(type=socket.SOCK_DGRAM) as everybody, socket.socket(type=socket.SOCK_DGRAM) as one:
         for sock in (everybody, one):
@@ -271,7 +269,7 @@ async def test_what_is_for_a_vehicle_that_is_silent_is_not_broadcast(monkeypatch
         link = UdpBroadcast(*everybody.getsockname())
         await link.open(Keeper())
         link.keep_peer(one.getsockname())
-        monkeypatch.setattr(udp, "QUIET_AFTER_S", -1.0)
+        monkeypatch.setattr(udp, "REMOTE_TIMEOUT_S", -1.0)
         link.write(b"an order", one.getsockname())
         link.write(b"heartbeat")
         await eventually(lambda: received(one) == b"an order")
@@ -288,5 +286,5 @@ def received(sock: socket.socket) -> bytes:
         return b""
 
 
-def test_udpout_hears_one_address_and_needs_no_list() -> None:
+def test_udpout_accepts_one_address() -> None:
     assert isinstance(create_link("udpout:127.0.0.1:1"), UdpConnect)

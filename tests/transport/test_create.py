@@ -29,7 +29,7 @@ LINKS: list[tuple[str, type[Link], str]] = [
     ("/dev/ttyACM0,57600", SerialLink, "serial:///dev/ttyACM0:57600"),
     ("serial://COM3?rtscts=1", SerialLink, "serial://COM3:921600?rtscts=1"),
     ("flight.tlog", Replay, "replay:flight.tlog"),
-    ("zenoh://north/alpha?helm=never&client=me", ZenohConnect, "zenoh://north/alpha"),
+    ("zenoh://north/alpha?control=never&client=me", ZenohConnect, "zenoh://north/alpha"),
     ("zenohin:north/alpha?listen=tcp/127.0.0.1:0", ZenohListen, "zenohin://north/alpha"),
     ("replay:flight.tlog?speed=max", Replay, "replay:flight.tlog?speed=inf"),
 ]
@@ -44,6 +44,6 @@ def test_each_address_makes_its_link(address: str, kind: type[Link], named: str)
     link.close()
 
 
-def test_a_wrong_address_shows_the_accepted_forms() -> None:
+def test_wrong_address_shows_the_accepted_forms() -> None:
     with pytest.raises(InvalidArgument, match="Accepted:"):
         create_link("udpin:0.0.0.0")

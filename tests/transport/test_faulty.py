@@ -47,15 +47,13 @@ def carried(path: FaultyPath, data: list[bytes], now: float = 0.0) -> list[tuple
 # --------------------------------------------------------------------------------------- one direction
 
 
-def test_without_faults_everything_arrives_at_once_in_order() -> None:
+def test_without_faults_frames_arrive_in_order() -> None:
     sent = frames(50)
     assert carried(FaultyPath(FaultModel()), sent, 3.0) == [(3.0, frame) for frame in sent]
 
 
 @given(model=models, data=pieces, seed=st.integers())
-def test_the_same_seed_has_the_same_bad_luck_and_nothing_comes_before_it_was_sent(
-    model: FaultModel, data: list[tuple[float, bytes]], seed: int
-) -> None:
+def test_same_seed_gives_same_faults(model: FaultModel, data: list[tuple[float, bytes]], seed: int) -> None:
     one, two, now = FaultyPath(model, seed), FaultyPath(model, seed), 0.0
     for wait, piece in data:
         now += wait
@@ -79,9 +77,7 @@ def test_shares_are_met(fault: str, share: float) -> None:
         "loss": count - len(arrived),
         "duplication": len(arrived) - count,
         "reordering": path.reordered,
-        "corruption": sum(a != b for a, b in zip(sent, arrived, strict=False))
-        if fault == "corruption"
-        else 0,
+        "corruption": sum(a != b for a, b in zip(sent, arrived, strict=False)) if fault == "corruption" else 0,
     }[fault]
     assert (
         seen
@@ -95,7 +91,7 @@ def test_shares_are_met(fault: str, share: float) -> None:
     assert seen / count == pytest.approx(share, abs=0.03)
 
 
-def test_the_other_faults_stay_where_they_are_when_one_share_changes() -> None:
+def test_changing_one_share_keeps_other_faults() -> None:
     sent = frames(300)
     few = {data for _, data in carried(FaultyPath(FaultModel(loss=0.2), 5), sent)}
     more = {data for _, data in carried(FaultyPath(FaultModel(loss=0.2, duplication=0.5), 5), sent)}
@@ -104,7 +100,7 @@ def test_the_other_faults_stay_where_they_are_when_one_share_changes() -> None:
     assert few < less
 
 
-def test_jitter_keeps_the_order_and_reordering_does_not() -> None:
+def test_jitter_keeps_order_and_reordering_does_not() -> None:
     sent = frames(200)
     path = FaultyPath(FaultModel(delay_s=0.05, jitter_s=0.1))
     due = [when for n, each in enumerate(sent) for when, _ in path.carry(each, n * 0.001)]
@@ -117,19 +113,17 @@ def test_jitter_keeps_the_order_and_reordering_does_not() -> None:
 def test_bandwidth_is_a_queue_that_overflows() -> None:
     path = FaultyPath(FaultModel(bandwidth=100.0, queue_bytes=50.0, delay_s=1.0))
     arrivals = carried(path, [bytes(20)] * 10)
-    assert [when for when, _ in arrivals] == pytest.approx(
-        [1.2, 1.4]
-    )  # 20 on the air, 20 wait, 20 are too many
+    assert [when for when, _ in arrivals] == pytest.approx([1.2, 1.4])  # 20 on the air, 20 wait, 20 are too many
     assert path.overflowed == 8
     assert [when for when, _ in path.carry(bytes(20), 0.4)] == pytest.approx([1.6])
 
 
-def test_a_frame_larger_than_the_queue_goes_when_nothing_waits() -> None:
+def test_frame_larger_than_queue_passes_when_empty() -> None:
     path = FaultyPath(FaultModel(bandwidth=100.0, queue_bytes=50.0))
     assert [when for when, _ in path.carry(bytes(200), 0.0)] == [2.0]
 
 
-def test_two_directions_on_one_frequency_take_turns() -> None:
+def test_half_duplex_directions_take_turns() -> None:
     air = Air()
     there, back = (
         FaultyPath(FaultModel(bandwidth=100.0), air=air),
@@ -140,7 +134,7 @@ def test_two_directions_on_one_frequency_take_turns() -> None:
     assert [when for when, _ in there.carry(bytes(100), 0.5)] == [3.0]
 
 
-def test_who_has_no_limit_of_bandwidth_waits_for_the_air_all_the_same() -> None:
+def test_half_duplex_without_bandwidth_limit_waits() -> None:
     air = Air()
     slow, fast = FaultyPath(FaultModel(bandwidth=100.0), air=air), FaultyPath(FaultModel(), air=air)
     assert [when for when, _ in fast.carry(bytes(100), 0.5)] == [0.5]
@@ -149,7 +143,7 @@ def test_who_has_no_limit_of_bandwidth_waits_for_the_air_all_the_same() -> None:
     assert [when for when, _ in fast.carry(bytes(100), 2.0)] == [2.0]
 
 
-def test_outages_count_from_the_start() -> None:
+def test_outages_count_from_start() -> None:
     path = FaultyPath(FaultModel(outages=((1.0, 2.0), (5.0, 6.0))))
     path.start(100.0)
     arrived = [when for tenth in range(80) for when, _ in path.carry(b"x", 100.0 + tenth / 10)]
@@ -157,7 +151,7 @@ def test_outages_count_from_the_start() -> None:
     assert not any(101.0 <= when < 102.0 or 105.0 <= when < 106.0 for when in arrived)
 
 
-def test_a_model_can_be_replaced_at_any_time() -> None:
+def test_model_can_be_replaced_at_any_time() -> None:
     path = FaultyPath(FaultModel(loss=1.0))
     assert path.carry(b"gone", 0.0) == []
     path.model = path.model.replace(loss=0.0)
@@ -177,7 +171,7 @@ def test_a_model_can_be_replaced_at_any_time() -> None:
         {"outages": ((2.0, 1.0),)},
     ],
 )
-def test_a_model_that_makes_no_sense_is_refused(wrong: dict[str, Any]) -> None:
+def test_invalid_model_is_refused(wrong: dict[str, Any]) -> None:
     (field,) = wrong
     with pytest.raises(InvalidArgument, match=field):
         FaultModel(**wrong)
@@ -187,23 +181,23 @@ def test_a_model_that_makes_no_sense_is_refused(wrong: dict[str, Any]) -> None:
 
 
 @given(st.lists(st.sampled_from([*frames(3), *frames(3, version=1)]), min_size=1), st.binary(max_size=5))
-def test_frames_in_one_write_are_cut_apart(parts: list[bytes], tail: bytes) -> None:
+def test_joined_frames_are_split(parts: list[bytes], tail: bytes) -> None:
     tail = tail.replace(b"\xfd", b"").replace(b"\xfe", b"")
     assert split_frames(b"".join(parts) + tail) == parts + ([tail] if tail else [])
 
 
 @given(st.binary())
-def test_cutting_loses_nothing(data: bytes) -> None:
+def test_splitting_loses_nothing(data: bytes) -> None:
     assert b"".join(split_frames(data)) == data
 
 
-def test_a_signed_frame_is_one_piece() -> None:
+def test_signed_frame_is_not_split() -> None:
     signed = bytearray(frames(1)[0] + bytes(13))
     signed[2] = 1
     assert split_frames(bytes(signed) * 2) == [bytes(signed)] * 2
 
 
-def test_whole_datagrams_share_their_fate_when_asked_for() -> None:
+def test_whole_datagrams_share_faults_on_request() -> None:
     datagram = b"".join(frames(4))
     assert len(FaultyPath(FaultModel()).carry(datagram, 0.0)) == 4
     assert FaultyPath(FaultModel(per_frame=False)).carry(datagram, 0.0) == [(0.0, datagram)]
@@ -218,7 +212,7 @@ each_model = pytest.mark.parametrize("model", [FaultModel(), DELAYED], ids=["per
 @each_loop
 @each_traffic
 @each_model
-async def test_every_write_arrives_as_one_piece_in_order(pieces: list[bytes], model: FaultModel) -> None:
+async def test_faulty_writes_arrive_unsplit_in_order(pieces: list[bytes], model: FaultModel) -> None:
     inner, far = memory_link_pair()
     near, left, right = FaultyLink(inner, model), Recorder(), Recorder()
     await near.open(left)
@@ -236,7 +230,7 @@ async def test_every_write_arrives_as_one_piece_in_order(pieces: list[bytes], mo
 
 
 @each_loop
-async def test_udp_peers_are_told_apart_and_answered() -> None:
+async def test_udp_peers_are_separate_and_answered() -> None:
     listening = FaultyLink(UdpListen("127.0.0.1", 0), DELAYED)
     heard = Recorder()
     await listening.open(heard)
@@ -260,7 +254,7 @@ async def test_udp_peers_are_told_apart_and_answered() -> None:
 
 @each_loop
 @each_model
-async def test_what_was_written_goes_out_before_a_closed_link_is_gone(model: FaultModel) -> None:
+async def test_written_data_leaves_before_close_ends(model: FaultModel) -> None:
     inner, far = memory_link_pair()
     near, right = FaultyLink(inner, model), Recorder()
     await near.open(Recorder())
@@ -274,7 +268,7 @@ async def test_what_was_written_goes_out_before_a_closed_link_is_gone(model: Fau
     assert right.data == b"last words"
 
 
-def test_a_closed_link_does_not_linger_long() -> None:
+def test_closed_link_lingers_briefly() -> None:
     async def main() -> None:
         inner, far = memory_link_pair()
         near, right = FaultyLink(inner, FaultModel(delay_s=30.0)), Recorder()
@@ -291,7 +285,7 @@ def test_a_closed_link_does_not_linger_long() -> None:
 
 @each_loop
 @each_model
-async def test_what_is_on_its_way_is_heard_before_the_link_is_lost(model: FaultModel) -> None:
+async def test_data_in_transit_arrives_before_the_loss(model: FaultModel) -> None:
     inner, far = memory_link_pair()
     near, left = FaultyLink(inner, model), Recorder()
     await near.open(left)
@@ -310,7 +304,7 @@ async def test_what_is_on_its_way_is_heard_before_the_link_is_lost(model: FaultM
 
 @each_loop
 @each_model
-async def test_nothing_arrives_after_close(model: FaultModel) -> None:
+async def test_closed_link_delivers_nothing(model: FaultModel) -> None:
     inner, far = memory_link_pair()
     near, left, right = FaultyLink(inner, model), Recorder(), Recorder()
     await near.open(left)
@@ -324,7 +318,7 @@ async def test_nothing_arrives_after_close(model: FaultModel) -> None:
 
 
 @each_loop
-async def test_a_lost_link_that_was_closed_while_it_drained_is_gone() -> None:
+async def test_lost_link_closed_while_draining_is_released() -> None:
     inner, far = memory_link_pair()
     near, left = FaultyLink(inner, FaultModel(delay_s=0.5)), Recorder()
     await near.open(left)
@@ -337,7 +331,7 @@ async def test_a_lost_link_that_was_closed_while_it_drained_is_gone() -> None:
 
 
 @each_loop
-async def test_a_link_is_opened_once_and_may_be_tried_again_after_it_failed() -> None:
+async def test_link_opens_once_and_may_retry_after_failure() -> None:
     taken = UdpListen("127.0.0.1", 0)
     await taken.open(Recorder())
     near = FaultyLink(UdpListen(*taken.local_address))
@@ -354,7 +348,7 @@ async def test_a_link_is_opened_once_and_may_be_tried_again_after_it_failed() ->
         await near.open(Recorder())
 
 
-def test_a_link_that_was_never_opened_can_be_closed_without_a_loop() -> None:
+def test_unopened_link_can_be_closed_without_loop() -> None:
     inner, far = memory_link_pair()
     near = FaultyLink(inner)
     near.write(b"")
@@ -362,7 +356,7 @@ def test_a_link_that_was_never_opened_can_be_closed_without_a_loop() -> None:
     far.close()
 
 
-def test_dropped_writes_are_those_of_the_link_and_of_the_queue() -> None:
+def test_dropped_writes_include_link_and_queue() -> None:
     async def main() -> None:
         inner, far = memory_link_pair()
         model = FaultModel(loss=0.5, bandwidth=100.0, queue_bytes=200.0)
@@ -379,14 +373,12 @@ def test_dropped_writes_are_those_of_the_link_and_of_the_queue() -> None:
     run_virtual(main())
 
 
-def test_half_duplex_shares_the_air() -> None:
+def test_half_duplex_shares_the_channel() -> None:
     async def main() -> None:
         inner, far = memory_link_pair()
         near = FaultyLink(inner, FaultModel(bandwidth=100.0), half_duplex=True)
         left, right, times = Recorder(), Recorder(), list[float]()
-        left.at_each_piece = right.at_each_piece = lambda data, peer: times.append(
-            asyncio.get_running_loop().time()
-        )
+        left.at_each_piece = right.at_each_piece = lambda data, peer: times.append(asyncio.get_running_loop().time())
         await near.open(left)
         await far.open(right)
         near.write(bytes(100))
@@ -402,7 +394,7 @@ def test_half_duplex_shares_the_air() -> None:
 # ------------------------------------------------------------------------------------- a whole program
 
 
-def test_a_program_connects_and_flies_by_a_bad_radio() -> None:
+def test_program_flies_over_a_bad_radio() -> None:
     async def main() -> tuple[float, int]:
         bad = FaultModel(loss=0.1, duplication=0.1, corruption=0.02, delay_s=0.05, jitter_s=0.05)
         async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:

@@ -1,4 +1,4 @@
-"""Nothing older than two seconds is ever accepted, whatever the network did with it and whatever clocks show."""
+"""No datagram older than two seconds is accepted, for any network delays and clocks."""
 
 from __future__ import annotations
 
@@ -11,21 +11,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerokit.transport.zenoh.control_lease import BEACON_EVERY_S, FRESH_S, Ears, Judge, Lateness
+from aerokit.transport.zenoh.control_lease import (
+    BEACON_INTERVAL_S,
+    MAX_DELAY_S,
+    DelayEstimator,
+    FreshnessChecker,
+    VehicleSideTracker,
+)
 from aerokit.transport.zenoh.keys import Beacon, Stamp
 
 Event = tuple[float, int, str, Any]
 Holds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
 
-clocks = st.tuples(
-    st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001])
-)  # what it shows at 0, and its rate
+clocks = st.tuples(st.floats(-1e6, 1e6), st.sampled_from([1.0, 0.9999, 1.0001]))  # what it shows at 0, and its rate
 delays = st.one_of(st.floats(0, 0.5), st.floats(0, 20))
 holds = st.lists(st.tuples(st.floats(0, 12), st.floats(0, 10)), max_size=3)  # begins, lasts
 
 
 class World:
-    """A vehicle side that sends beacons, a client that sends all the time, a network that does what it likes."""
+    """A vehicle side that sends beacons, a client that sends continuously, and a network with arbitrary delays."""
 
     def __init__(
         self,
@@ -34,7 +38,7 @@ class World:
         delays: Iterator[float],
         holds: Holds = ((), ()),
     ) -> None:
-        self.judge, self.ears = Judge(7), Ears(1)
+        self.checker, self.tracker = FreshnessChecker(7), VehicleSideTracker(1)
         self.vehicle_clock, self.client_clock = vehicle, client
         self.delays, self.holds = delays, holds
         self.events: list[Event] = []
@@ -47,7 +51,7 @@ class World:
         heapq.heappush(self.events, (when, next(self.order), kind, what))
 
     def arrival(self, now: float, way: int) -> float:
-        """What comes into a hold comes at its end, in order."""
+        """Data that arrives during a hold is delivered at its end, in order."""
         when = now + next(self.delays)
         for begins, lasts in sorted(self.holds[way]):
             if begins <= when < begins + lasts:
@@ -55,8 +59,8 @@ class World:
         return when
 
     def run(self, until: float) -> None:
-        for number in range(int(until / BEACON_EVERY_S)):
-            self.at(number * BEACON_EVERY_S, "beacon")
+        for number in range(int(until / BEACON_INTERVAL_S)):
+            self.at(number * BEACON_INTERVAL_S, "beacon")
         for number in range(int(until / 0.3)):
             self.at(number * 0.3, "send", number)
         while self.events:
@@ -64,41 +68,41 @@ class World:
             (begun, rate), (begun_too, rate_too) = self.vehicle_clock, self.client_clock
             vehicle, client = begun + rate * now, begun_too + rate_too * now
             if kind == "beacon":
-                self.at(self.arrival(now, 0), "heard", self.judge.beacon(vehicle))
+                self.at(self.arrival(now, 0), "heard", self.checker.beacon(vehicle))
             elif kind == "heard":
-                self.ears.hear_beacon(what, client)
+                self.tracker.receive_beacon(what, client)
             elif kind == "send":
-                stamp = self.ears.stamp(client)
+                stamp = self.tracker.stamp(client)
                 if stamp is None:
                     self.unsent.append(now)
                 else:
                     self.at(self.arrival(now, 1), "came", (now, stamp))
             else:
                 sent, stamp = what
-                accepted = self.judge.accepts("ground", stamp, vehicle)
+                accepted = self.checker.accepts("ground", stamp, vehicle)
                 (self.accepted if accepted else self.refused).append((sent, now))
 
 
 @given(clocks, clocks, st.lists(delays, min_size=120, max_size=120))
-def test_what_is_accepted_was_sent_within_two_seconds(
+def test_accepted_datagrams_are_at_most_two_seconds_old(
     vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
 ) -> None:
     world = World(vehicle, client, iter(delays))
     world.run(15)
     for sent, accepted in world.accepted:
-        assert accepted - sent <= FRESH_S * 1.001
+        assert accepted - sent <= MAX_DELAY_S * 1.001
     times = [sent for sent, _ in world.accepted]
     assert times == sorted(set(times))  # none twice, none behind a later one
 
 
 @given(clocks, clocks, st.floats(0, 0.1), st.tuples(holds, holds))
-def test_what_a_partition_kept_back_is_not_accepted(
+def test_datagrams_delayed_by_partition_are_refused(
     vehicle: tuple[float, float], client: tuple[float, float], delay: float, holds: Holds
 ) -> None:
     world = World(vehicle, client, repeat(delay), holds)
     world.run(25)
     for sent, accepted in world.accepted:
-        assert accepted - sent <= FRESH_S * 1.001
+        assert accepted - sent <= MAX_DELAY_S * 1.001
     healed = 1 + max((begins + lasts for way in holds for begins, lasts in way), default=0)
     assert [sent for sent, _ in world.accepted if sent > healed] == [
         number * 0.3 for number in range(83) if number * 0.3 > healed
@@ -106,7 +110,7 @@ def test_what_a_partition_kept_back_is_not_accepted(
 
 
 @given(clocks, clocks, st.lists(st.floats(0, 0.7), min_size=1, max_size=120))
-def test_on_a_network_that_works_everything_is_accepted(
+def test_working_network_accepts_everything(
     vehicle: tuple[float, float], client: tuple[float, float], delays: list[float]
 ) -> None:
     steady = max(delays)  # in order
@@ -117,57 +121,57 @@ def test_on_a_network_that_works_everything_is_accepted(
     assert len(world.accepted) + len(world.unsent) == 50
 
 
-def test_nothing_is_sent_into_silence_and_what_was_held_back_is_refused() -> None:
-    judge, ears = Judge(7), Ears(1)
-    assert ears.stamp(0.0) is None  # nobody was heard
-    assert ears.hear_beacon(judge.beacon(100.0), 0.0)
-    held = ears.stamp(1.9)
+def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
+    checker, tracker = FreshnessChecker(7), VehicleSideTracker(1)
+    assert tracker.stamp(0.0) is None  # no beacon was received
+    assert tracker.receive_beacon(checker.beacon(100.0), 0.0)
+    held = tracker.stamp(1.9)
     assert held is not None
-    assert ears.stamp(2.1) is None  # the beacon is too old by our own clock
-    assert not judge.accepts("ground", held, 102.1)
-    assert judge.late == 1
-    beacon = judge.beacon(110.0)
-    assert not ears.hear_beacon(beacon, 20.0)  # ten seconds late: it was held back, too
-    assert ears.late == 1
-    assert ears.stamp(20.0) is None
-    assert ears.hear_beacon(judge.beacon(120.0), 20.0)
-    fresh = ears.stamp(20.1)
-    assert judge.accepts("ground", fresh, 120.1)
-    assert not judge.accepts("ground", fresh, 120.1)  # the same once more
-    assert judge.doubled == 1
+    assert tracker.stamp(2.1) is None  # the beacon is too old by our own clock
+    assert not checker.accepts("ground", held, 102.1)
+    assert checker.late == 1
+    beacon = checker.beacon(110.0)
+    assert not tracker.receive_beacon(beacon, 20.0)  # ten seconds late: it was held back, too
+    assert tracker.late == 1
+    assert tracker.stamp(20.0) is None
+    assert tracker.receive_beacon(checker.beacon(120.0), 20.0)
+    fresh = tracker.stamp(20.1)
+    assert checker.accepts("ground", fresh, 120.1)
+    assert not checker.accepts("ground", fresh, 120.1)  # the same once more
+    assert checker.duplicates == 1
 
 
-def test_another_vehicle_side_of_the_same_name() -> None:
-    first, second, ears = Judge(1), Judge(2), Ears(1)
-    assert ears.hear_beacon(first.beacon(0.0), 0.0)
-    assert not ears.hear_beacon(second.beacon(50.0), 0.1)  # the first one is there
-    assert not ears.hears(2, 50.0, 0.1)
-    assert ears.foreign == 2
-    stamp = ears.stamp(0.2)
+def test_second_vehicle_side_with_same_name() -> None:
+    first, second, tracker = FreshnessChecker(1), FreshnessChecker(2), VehicleSideTracker(1)
+    assert tracker.receive_beacon(first.beacon(0.0), 0.0)
+    assert not tracker.receive_beacon(second.beacon(50.0), 0.1)  # the first one is active
+    assert not tracker.accepts(2, 50.0, 0.1)
+    assert tracker.foreign == 2
+    stamp = tracker.stamp(0.2)
     assert first.accepts("ground", stamp, 0.2)
     assert not second.accepts("ground", stamp, 50.2)
-    assert ears.hear_beacon(second.beacon(53.0), 3.0)  # the first one is silent: this is its successor
-    assert second.accepts("ground", ears.stamp(3.1), 53.1)
-    ears.forget()
-    assert ears.stamp(3.2) is None
-    assert ears.hear_beacon(first.beacon(3.3), 3.3)
+    assert tracker.receive_beacon(second.beacon(53.0), 3.0)  # the first one is silent: this is its successor
+    assert second.accepts("ground", tracker.stamp(3.1), 53.1)
+    tracker.reset()
+    assert tracker.stamp(3.2) is None
+    assert tracker.receive_beacon(first.beacon(3.3), 3.3)
 
 
 @pytest.mark.parametrize("stamp", [None, Stamp(8, 1, 1, 1), Stamp(7, 0, 1, 1), Stamp(7, 2, 1, 1)])
-def test_what_bears_no_stamp_of_ours_is_refused(stamp: Stamp | None) -> None:
-    judge = Judge(7)
-    judge.beacon(0.0)
-    assert not judge.accepts("ground", stamp, 0.1)
-    assert judge.late == 1
-    assert judge.accepts("ground", Stamp(7, 1, 1, 1), 0.1)
+def test_datagram_without_valid_stamp_is_refused(stamp: Stamp | None) -> None:
+    checker = FreshnessChecker(7)
+    checker.beacon(0.0)
+    assert not checker.accepts("ground", stamp, 0.1)
+    assert checker.late == 1
+    assert checker.accepts("ground", Stamp(7, 1, 1, 1), 0.1)
 
 
-def test_a_judge_remembers_so_many_clients() -> None:
-    judge = Judge(7)
-    judge.beacon(0.0)
+def test_checker_bounds_remembered_clients() -> None:
+    checker = FreshnessChecker(7)
+    checker.beacon(0.0)
     for nonce in range(1000):
-        assert judge.accepts("ground", Stamp(7, 1, nonce, 1), 0.1)
-    assert len(judge._sequences) == 256
+        assert checker.accepts("ground", Stamp(7, 1, nonce, 1), 0.1)
+    assert len(checker._sequences) == 256
 
 
 @given(
@@ -175,25 +179,25 @@ def test_a_judge_remembers_so_many_clients() -> None:
     clocks,
     st.lists(st.tuples(st.floats(0, 30), st.floats(0, 60)), min_size=1, max_size=40),
 )
-def test_lateness_is_never_more_than_the_delay(
+def test_estimated_delay_never_exceeds_the_real_one(
     theirs: tuple[float, float], ours: tuple[float, float], sent: list[tuple[float, float]]
 ) -> None:
-    lateness = Lateness()
+    estimator = DelayEstimator()
     for delay, at in sorted(sent, key=lambda each: sum(each)):
         now = at + delay
-        late = lateness.of(theirs[0] + theirs[1] * at, ours[0] + ours[1] * now)
+        late = estimator.delay(theirs[0] + theirs[1] * at, ours[0] + ours[1] * now)
         assert 0 <= late <= delay + 0.02
 
 
-def test_lateness_after_a_quick_one() -> None:
-    lateness = Lateness()
-    assert lateness.of(1000.0, 5.0) == 0.0
-    assert lateness.of(1001.0, 9.0) == pytest.approx(3.0, abs=0.01)
-    assert lateness.of(1005.0, 9.9) == 0.0  # quicker still
+def test_delay_after_a_faster_datagram() -> None:
+    estimator = DelayEstimator()
+    assert estimator.delay(1000.0, 5.0) == 0.0
+    assert estimator.delay(1001.0, 9.0) == pytest.approx(3.0, abs=0.01)
+    assert estimator.delay(1005.0, 9.9) == 0.0  # quicker still
 
 
-def test_a_beacon_that_was_overtaken_is_none() -> None:
-    ears = Ears(1)
-    assert ears.hear_beacon(Beacon(7, 2, 1.0), 1.0)
-    assert not ears.hear_beacon(Beacon(7, 1, 0.5), 1.1)
-    assert not ears.hear_beacon(Beacon(7, 2, 1.0), 1.2)
+def test_overtaken_beacon_is_ignored() -> None:
+    tracker = VehicleSideTracker(1)
+    assert tracker.receive_beacon(Beacon(7, 2, 1.0), 1.0)
+    assert not tracker.receive_beacon(Beacon(7, 1, 0.5), 1.1)
+    assert not tracker.receive_beacon(Beacon(7, 2, 1.0), 1.2)

@@ -12,7 +12,7 @@ from aerokit.transport import memory_link_pair
 
 @each_loop
 @each_traffic
-async def test_every_write_arrives_as_one_piece_in_order(pieces: list[bytes]) -> None:
+async def test_memory_writes_arrive_unsplit_in_order(pieces: list[bytes]) -> None:
     near, far = memory_link_pair()
     left, right = Recorder(), Recorder()
     await near.open(left)
@@ -29,7 +29,7 @@ async def test_every_write_arrives_as_one_piece_in_order(pieces: list[bytes]) ->
 
 
 @each_loop
-async def test_the_other_end_is_lost_after_it_has_heard_everything() -> None:
+async def test_other_end_is_lost_after_receiving_everything() -> None:
     near, far = memory_link_pair()
     left, right = Recorder(), Recorder()
     await near.open(left)
@@ -46,7 +46,7 @@ async def test_the_other_end_is_lost_after_it_has_heard_everything() -> None:
 
 
 @each_loop
-async def test_an_end_that_was_never_opened_takes_nobody_with_it() -> None:
+async def test_closing_an_unopened_end_affects_no_other() -> None:
     near, far = memory_link_pair()
     right = Recorder()
     await far.open(right)
@@ -59,7 +59,7 @@ async def test_an_end_that_was_never_opened_takes_nobody_with_it() -> None:
 
 
 @each_loop
-async def test_nothing_arrives_after_close() -> None:
+async def test_closed_memory_link_delivers_nothing() -> None:
     near, far = memory_link_pair()
     left, right = Recorder(), Recorder()
     await near.open(left)
@@ -74,7 +74,7 @@ async def test_nothing_arrives_after_close() -> None:
 
 
 @each_loop
-async def test_writes_to_an_end_that_is_not_open_are_dropped_and_counted() -> None:
+async def test_writes_to_unopened_end_are_dropped_and_counted() -> None:
     near, far = memory_link_pair()
     near.write(b"not even open")
     await near.open(Recorder())
@@ -86,7 +86,7 @@ async def test_writes_to_an_end_that_is_not_open_are_dropped_and_counted() -> No
 
 
 @each_loop
-async def test_a_link_is_opened_once() -> None:
+async def test_memory_link_is_opened_once() -> None:
     near, far = memory_link_pair()
     await near.open(Recorder())
     with pytest.raises(BusyError, match="is open"):
@@ -97,7 +97,7 @@ async def test_a_link_is_opened_once() -> None:
     far.close()
 
 
-def test_a_reply_from_inside_a_callback_comes_on_a_later_turn() -> None:
+def test_reply_inside_callback_comes_in_later_iteration() -> None:
     async def main() -> None:
         near, far = memory_link_pair()
         left, right = Recorder(), Recorder()
@@ -112,7 +112,7 @@ def test_a_reply_from_inside_a_callback_comes_on_a_later_turn() -> None:
     run_virtual(main())
 
 
-def test_latency_delays_each_way_and_keeps_the_order() -> None:
+def test_latency_delays_both_directions_in_order() -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         near, far = memory_link_pair(latency_s=0.25)
@@ -133,7 +133,7 @@ def test_latency_delays_each_way_and_keeps_the_order() -> None:
     run_virtual(main())
 
 
-def test_a_pair_that_was_never_opened_can_be_closed_without_a_loop() -> None:
+def test_unopened_pair_can_be_closed_without_loop() -> None:
     near, far = memory_link_pair()
     near.write(b"")
     near.close()

@@ -34,7 +34,7 @@ def anyio_backend() -> tuple[str, dict[str, Any]]:
 
 @pytest.fixture
 def taken() -> Iterator[dict[str, int]]:
-    """Ports that somebody has bound and nobody serves."""
+    """Ports that are bound but not served."""
     with socket.socket() as tcp, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         tcp.bind(("127.0.0.1", 0))
         udp.bind(("127.0.0.1", 0))
@@ -64,7 +64,7 @@ CASES: list[tuple[str, type[BaseException], int | None]] = [
 @pytest.mark.anyio
 @pytest.mark.parametrize("reconnect", [False, True], ids=["once", "reconnect"])
 @pytest.mark.parametrize(("address", "kind", "number"), CASES, ids=[case[0] for case in CASES])
-async def test_the_context_is_the_systems_own_error(
+async def test_context_is_the_system_error(
     address: str,
     kind: type[BaseException],
     number: int | None,
@@ -89,7 +89,7 @@ async def test_the_context_is_the_systems_own_error(
 
 
 @pytest.mark.anyio
-async def test_a_device_that_vanishes_while_it_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_device_vanishes_while_opening(monkeypatch: pytest.MonkeyPatch) -> None:
     pyserial, termios = importlib.import_module("serial"), importlib.import_module("termios")
 
     def vanish(*args: object, **options: object) -> None:
@@ -121,10 +121,8 @@ FOREIGN = re.compile(rf'  File "{re.escape(os.path.dirname(asyncio.__file__))}.*
 
 @pytest.mark.parametrize("address", ["udpin:127.0.0.1:{udp}", "/dev/no-such-device", "no/such/file.tlog"])
 @pytest.mark.parametrize("program", sampled(PROGRAMS.values(), 4), ids=PROGRAMS)
-def test_traceback_of_a_link_that_cannot_be_opened_is_short(
-    program: str, address: str, taken: dict[str, int], tmp_path: Path
-) -> None:
-    """Ten lines, beside those of asyncio itself."""
+def test_traceback_of_failed_open_is_short(program: str, address: str, taken: dict[str, int], tmp_path: Path) -> None:
+    """At most ten lines, apart from asyncio's own."""
     file = tmp_path / "program.py"
     file.write_text(program.format(address=address.format(**taken)), encoding="utf-8")
     ended = subprocess.run(
@@ -140,7 +138,7 @@ def test_traceback_of_a_link_that_cannot_be_opened_is_short(
     assert len(shown.splitlines()) <= 10, ended.stderr
 
 
-def test_it_comes_through_the_blocking_twin(taken: dict[str, int]) -> None:
+def test_error_passes_the_blocking_twin(taken: dict[str, int]) -> None:
     for opened in (aerokit.sync.connect, aerokit.sync.open_connection):
         with pytest.raises(LinkOpenError) as caught:
             opened("tcp:127.0.0.1:{tcp}".format(**taken), reconnect=True)

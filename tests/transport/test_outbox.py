@@ -1,4 +1,4 @@
-"""What a transport does not take: bounded in bytes and seconds, told, and taken back where that is possible."""
+"""Data that a transport does not accept: bounded in bytes and seconds, reported, and discarded on request."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aerokit.connection.connection import Connection
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.testing import FaultyLink
 from aerokit.transport import Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox
-from aerokit.transport.outbox import WRITE_DEADLINE_S, Outbox
+from aerokit.transport.outbox import WRITE_TIMEOUT_S, Outbox
 
 pytestmark = pytest.mark.anyio
 
@@ -51,7 +51,7 @@ class Line:
         self.outbox.resume()
 
 
-async def test_what_the_transport_takes_goes_through_at_once_and_no_timer_stays() -> None:
+async def test_accepted_data_passes_at_once_without_timer() -> None:
     line = Line(room=1000)
     line.outbox.write(b"one")
     line.outbox.write(b"two")
@@ -64,7 +64,7 @@ async def test_what_the_transport_takes_goes_through_at_once_and_no_timer_stays(
     assert line.told == []
 
 
-async def test_what_is_kept_goes_out_in_order_whole_and_together() -> None:
+async def test_kept_data_leaves_whole_in_order_and_joined() -> None:
     line = Line(room=1)
     for word in (b"a", b"bb", b"ccc"):
         line.outbox.write(word)
@@ -73,7 +73,7 @@ async def test_what_is_kept_goes_out_in_order_whole_and_together() -> None:
     assert (line.sent, line.dropped) == ([b"a", b"bbccc"], 0)
 
 
-async def test_no_more_is_kept_than_the_limit() -> None:
+async def test_kept_data_is_limited() -> None:
     line = Line(room=1, limit=100)
     for _ in range(1000):
         line.outbox.write(bytes(30))
@@ -81,29 +81,29 @@ async def test_no_more_is_kept_than_the_limit() -> None:
     assert line.dropped == 1000 - 4
 
 
-async def test_nothing_is_written_that_has_waited_for_a_second() -> None:
+async def test_data_older_than_a_second_is_not_written() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
-    await anyio.sleep(WRITE_DEADLINE_S - 0.1)
+    await anyio.sleep(WRITE_TIMEOUT_S - 0.1)
     line.outbox.write(b"in time")
     await anyio.sleep(0.11)
     line.flow()
     assert (line.sent, line.dropped) == ([b"taken", b"in time"], 1)
 
 
-async def test_a_second_is_too_long_to_the_last_tick_of_the_clock() -> None:
+async def test_limit_of_a_second_is_exact() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
-    until = asyncio.get_running_loop().time() + WRITE_DEADLINE_S
-    await anyio.sleep(WRITE_DEADLINE_S)
+    until = asyncio.get_running_loop().time() + WRITE_TIMEOUT_S
+    await anyio.sleep(WRITE_TIMEOUT_S)
     assert asyncio.get_running_loop().time() == until
     line.flow()
     assert (line.sent, line.dropped) == ([b"taken"], 1)
 
 
-async def test_late_writes_are_given_up_without_any_other_write() -> None:
+async def test_late_writes_are_dropped_without_another_write() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"too late")
@@ -111,7 +111,7 @@ async def test_late_writes_are_given_up_without_any_other_write() -> None:
     assert (line.dropped, line.outbox.unsent_bytes) == (1, 5)
 
 
-async def test_a_line_that_does_not_drain_is_told_once_and_gets_nothing_more() -> None:
+async def test_stall_is_reported_once_and_stops_forwarding() -> None:
     """The system takes more for a long while: what it has is beyond recall, so it is not given any more."""
     line = Line(room=1000)
     for _ in range(5):
@@ -127,7 +127,7 @@ async def test_a_line_that_does_not_drain_is_told_once_and_gets_nothing_more() -
     assert line.sent[-1] == b"again"
 
 
-async def test_what_came_during_a_stall_goes_out_when_the_line_moves_again() -> None:
+async def test_data_written_during_stall_leaves_afterwards() -> None:
     line = Line(room=1000)
     line.outbox.write(b"taken")
     await anyio.sleep(1.4)
@@ -138,7 +138,7 @@ async def test_what_came_during_a_stall_goes_out_when_the_line_moves_again() -> 
     assert (line.told, line.sent) == ([True, False], [b"taken", b"in time"])
 
 
-async def test_a_slow_line_is_no_stalled_line() -> None:
+async def test_slow_link_is_not_stalled() -> None:
     line = Line(room=10_000)
     for _ in range(200):
         line.outbox.write(bytes(10))
@@ -147,7 +147,7 @@ async def test_a_slow_line_is_no_stalled_line() -> None:
     assert line.told == []
 
 
-async def test_what_is_taken_back_never_leaves() -> None:
+async def test_discarded_data_never_leaves() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"order")
@@ -157,17 +157,17 @@ async def test_what_is_taken_back_never_leaves() -> None:
     assert line.sent == [b"taken"]
 
 
-async def test_taking_back_is_no_progress() -> None:
+async def test_discarding_is_no_progress() -> None:
     line = Line(room=1000)
     for _ in range(8):
         line.outbox.write(b"x" * 10)
         await anyio.sleep(0.2)
         line.pending -= 5
-        line.outbox.taken_back(5)
+        line.outbox.reclaimed(5)
     assert line.told == [True]
 
 
-async def test_closed_a_stalled_one_gives_the_transport_nothing_more() -> None:
+async def test_closed_stalled_outbox_forwards_nothing() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")
     await anyio.sleep(1.5)
@@ -177,7 +177,7 @@ async def test_closed_a_stalled_one_gives_the_transport_nothing_more() -> None:
     assert (line.sent, line.dropped) == ([b"taken"], 2)
 
 
-async def test_closed_the_others_give_it_what_is_in_time() -> None:
+async def test_closed_outbox_forwards_data_in_time() -> None:
     line = Line(room=1)
     line.outbox.write(b"taken")
     line.outbox.write(b"in time")
@@ -209,9 +209,7 @@ async def connection(radio: FaultyLink) -> AsyncIterator[Connection]:
         yield connection
 
 
-async def test_a_connection_tells_that_its_link_stalls_and_that_it_drains(
-    radio: FaultyLink, connection: Connection
-) -> None:
+async def test_connection_reports_stall_and_drain(radio: FaultyLink, connection: Connection) -> None:
     told: list[events.Event] = []
     connection.bus.attach_event(events.LinkStalled, told.append)
     connection.bus.attach_event(events.LinkDrained, told.append)
@@ -227,9 +225,7 @@ async def test_a_connection_tells_that_its_link_stalls_and_that_it_drains(
     assert connection.unsent_bytes == 0
 
 
-async def test_an_order_in_a_stall_does_not_arrive_after_it(
-    radio: FaultyLink, connection: Connection
-) -> None:
+async def test_order_during_stall_does_not_arrive_later(radio: FaultyLink, connection: Connection) -> None:
     before = heard_by(radio).data
     radio.stall()
     connection.send(COMMAND)
@@ -240,7 +236,7 @@ async def test_an_order_in_a_stall_does_not_arrive_after_it(
     assert COMMAND.encode()[:20] not in heard_by(radio).data[len(before) :]
 
 
-async def test_an_order_that_is_taken_back_does_not_arrive(radio: FaultyLink, connection: Connection) -> None:
+async def test_discarded_order_does_not_arrive(radio: FaultyLink, connection: Connection) -> None:
     before = heard_by(radio).data
     radio.stall()
     connection.send(COMMAND)
@@ -251,9 +247,7 @@ async def test_an_order_that_is_taken_back_does_not_arrive(radio: FaultyLink, co
     assert heard_by(radio).data == before
 
 
-async def test_what_the_system_has_taken_is_told_and_arrives_late(
-    radio: FaultyLink, connection: Connection
-) -> None:
+async def test_kernel_data_is_reported_and_arrives_late(radio: FaultyLink, connection: Connection) -> None:
     before = heard_by(radio).data
     radio.stall(system_bytes=40)
     connection.send(COMMAND)
@@ -267,9 +261,7 @@ async def test_what_the_system_has_taken_is_told_and_arrives_late(
     assert connection.unsent_bytes == 0
 
 
-async def test_what_the_system_has_room_for_is_beyond_recall_to_the_byte(
-    radio: FaultyLink, connection: Connection
-) -> None:
+async def test_kernel_buffer_size_limits_undiscardable_data(radio: FaultyLink, connection: Connection) -> None:
     size = len(FrameEncoder(255, 190).encode(COMMAND))
     radio.stall(system_bytes=size)
     for _ in range(2):
@@ -279,7 +271,7 @@ async def test_what_the_system_has_room_for_is_beyond_recall_to_the_byte(
     assert connection.unsent_bytes == size
 
 
-async def test_a_reconnecting_link_passes_all_of_it_on(radio: FaultyLink) -> None:
+async def test_reconnecting_link_forwards_outbox_calls(radio: FaultyLink) -> None:
     async with open_connection(ReconnectingLink(lambda: radio)) as connection:
         told: list[events.Event] = []
         connection.bus.attach_event(events.LinkStalled, told.append)
@@ -294,7 +286,7 @@ async def test_a_reconnecting_link_passes_all_of_it_on(radio: FaultyLink) -> Non
         assert [type(each) for each in told] == [events.LinkStalled, events.LinkDrained]
 
 
-async def test_links_that_know_nothing_of_it_have_nothing_unsent() -> None:
+async def test_links_without_outbox_have_nothing_unsent() -> None:
     near, _ = memory_link_pair()
     assert Link.unsent_bytes.fget(near) == 0  # type: ignore[attr-defined]
     assert Link.dropped_writes == 0
@@ -347,7 +339,7 @@ async def fill(link: TcpConnect | SerialLink, frame: bytes) -> int:
 
 @on_linux
 @each_loop
-async def test_little_of_a_tcp_connection_that_stalls_is_beyond_recall(deaf: socket.socket) -> None:
+async def test_stalled_tcp_connection_has_little_undiscardable_data(deaf: socket.socket) -> None:
     client = TcpConnect(*deaf.getsockname())
     await client.open(Recorder())
     connection, _ = deaf.accept()
@@ -371,11 +363,9 @@ async def test_little_of_a_tcp_connection_that_stalls_is_beyond_recall(deaf: soc
 
 @on_linux
 @each_loop
-async def test_a_tcp_connection_that_does_not_drain_is_told_until_it_does(
-    deaf: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_tcp_stall_is_reported_until_it_drains(deaf: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "STALLED_AFTER_S", 0.0)
-    monkeypatch.setattr(outbox, "_LOOK_EVERY_S", 0.001)
+    monkeypatch.setattr(outbox, "_POLL_INTERVAL_S", 0.001)
     client, listener = TcpConnect(*deaf.getsockname()), Listener()
     await client.open(listener)
     connection, _ = deaf.accept()
@@ -392,11 +382,11 @@ async def test_a_tcp_connection_that_does_not_drain_is_told_until_it_does(
 
 @on_linux
 @each_loop
-async def test_a_stalled_tcp_connection_that_is_closed_takes_its_bytes_with_it(
+async def test_closing_a_stalled_tcp_connection_discards_its_bytes(
     deaf: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(outbox, "STALLED_AFTER_S", 0.0)
-    monkeypatch.setattr(outbox, "_LOOK_EVERY_S", 0.001)
+    monkeypatch.setattr(outbox, "_POLL_INTERVAL_S", 0.001)
     client, listener = TcpConnect(*deaf.getsockname()), Listener()
     await client.open(listener)
     connection, _ = deaf.accept()
@@ -413,7 +403,7 @@ async def test_a_stalled_tcp_connection_that_is_closed_takes_its_bytes_with_it(
 @on_linux
 @pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
 @each_loop
-async def test_what_waits_for_a_serial_line_can_be_taken_back() -> None:
+async def test_data_waiting_for_serial_line_can_be_discarded() -> None:
     with far_end() as far:
         link = SerialLink(far.device, 57600)
         await link.open(Recorder())

@@ -37,7 +37,7 @@ def test_addresses_of_pseudo_terminals() -> None:
 
 
 @posix_only
-def test_bytes_go_through_a_pseudo_terminal_unchanged() -> None:
+def test_bytes_pass_a_pseudo_terminal_unchanged() -> None:
     async def both_ways() -> None:
         link, heard = PtyLink(), Heard()
         await link.open(heard)
@@ -57,7 +57,7 @@ def test_bytes_go_through_a_pseudo_terminal_unchanged() -> None:
 
 
 @posix_only
-def test_what_nobody_reads_is_dropped_and_files_are_left_alone(tmp_path: Path) -> None:
+def test_unread_data_is_dropped_and_files_are_kept(tmp_path: Path) -> None:
     taken, dead = tmp_path / "taken", tmp_path / "dead"
     taken.write_text("precious")
     dead.symlink_to("/dev/pts/no-such")
@@ -82,7 +82,7 @@ def test_what_nobody_reads_is_dropped_and_files_are_left_alone(tmp_path: Path) -
 
 
 @posix_only
-def test_closed_the_loop_does_not_look_at_it_any_more() -> None:
+def test_closed_pty_is_not_polled() -> None:
     """Another file may have the number soon."""
 
     async def close() -> None:

@@ -1,4 +1,4 @@
-"""A link that comes back: when it is tried, what is told, and that nothing is left of it."""
+"""A reconnecting link: times of attempts, callbacks, and release of resources."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from aerokit.errors import (
 )
 from aerokit.transport import Peer, ReconnectingLink, Replay, create_link
 from aerokit.transport.link import BaseLink
-from aerokit.transport.reconnecting import STEADY_S
+from aerokit.transport.reconnecting import STABLE_AFTER_S
 
 pytestmark = pytest.mark.anyio
 
@@ -64,7 +64,7 @@ class Plug(BaseLink):
 
 
 class Device:
-    """What is at the other end of the cable."""
+    """The other end of the cable."""
 
     def __init__(self) -> None:
         self.is_there = True
@@ -83,7 +83,7 @@ class Device:
 
 
 class Told(Recorder):
-    """A receiver that wants to be told."""
+    """A receiver with interruption callbacks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -111,7 +111,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
 # ------------------------------------------------------------------------------ opening it the first time
 
 
-async def test_the_first_opening_is_that_of_the_link_itself() -> None:
+async def test_first_opening_behaves_as_the_link() -> None:
     device, heard = Device(), Told()
     device.is_there = False
     link = ReconnectingLink(device.plug)
@@ -136,7 +136,7 @@ async def test_the_first_opening_is_that_of_the_link_itself() -> None:
     assert (heard.told, device.written, link.dropped_writes) == (["hello"], [b"after"], 0)
 
 
-async def test_a_wrong_address_is_told_before_anything_is_opened() -> None:
+async def test_wrong_address_is_refused_before_opening() -> None:
     with pytest.raises(InvalidArgument):
         ReconnectingLink(lambda: create_link("nonsense"))
 
@@ -144,7 +144,7 @@ async def test_a_wrong_address_is_told_before_anything_is_opened() -> None:
 # -------------------------------------------------------------------------------------- losing it
 
 
-async def test_it_is_tried_more_and_more_rarely_until_it_is_back(caplog: pytest.LogCaptureFixture) -> None:
+async def test_retry_delays_grow_until_restored(caplog: pytest.LogCaptureFixture) -> None:
     device, heard = Device(), Told()
     link = ReconnectingLink(device.plug)
     await link.open(heard)
@@ -169,7 +169,7 @@ async def test_it_is_tried_more_and_more_rarely_until_it_is_back(caplog: pytest.
     assert device.written == [b"is anybody there?"]
     assert link.dropped_writes == 1
     lost, back = (
-        ("WARNING", "device: unplugged; trying to open it again"),
+        ("WARNING", "device: unplugged; reopening it"),
         ("INFO", "device is back after 26.4 s"),
     )
     assert lines(caplog) == [lost, back, lost]
@@ -177,7 +177,7 @@ async def test_it_is_tried_more_and_more_rarely_until_it_is_back(caplog: pytest.
     await link.wait_closed()
 
 
-async def test_what_the_links_dropped_is_counted_together() -> None:
+async def test_dropped_writes_of_all_links_are_added() -> None:
     device = Device()
     link = ReconnectingLink(device.plug)
     await link.open(Recorder())
@@ -194,12 +194,12 @@ async def test_what_the_links_dropped_is_counted_together() -> None:
     await link.wait_closed()
 
 
-async def test_one_that_is_open_and_says_nothing_is_back_after_a_while() -> None:
+async def test_silent_open_link_is_restored_after_a_while() -> None:
     device, heard = Device(), Told()
     link = ReconnectingLink(device.plug)
     await link.open(heard)
     device.unplug(gone=False)
-    await anyio.sleep(0.2 + STEADY_S - 0.01)
+    await anyio.sleep(0.2 + STABLE_AFTER_S - 0.01)
     assert link.is_away
     await anyio.sleep(0.02)
     assert heard.told[1:] == ["back after 1.2 s"]
@@ -207,7 +207,7 @@ async def test_one_that_is_open_and_says_nothing_is_back_after_a_while() -> None
     await link.wait_closed()
 
 
-async def test_a_server_that_takes_connections_only_to_close_them_is_still_away(
+async def test_server_that_closes_connections_stays_lost(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     device, heard = Device(), Told()
@@ -226,7 +226,7 @@ async def test_a_server_that_takes_connections_only_to_close_them_is_still_away(
     await link.wait_closed()
 
 
-async def test_bytes_may_come_before_it_is_open_and_it_may_be_lost_then() -> None:
+async def test_data_and_loss_before_open_returns() -> None:
     device, heard = Device(), Told()
     device.greeting = b"hello"
     link = ReconnectingLink(device.plug)
@@ -247,7 +247,7 @@ async def test_bytes_may_come_before_it_is_open_and_it_may_be_lost_then() -> Non
     await link.wait_closed()
 
 
-async def test_closed_by_who_is_told_that_it_is_away_it_stays_closed() -> None:
+async def test_link_closed_in_interruption_callback_stays_closed() -> None:
     class Leaving(Told):
         def link_interrupted(self, error: LinkLost) -> None:
             super().link_interrupted(error)
@@ -263,7 +263,7 @@ async def test_closed_by_who_is_told_that_it_is_away_it_stays_closed() -> None:
     assert heard.told == ["away: device: unplugged"]
 
 
-async def test_the_lost_one_is_gone_before_another_is_opened() -> None:
+async def test_lost_link_is_released_before_the_next_opens() -> None:
     """A serial port is not shared; not even with the link that had it before."""
     device = Device()
     device.releasing_takes_s = 0.7
@@ -280,9 +280,9 @@ async def test_the_lost_one_is_gone_before_another_is_opened() -> None:
     await link.wait_closed()
 
 
-async def test_a_receiver_that_does_not_want_to_be_told_is_not() -> None:
+async def test_receiver_without_interruption_callbacks() -> None:
     device, heard = Device(), Recorder()
-    link = ReconnectingLink(device.plug, first_delay_s=1, longest_delay_s=1)
+    link = ReconnectingLink(device.plug, min_delay_s=1, max_delay_s=1)
     await link.open(heard)
     device.unplug(gone=False)
     await anyio.sleep(1.1)
@@ -292,7 +292,7 @@ async def test_a_receiver_that_does_not_want_to_be_told_is_not() -> None:
     await link.wait_closed()
 
 
-async def test_peers_are_those_of_the_present_link() -> None:
+async def test_peers_are_of_the_current_link() -> None:
     device = Device()
     link = ReconnectingLink(device.plug)
     assert not link.has_peer(None)
@@ -307,7 +307,7 @@ async def test_peers_are_those_of_the_present_link() -> None:
 # ----------------------------------------------------------------------------- what cannot be mended
 
 
-async def test_the_end_of_a_recording_is_an_end(tmp_path: Path) -> None:
+async def test_end_of_recording_ends_the_link(tmp_path: Path) -> None:
     path = tmp_path / "empty.tlog"
     path.write_bytes(b"")
     heard = Told()
@@ -322,14 +322,14 @@ async def test_the_end_of_a_recording_is_an_end(tmp_path: Path) -> None:
     await link.wait_closed()
 
 
-async def test_links_that_cannot_be_made_any_more_are_an_end() -> None:
+async def test_failing_factory_ends_the_link() -> None:
     device, heard = Device(), Told()
     links: list[Callable[[], Plug]] = [device.plug]
     link = ReconnectingLink(lambda: links.pop()())
     await link.open(heard)
     device.unplug()
     error = await heard.until_lost()
-    assert str(error) == "device cannot be opened again: pop from empty list"
+    assert str(error) == "device cannot be reopened: pop from empty list"
     assert isinstance(error.__cause__, IndexError)
     link.close()
     await link.wait_closed()
@@ -361,12 +361,12 @@ async def lose_it_twice(heard: Told) -> None:
         assert not device.plugs or not device.plugs[-1]._receiver
 
 
-def test_cancelled_at_any_turn_of_the_loop_nothing_is_left() -> None:
+def test_cancelled_reconnect_leaves_nothing_behind() -> None:
     for turns in range(60):
         run_and_do(lambda: lose_it_twice(Told()), turns, lambda task: task.cancel())
 
 
-def test_closed_at_any_turn_of_the_loop_nothing_is_left() -> None:
+def test_closed_reconnect_leaves_nothing_behind() -> None:
     made: list[ReconnectingLink] = []
 
     async def program() -> None:
@@ -408,7 +408,7 @@ def test_closed_after_its_loop() -> None:
     link.close()
 
 
-async def test_a_link_that_is_opened_again_on_purpose() -> None:
+async def test_reopen_on_request() -> None:
     device, heard = Device(), Told()
     link = ReconnectingLink(device.plug)
     link.reopen()  # it is not open yet
@@ -423,7 +423,7 @@ async def test_a_link_that_is_opened_again_on_purpose() -> None:
     await link.wait_closed()
     assert len(device.plugs) == 2
     assert heard.told == [
-        "away: device was closed to be opened again",
+        "away: device was closed to be reopened",
         "back after 0.3 s",
         "hello",
     ]

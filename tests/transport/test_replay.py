@@ -32,7 +32,7 @@ def recording(folder: Path, times: Sequence[float]) -> Path:
 
 
 def replay_times(path: Path, speed: float | None) -> list[float]:
-    """When each frame came, on the loop's clock, and then when the end did."""
+    """Arrival time of each frame on the loop's clock, and of the end."""
 
     async def main() -> list[float]:
         loop, heard = asyncio.get_running_loop(), Recorder()
@@ -50,29 +50,29 @@ def replay_times(path: Path, speed: float | None) -> list[float]:
 
 
 @pytest.mark.parametrize("speed", [1.0, 2.0, 0.5])
-def test_frames_come_at_the_pace_of_the_recording(tmp_path: Path, speed: float) -> None:
+def test_frames_keep_the_recorded_pace(tmp_path: Path, speed: float) -> None:
     times = [0.0, 0.1, 0.1, 0.5, 2.0]
     came = replay_times(recording(tmp_path, times), speed)
     assert came == pytest.approx([when / speed for when in [*times, 2.0]], abs=1e-5)
 
 
 @pytest.mark.parametrize("speed", [None, math.inf])
-def test_as_fast_as_it_goes_takes_no_time_on_the_clock(tmp_path: Path, speed: float | None) -> None:
+def test_unlimited_speed_takes_no_time(tmp_path: Path, speed: float | None) -> None:
     assert set(replay_times(recording(tmp_path, range(300)), speed)) == {0.0}
 
 
-def test_long_silences_and_clocks_set_back_do_not_stop_the_replay(tmp_path: Path) -> None:
-    gap = replay.LONGEST_GAP_S
+def test_long_gaps_and_backward_clocks_do_not_stop_replay(tmp_path: Path) -> None:
+    gap = replay.MAX_GAP_S
     came = replay_times(recording(tmp_path, [0.0, 1.0, 1e6, 1e6 + 1, 50.0, 51.0]), 1.0)
     assert came[:-1] == pytest.approx([0.0, 1.0, 1.0 + gap, 2.0 + gap, 2.0 + gap, 3.0 + gap], abs=1e-5)
 
 
-def test_an_empty_recording_ends_at_once(tmp_path: Path) -> None:
+def test_empty_recording_ends_at_once(tmp_path: Path) -> None:
     assert replay_times(recording(tmp_path, []), 1.0) == [0.0]
 
 
 @each_loop
-async def test_others_get_their_turn_while_it_goes_as_fast_as_it_can(tmp_path: Path) -> None:
+async def test_other_tasks_run_during_fast_replay(tmp_path: Path) -> None:
     heard, loop, seen = Recorder(), asyncio.get_running_loop(), list[int]()
 
     def look() -> None:
@@ -85,12 +85,12 @@ async def test_others_get_their_turn_while_it_goes_as_fast_as_it_can(tmp_path: P
     look()
     await heard.until_lost()
     steps = [after - before for before, after in itertools.pairwise(seen)]
-    assert max(steps) <= replay.FRAMES_PER_TURN
+    assert max(steps) <= replay.MAX_FRAMES_PER_ITERATION
     assert len(heard.pieces) == link.frames == 1000
 
 
 @each_loop
-async def test_close_inside_a_callback_ends_all_callbacks(tmp_path: Path) -> None:
+async def test_replay_closed_inside_callback_delivers_nothing(tmp_path: Path) -> None:
     link, heard = Replay(recording(tmp_path, range(5)), None), Recorder()
     heard.at_each_piece = lambda data, peer: link.close()
     await link.open(heard)
@@ -102,7 +102,7 @@ async def test_close_inside_a_callback_ends_all_callbacks(tmp_path: Path) -> Non
 
 
 @each_loop
-async def test_closing_before_the_first_frame_closes_the_file(tmp_path: Path) -> None:
+async def test_closing_before_first_frame_closes_the_file(tmp_path: Path) -> None:
     link, heard = Replay(recording(tmp_path, range(5))), Recorder()
     await link.open(heard)
     link.close()
@@ -122,13 +122,13 @@ async def test_writes_are_ignored_and_counted(tmp_path: Path) -> None:
 
 
 @each_loop
-async def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+async def test_missing_file_is_an_error(tmp_path: Path) -> None:
     link = Replay(tmp_path / "no.tlog")
     with pytest.raises(LinkOpenError, match=r"cannot open replay:.*no\.tlog: No such file"):
         await link.open(Recorder())
 
 
-def test_a_file_that_fails_later_is_a_lost_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_failing_later_is_a_lost_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(path: object) -> object:
         yield START, frame(0)
         raise OSError(5, "Input/output error")
@@ -140,22 +140,22 @@ def test_a_file_that_fails_later_is_a_lost_link(tmp_path: Path, monkeypatch: pyt
         await Replay(tmp_path / "flight.tlog").open(heard)
         return str(await heard.until_lost())
 
-    assert "cannot be read on: Input/output error" in run_virtual(main())
+    assert "reading the recording failed: Input/output error" in run_virtual(main())
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
 def test_speed_must_be_above_zero(speed: float) -> None:
-    with pytest.raises(InvalidArgument, match="must be above 0"):
+    with pytest.raises(InvalidArgument, match="is not allowed: above 0"):
         Replay("flight.tlog", speed)
 
 
-def test_the_address_tells_the_speed() -> None:
+def test_address_has_the_speed() -> None:
     assert Replay("flight.tlog").address == "replay:flight.tlog"
     assert Replay("flight.tlog", 2.0).address == "replay:flight.tlog?speed=2"
     assert Replay("flight.tlog", None).address == "replay:flight.tlog?speed=inf"
 
 
-def test_closed_between_two_frames_it_waits_for_nothing_more(tmp_path: Path) -> None:
+def test_closed_between_frames_has_no_timer(tmp_path: Path) -> None:
     async def main() -> float:
         link = Replay(recording(tmp_path, [0.0, 1000.0]), 1.0)
         await link.open(Recorder())

@@ -11,7 +11,7 @@ from link_harness import Recorder, each_loop, eventually
 
 from aerokit.transport import ReconnectingLink, SerialLink, TcpConnect, TcpListen, UdpConnect, UdpListen
 
-SOON = {"first_delay_s": 0.01, "longest_delay_s": 0.05}
+SOON = {"min_delay_s": 0.01, "max_delay_s": 0.05}
 
 
 class Replugged(Recorder):
@@ -38,7 +38,7 @@ def plug_in(far: FarEnd, name: Path) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
 @each_loop
-async def test_a_serial_device_that_is_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
+async def test_serial_device_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
     name, heard = tmp_path / "ttyACM0", Replugged()
     link = ReconnectingLink(lambda: SerialLink(str(name), 115200), **SOON)
     with far_end() as first, far_end() as second:
@@ -78,7 +78,7 @@ async def test_closed_while_the_device_is_unplugged(tmp_path: Path) -> None:
 
 @each_loop
 @pytest.mark.parametrize("reset", [False, True], ids=["end of file", "reset"])
-async def test_a_server_that_closes_and_opens_again(reset: bool) -> None:
+async def test_server_closes_and_opens_again(reset: bool) -> None:
     clients, heard = Recorder(), Replugged()
     server = TcpListen("127.0.0.1", 0)
     await server.open(clients)
@@ -108,7 +108,7 @@ async def test_a_server_that_closes_and_opens_again(reset: bool) -> None:
 
 
 @each_loop
-async def test_a_client_that_has_gone_is_no_peer_any_more() -> None:
+async def test_disconnected_client_is_no_peer() -> None:
     heard, server = Recorder(), TcpListen("127.0.0.1", 0)
     await server.open(heard)
     client = TcpConnect("127.0.0.1", server.local_address[1])
@@ -124,7 +124,7 @@ async def test_a_client_that_has_gone_is_no_peer_any_more() -> None:
 
 
 @each_loop
-async def test_who_was_not_heard_is_no_peer() -> None:
+async def test_unknown_sender_is_no_peer() -> None:
     heard, listening = Recorder(), UdpListen("127.0.0.1", 0)
     await listening.open(heard)
     talking = UdpConnect("127.0.0.1", listening.local_address[1])

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-termina
 
 @each_loop
 @each_traffic
-async def test_bytes_go_both_ways(pieces: list[bytes]) -> None:
+async def test_serial_bytes_pass_both_ways(pieces: list[bytes]) -> None:
     with far_end() as far:
         far.reads()
         link, heard = SerialLink(far.device, 115200), Recorder()
@@ -50,7 +50,7 @@ async def test_unplugging_loses_the_link_once() -> None:
         await heard.until_data(b"last words")
         far.unplug()
         error = await heard.until_lost()
-        assert str(error).startswith(f"serial://{far.device}:57600: the device is gone: ")
+        assert str(error).startswith(f"serial://{far.device}:57600: the device failed: ")
         link.write(b"into the void")
         await link.wait_closed()
         link.close()
@@ -61,7 +61,7 @@ async def test_unplugging_loses_the_link_once() -> None:
 
 
 @each_loop
-async def test_unplugging_is_noticed_by_a_write_but_never_said_inside_it() -> None:
+async def test_unplugging_noticed_by_write_is_reported_later() -> None:
     with far_end() as far:
         link, heard = SerialLink(far.device), Recorder()
         await link.open(heard)
@@ -75,7 +75,7 @@ async def test_unplugging_is_noticed_by_a_write_but_never_said_inside_it() -> No
 
 
 @each_loop
-async def test_a_line_that_takes_nothing_costs_bounded_memory_and_never_blocks() -> None:
+async def test_full_line_uses_bounded_memory_and_never_blocks() -> None:
     with far_end() as far:
         link = SerialLink(far.device, 57600)
         await link.open(Recorder())
@@ -99,7 +99,7 @@ async def test_a_line_that_takes_nothing_costs_bounded_memory_and_never_blocks()
 
 
 @each_loop
-async def test_close_is_bounded_in_time_when_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_close_is_bounded_without_a_reader(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "LINGER_S", 0.03)
     with far_end() as far:
         link, heard = SerialLink(far.device, 57600), Recorder()
@@ -115,7 +115,7 @@ async def test_close_is_bounded_in_time_when_nobody_reads(monkeypatch: pytest.Mo
 
 
 @each_loop
-async def test_what_was_written_before_close_still_goes_out() -> None:
+async def test_data_written_before_close_is_sent() -> None:
     data = bytes(range(256)) * 40
     with far_end() as far:
         link = SerialLink(far.device, 57600)
@@ -145,7 +145,7 @@ async def test_no_callback_after_close() -> None:
 
 
 @each_loop
-async def test_closed_in_the_same_turn_as_opened() -> None:
+async def test_closed_in_the_iteration_of_opening() -> None:
     with far_end() as far:
         link = SerialLink(far.device)
         await link.open(Recorder())
@@ -155,7 +155,7 @@ async def test_closed_in_the_same_turn_as_opened() -> None:
 
 
 @each_loop
-async def test_a_port_is_not_shared_and_a_link_is_opened_once() -> None:
+async def test_port_is_exclusive_and_link_opens_once() -> None:
     with far_end() as far:
         first, second = SerialLink(far.device), SerialLink(far.device)
         await first.open(Recorder())
@@ -171,12 +171,10 @@ async def test_a_port_is_not_shared_and_a_link_is_opened_once() -> None:
 
 
 @each_loop
-async def test_a_missing_device_is_an_error_that_lists_the_ports() -> None:
+async def test_missing_device_error_lists_ports() -> None:
     link = SerialLink("/dev/ttyNoSuchPort", 57600)
     assert link.unsent_bytes == 0
-    with pytest.raises(
-        LinkOpenError, match=r"cannot open serial:///dev/ttyNoSuchPort:57600: .*serial port"
-    ) as caught:
+    with pytest.raises(LinkOpenError, match=r"cannot open serial:///dev/ttyNoSuchPort:57600: .*serial port") as caught:
         await link.open(Recorder())
     assert caught.value.errno == errno.ENOENT
     await link.wait_closed()
@@ -184,15 +182,15 @@ async def test_a_missing_device_is_an_error_that_lists_the_ports() -> None:
 
 
 @each_loop
-async def test_a_file_that_is_no_port_is_an_error_with_a_hint(tmp_path: Path) -> None:
+async def test_file_that_is_no_port_has_a_hint(tmp_path: Path) -> None:
     path = tmp_path / "flight"
     path.write_bytes(b"")
-    with pytest.raises(LinkOpenError, match="this is no serial port; to replay a recording"):
+    with pytest.raises(LinkOpenError, match="this is not a serial port; use replay:PATH to replay a recording"):
         await SerialLink(str(path)).open(Recorder())
 
 
 @each_loop
-async def test_a_missing_right_is_an_error_that_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_permission_error_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
     pyserial = importlib.import_module("serial")
 
     def refuse(*args: Any, **kwargs: Any) -> None:
@@ -207,7 +205,7 @@ def test_hardware_flow_control_is_in_the_address() -> None:
     assert SerialLink("COM3", 9600, rtscts=True).address == "serial://COM3:9600?rtscts=1"
 
 
-def test_close_works_without_a_running_loop() -> None:
+def test_serial_close_without_running_loop() -> None:
     with far_end() as far:
         loop = asyncio.new_event_loop()
         link, gone = SerialLink(far.device), SerialLink(far.device)
@@ -229,9 +227,7 @@ def test_pyserial_is_imported_only_when_a_port_is_opened() -> None:
 
 @each_loop
 @pytest.mark.parametrize("taken", [0, 1])
-async def test_a_byte_that_is_taken_out_of_a_serial_driver_is_a_write_less(
-    monkeypatch: pytest.MonkeyPatch, taken: int
-) -> None:
+async def test_bytes_cleared_from_driver_count_as_dropped_write(monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
     with far_end() as far:
         link = SerialLink(far.device, 57600)
         await link.open(Recorder())

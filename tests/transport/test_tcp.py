@@ -15,7 +15,7 @@ from link_harness import Recorder, each_loop, each_traffic, eventually
 from aerokit.errors import BusyError, ConnectionClosed, LinkOpenError
 from aerokit.testing import FaultyLink
 from aerokit.transport import Peer, ReconnectingLink, TcpConnect, TcpListen, tcp
-from aerokit.transport.sockets import Endpoint
+from aerokit.transport.sockets import SocketAddress
 
 HOSTS = pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 
@@ -45,7 +45,7 @@ async def connected(listener: TcpListen) -> AsyncIterator[tuple[TcpConnect, Reco
 @each_loop
 @each_traffic
 @HOSTS
-async def test_bytes_go_both_ways(host: str, pieces: list[bytes]) -> None:
+async def test_tcp_bytes_pass_both_ways(host: str, pieces: list[bytes]) -> None:
     async with listening(host) as (listener, heard), connected(listener) as (client, answered):
         for piece in pieces:
             client.write(piece)
@@ -61,7 +61,7 @@ async def test_bytes_go_both_ways(host: str, pieces: list[bytes]) -> None:
 
 
 @each_loop
-async def test_small_writes_go_out_at_once() -> None:
+async def test_small_writes_are_sent_at_once() -> None:
     async with listening() as (listener, heard), connected(listener) as (client, _):
         client.write(b"x")
         await heard.until_data(b"x")
@@ -72,7 +72,7 @@ async def test_small_writes_go_out_at_once() -> None:
 
 
 @each_loop
-async def test_several_clients_are_peers_and_losing_one_does_not_lose_the_link() -> None:
+async def test_losing_one_client_does_not_lose_the_link() -> None:
     async with listening() as (listener, heard):
         async with connected(listener) as (staying, staying_heard):
             staying.write(b"a")
@@ -95,7 +95,7 @@ async def test_several_clients_are_peers_and_losing_one_does_not_lose_the_link()
 
 
 @each_loop
-async def test_further_clients_are_turned_away(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_clients_beyond_the_limit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "MAX_CLIENTS", 1)
     async with listening() as (listener, heard), connected(listener) as (client, _):
         client.write(b"x")
@@ -105,14 +105,14 @@ async def test_further_clients_are_turned_away(monkeypatch: pytest.MonkeyPatch) 
 
 
 @each_loop
-async def test_the_servers_end_of_stream_loses_the_link_once() -> None:
+async def test_server_end_of_stream_loses_the_link_once() -> None:
     async with listening() as (listener, heard), connected(listener) as (client, answered):
         client.write(b"x")
         await heard.until_data(b"x")
         listener.write(b"goodbye")
         listener.close()
         error = await answered.until_lost()
-        assert str(error) == f"{client.address}: the other side closed the connection"
+        assert str(error) == f"{client.address}: the other end closed the connection"
         assert answered.data == b"goodbye"
         client.write(b"into the void")
         await client.wait_closed()
@@ -123,7 +123,7 @@ async def test_the_servers_end_of_stream_loses_the_link_once() -> None:
 
 
 @each_loop
-async def test_a_reset_is_a_lost_link_with_its_reason() -> None:
+async def test_reset_is_a_lost_link_with_reason() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         client, answered = TcpConnect(*server.getsockname()), Recorder()
         await client.open(answered)
@@ -137,7 +137,7 @@ async def test_a_reset_is_a_lost_link_with_its_reason() -> None:
 
 
 @each_loop
-async def test_an_error_that_has_no_number_tells_its_text() -> None:
+async def test_error_without_number_has_its_text() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         client, answered = TcpConnect(*server.getsockname()), Recorder()
         await client.open(answered)
@@ -148,7 +148,7 @@ async def test_an_error_that_has_no_number_tells_its_text() -> None:
 
 
 @each_loop
-async def test_a_peer_that_does_not_read_costs_bounded_memory_and_time(
+async def test_peer_that_does_not_read_costs_bounded_memory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tcp, "LINGER_S", 0.05)
@@ -173,7 +173,7 @@ async def test_a_peer_that_does_not_read_costs_bounded_memory_and_time(
 
 
 @each_loop
-async def test_what_is_written_to_a_connection_that_closes_is_counted_as_dropped() -> None:
+async def test_write_to_closing_connection_is_counted_as_dropped() -> None:
     async with listening() as (listener, heard), connected(listener) as (client, _):
         client.write(b"x")
         await heard.until_data(b"x")
@@ -186,7 +186,7 @@ async def test_what_is_written_to_a_connection_that_closes_is_counted_as_dropped
 
 
 @each_loop
-async def test_what_was_written_before_close_still_arrives() -> None:
+async def test_data_written_before_close_arrives() -> None:
     data = bytes(range(256)) * 4096
     async with listening() as (listener, heard), connected(listener) as (client, _):
         client.write(data)
@@ -197,7 +197,7 @@ async def test_what_was_written_before_close_still_arrives() -> None:
 
 
 @each_loop
-async def test_close_inside_a_callback_ends_all_callbacks() -> None:
+async def test_tcp_close_inside_callback_ends_all_callbacks() -> None:
     async with listening() as (listener, heard), connected(listener) as (client, answered):
         heard.at_each_piece = lambda data, peer: listener.close()
         client.write(b"first")
@@ -209,7 +209,7 @@ async def test_close_inside_a_callback_ends_all_callbacks() -> None:
 
 
 @each_loop
-async def test_nobody_listening_is_an_error_with_a_hint_and_can_be_tried_again() -> None:
+async def test_refused_connection_has_hint_and_can_be_retried() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
     client, answered = TcpConnect(*address), Recorder()
@@ -232,11 +232,11 @@ async def test_nobody_listening_is_an_error_with_a_hint_and_can_be_tried_again()
 @each_loop
 async def test_every_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        nobody = Endpoint(socket.AF_INET, server.getsockname())
+        nobody = SocketAddress(socket.AF_INET, server.getsockname())
     async with listening("::1") as (listener, heard):
-        somebody = Endpoint(socket.AF_INET6, listener.local_address)
+        somebody = SocketAddress(socket.AF_INET6, listener.local_address)
 
-        async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[Endpoint]:
+        async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketAddress]:
             return [nobody, somebody]
 
         monkeypatch.setattr(tcp, "resolve", resolve)
@@ -263,7 +263,7 @@ def deaf_server() -> Iterator[tuple[str, int]]:
 
 
 @each_loop
-async def test_connecting_is_bounded_in_time() -> None:
+async def test_connecting_has_a_timeout() -> None:
     with deaf_server() as address:
         client = TcpConnect(*address, connect_timeout_s=0.05)
         with pytest.raises(LinkOpenError, match=r"no answer within 0\.05 s") as caught:
@@ -274,7 +274,7 @@ async def test_connecting_is_bounded_in_time() -> None:
 
 
 @each_loop
-async def test_a_cancelled_connect_leaves_nothing_behind() -> None:
+async def test_cancelled_connect_leaves_nothing_behind() -> None:
     with deaf_server() as address:
         client = TcpConnect(*address)
         with anyio.move_on_after(0.01):
@@ -284,7 +284,7 @@ async def test_a_cancelled_connect_leaves_nothing_behind() -> None:
 
 
 @each_loop
-async def test_cancelled_at_any_turn_nothing_is_left_behind() -> None:
+async def test_cancelled_at_any_iteration_leaves_nothing_behind() -> None:
     async with listening() as (listener, _):
         for turns in range(10):
             for link in (TcpConnect(*listener.local_address), TcpListen("127.0.0.1", 0)):
@@ -303,7 +303,7 @@ async def test_cancelled_at_any_turn_nothing_is_left_behind() -> None:
 
 
 @each_loop
-async def test_a_client_that_comes_while_the_link_closes_is_closed_too() -> None:
+async def test_client_connecting_while_closing_is_closed() -> None:
     """The system had accepted it already."""
     async with listening() as (listener, heard):
         pass
@@ -320,7 +320,7 @@ async def test_a_client_that_comes_while_the_link_closes_is_closed_too() -> None
 
 @each_loop
 @pytest.mark.parametrize("turns", [0, 1, 3, 4, 5, 6])  # at 2 asyncio itself drops it, and says so
-async def test_a_client_that_the_loop_has_just_accepted_is_closed_with_the_link(turns: int) -> None:
+async def test_just_accepted_client_is_closed_with_the_link(turns: int) -> None:
     link = TcpListen("127.0.0.1", 0)
     await link.open(Recorder())
     before = len(asyncio.all_tasks())
@@ -336,17 +336,17 @@ async def test_a_client_that_the_loop_has_just_accepted_is_closed_with_the_link(
 
 
 @each_loop
-async def test_a_taken_port_is_an_error_with_a_hint() -> None:
+async def test_tcp_port_in_use_has_a_hint() -> None:
     async with listening() as (listener, _):
         second = TcpListen(*listener.local_address)
-        with pytest.raises(LinkOpenError, match="another program has this port") as caught:
+        with pytest.raises(LinkOpenError, match="another program uses this port") as caught:
             await second.open(Recorder())
         assert caught.value.errno == errno.EADDRINUSE
         second.close()
         await second.wait_closed()
 
 
-def test_close_works_without_a_running_loop() -> None:
+def test_tcp_close_without_running_loop() -> None:
     loop = asyncio.new_event_loop()
     listener, client = TcpListen("127.0.0.1", 0), TcpConnect("127.0.0.1", 0)
     loop.run_until_complete(listener.open(Recorder()))
@@ -362,7 +362,7 @@ def test_close_works_without_a_running_loop() -> None:
 
 
 class Listener(Recorder):
-    """Is told of clients that come and go."""
+    """Receiver that records connecting and disconnecting clients."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -377,7 +377,7 @@ class Listener(Recorder):
 
 @pytest.mark.parametrize("wrap", [lambda link: link, lambda link: ReconnectingLink(lambda: link), FaultyLink])
 @pytest.mark.anyio
-async def test_clients_are_told_of_before_they_say_anything(wrap: Callable[[Any], Any]) -> None:
+async def test_clients_are_reported_before_they_send(wrap: Callable[[Any], Any]) -> None:
     inner = TcpListen("127.0.0.1", 0)
     listener, server = Listener(), wrap(inner)
     await server.open(listener)
@@ -396,7 +396,7 @@ async def test_clients_are_told_of_before_they_say_anything(wrap: Callable[[Any]
 
 
 @pytest.mark.anyio
-async def test_what_one_client_does_not_take_is_not_the_others() -> None:
+async def test_unread_data_of_one_client_affects_no_other() -> None:
     listener, server = Listener(), TcpListen("127.0.0.1", 0)
     await server.open(listener)
     with socket.socket() as stalled:

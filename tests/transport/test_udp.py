@@ -52,7 +52,7 @@ def plain_socket(host: str = "127.0.0.1") -> Iterator[socket.socket]:
 @each_loop_and_the_fallback
 @each_traffic
 @HOSTS
-async def test_datagrams_go_both_ways(host: str, pieces: list[bytes]) -> None:
+async def test_datagrams_pass_both_ways(host: str, pieces: list[bytes]) -> None:
     listener, caller = UdpListen(host, 0), UdpConnect(host, 0)
     heard, answered = Recorder(), Recorder()
     await listener.open(heard)
@@ -75,7 +75,7 @@ async def test_datagrams_go_both_ways(host: str, pieces: list[bytes]) -> None:
 
 
 @each_loop_and_the_fallback
-async def test_a_listener_talks_to_everybody_it_heard() -> None:
+async def test_listener_writes_to_all_senders() -> None:
     listener, heard = UdpListen("127.0.0.1", 0), Recorder()
     await listener.open(heard)
     listener.write(b"nobody is there yet")
@@ -94,7 +94,7 @@ async def test_a_listener_talks_to_everybody_it_heard() -> None:
 
 
 @each_loop
-async def test_the_peer_unheard_for_longest_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_least_recent_peer_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "MAX_PEERS", 2)
     listener, heard = UdpListen("127.0.0.1", 0), Recorder()
     await listener.open(heard)
@@ -109,8 +109,8 @@ async def test_the_peer_unheard_for_longest_is_forgotten_first(monkeypatch: pyte
 
 
 @each_loop
-async def test_a_burst_is_read_in_bounded_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(udp, "DATAGRAMS_PER_WAKE_UP", 4)
+async def test_burst_is_read_in_bounded_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "MAX_BURST_DATAGRAMS", 4)
     listener, heard = UdpListen("127.0.0.1", 0), Recorder()
     await listener.open(heard)
     loop = asyncio.get_running_loop()
@@ -132,7 +132,7 @@ async def test_a_burst_is_read_in_bounded_turns(monkeypatch: pytest.MonkeyPatch)
 
 
 @each_loop_and_the_fallback
-async def test_a_closed_remote_port_does_not_lose_the_link() -> None:
+async def test_closed_remote_port_does_not_lose_the_link() -> None:
     with plain_socket() as sock:
         port = sock.getsockname()[1]
     caller, answered = UdpConnect("127.0.0.1", port), Recorder()
@@ -154,7 +154,7 @@ async def test_a_closed_remote_port_does_not_lose_the_link() -> None:
 
 
 @each_loop_and_the_fallback
-async def test_only_the_one_that_is_called_is_heard() -> None:
+async def test_udpout_receives_from_its_remote_only() -> None:
     with plain_socket() as vehicle, plain_socket() as stranger:
         caller, answered = UdpConnect("0.0.0.0", vehicle.getsockname()[1]), Recorder()
         await caller.open(answered)
@@ -169,7 +169,7 @@ async def test_only_the_one_that_is_called_is_heard() -> None:
 
 
 @each_loop
-async def test_what_the_system_will_not_take_is_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_unsendable_data_is_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     with plain_socket() as remote:
         caller = UdpConnect(*remote.getsockname())
         await caller.open(Recorder())
@@ -191,7 +191,7 @@ class FullSocket:
 
 
 @each_loop_and_the_fallback
-async def test_broadcast_talks_only_to_the_one_that_answers() -> None:
+async def test_broadcast_uses_only_the_peer_that_answers() -> None:
     broadcast, heard = UdpBroadcast("127.255.255.255", 14550), Recorder()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle, plain_socket() as other:
         vehicle.bind(("0.0.0.0", 0))
@@ -214,7 +214,7 @@ async def test_broadcast_talks_only_to_the_one_that_answers() -> None:
 
 
 @each_loop_and_the_fallback
-async def test_close_inside_a_callback_ends_all_callbacks() -> None:
+async def test_udp_close_inside_callback_ends_all_callbacks() -> None:
     listener, heard = UdpListen("127.0.0.1", 0), Recorder()
     await listener.open(heard)
     address = listener.local_address
@@ -233,12 +233,10 @@ async def test_close_inside_a_callback_ends_all_callbacks() -> None:
 
 
 @each_loop_and_the_fallback
-async def test_a_taken_port_is_an_error_with_a_hint_and_can_be_tried_again() -> None:
+async def test_udp_port_in_use_has_hint_and_can_be_retried() -> None:
     with plain_socket() as sock:
         listener = UdpListen(*sock.getsockname())
-        with pytest.raises(
-            LinkOpenError, match=r"udpin:127\.0\.0\.1:\d+: .*another program has this port"
-        ) as caught:
+        with pytest.raises(LinkOpenError, match=r"udpin:127\.0\.0\.1:\d+: .*another program uses this port") as caught:
             await listener.open(Recorder())
         assert caught.value.errno == errno.EADDRINUSE
         await listener.wait_closed()
@@ -255,13 +253,13 @@ async def test_a_taken_port_is_an_error_with_a_hint_and_can_be_tried_again() -> 
 @pytest.mark.parametrize(
     ("link", "hint"),
     [
-        (UdpListen("192.0.2.1", 14550), "this machine has no such address"),
-        (UdpConnect("no-such-host.invalid", 14550), "the host name is not known"),
+        (UdpListen("192.0.2.1", 14550), "this machine does not have this address"),
+        (UdpConnect("no-such-host.invalid", 14550), "unknown host name"),
         (UdpConnect("255.255.255.255", 14550), "udpbcast:"),
     ],
     ids=["foreign address", "unknown name", "broadcast"],
 )
-async def test_errors_of_opening_help(link: UdpListen | UdpConnect, hint: str) -> None:
+async def test_open_errors_have_hints(link: UdpListen | UdpConnect, hint: str) -> None:
     link = type(link)(link._host, link._port)
     with pytest.raises(LinkOpenError, match=hint):
         await link.open(Recorder())
@@ -269,7 +267,7 @@ async def test_errors_of_opening_help(link: UdpListen | UdpConnect, hint: str) -
 
 
 @each_loop_and_the_fallback
-async def test_a_cancelled_open_leaves_nothing_behind() -> None:
+async def test_cancelled_open_leaves_nothing_behind() -> None:
     for turns in range(12):
         listener = UdpListen("localhost", 0)
         task = asyncio.ensure_future(listener.open(Recorder()))
@@ -296,7 +294,7 @@ async def test_closed_while_opening() -> None:
     assert listener.local_address == ("", 0)
 
 
-def test_close_works_when_the_loop_is_not_running_or_gone() -> None:
+def test_close_works_without_a_running_loop() -> None:
     loop = asyncio.new_event_loop()
     stopped, gone = UdpListen("127.0.0.1", 0), UdpListen("127.0.0.1", 0)
     loop.run_until_complete(stopped.open(Recorder()))
@@ -308,7 +306,7 @@ def test_close_works_when_the_loop_is_not_running_or_gone() -> None:
 
 
 @pytest.mark.parametrize("kind", [UdpListen, UdpConnect, UdpBroadcast, TcpListen, TcpConnect])
-def test_a_peer_stays_the_same_host_whatever_its_port(kind: Any) -> None:
+def test_host_of_peer_ignores_its_port(kind: Any) -> None:
     link = kind("127.0.0.1", 14550)
     assert (link.host_of(("10.0.0.7", 14550)), link.host_of(None)) == ("10.0.0.7", None)
 
@@ -326,7 +324,7 @@ def test_a_peer_stays_the_same_host_whatever_its_port(kind: Any) -> None:
     ],
     ids=str,
 )
-async def test_only_what_does_not_pass_ends_a_udp_link(error: Exception, told: list[str]) -> None:
+async def test_only_permanent_errors_end_a_udp_link(error: Exception, told: list[str]) -> None:
     link, heard = UdpListen("127.0.0.1", 0), Recorder()
     await link.open(heard)
     udp._DatagramProtocol(link).error_received(error)
@@ -337,7 +335,7 @@ async def test_only_what_does_not_pass_ends_a_udp_link(error: Exception, told: l
 
 
 class Gatherer(Recorder):
-    """Is told when a burst is over."""
+    """Receiver that records the ends of bursts."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -349,20 +347,20 @@ class Gatherer(Recorder):
 
 @pytest.mark.parametrize("wrap", [lambda link: link, lambda link: ReconnectingLink(lambda: link)])
 @pytest.mark.anyio
-async def test_the_end_of_a_burst_is_told(wrap: Callable[[Any], Any]) -> None:
+async def test_end_of_burst_is_reported(wrap: Callable[[Any], Any]) -> None:
     inner, gatherer = UdpListen("127.0.0.1", 0), Gatherer()
     link = wrap(inner)
-    assert not link.tells_bursts
+    assert not link.reports_bursts
     await link.open(gatherer)
     sender = UdpConnect("127.0.0.1", inner.local_address[1])
     await sender.open(Recorder())
     for _ in range(3):
         sender.write(b"datagram")
     await eventually(lambda: len(gatherer.pieces) == 3)
-    assert link.tells_bursts
+    assert link.reports_bursts
     assert gatherer.bursts[-1] == 3
     assert len(gatherer.bursts) <= 3
     for each in (link, sender):
         each.close()
         await each.wait_closed()
-    assert not inner.tells_bursts
+    assert not inner.reports_bursts

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from link_harness import Recorder, each_loop
-from zenoh_harness import Told, client, reconnecting, serving
+from zenoh_harness import RefusalRecorder, client, reconnecting, serving
 from zenoh_network import VEHICLE_SIDE, HoldingProxy, eventually, free_port, process, router
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkOpenError
@@ -20,8 +20,8 @@ from aerokit.transport import create_link
 from aerokit.transport import link as needed
 from aerokit.transport.zenoh import listen as zenoh_listen
 from aerokit.transport.zenoh.keys import Stamp
-from aerokit.transport.zenoh.listen import MAX_CLIENTS, SILENT_AFTER_S, ZenohListen
-from aerokit.transport.zenoh.session import Handover
+from aerokit.transport.zenoh.listen import CLIENT_TIMEOUT_S, MAX_CLIENTS, ZenohListen
+from aerokit.transport.zenoh.session import LoopQueue
 
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
@@ -42,7 +42,7 @@ def frame(message: Message = ARM) -> bytes:
 
 
 @each_loop
-async def test_bytes_go_both_ways() -> None:
+async def test_zenoh_bytes_pass_both_ways() -> None:
     port = free_port()
     async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):
         frames = [frame(ParamRequestList(1, 1)) for _ in range(100)]
@@ -56,7 +56,7 @@ async def test_bytes_go_both_ways() -> None:
         vehicle.write(b"to all")
         await answered.until_data(b"".join(PIECES) + b"to all")
         assert answered.peers == [None]
-        assert link.helm is None
+        assert link.lease_holder is None
         vehicle.write(b"to nobody", "stranger")
         assert vehicle.dropped_writes == 1
         assert vehicle.has_peer("ground") > vehicle.has_peer("stranger")
@@ -64,7 +64,7 @@ async def test_bytes_go_both_ways() -> None:
     assert heard.losses == []
 
 
-async def test_only_whole_frames_of_a_client_reach_the_vehicle() -> None:
+async def test_only_complete_frames_of_a_client_pass() -> None:
     port = free_port()
     async with serving(port) as (_, heard), client(port) as (link, _told):
         link.write(b"noise")
@@ -74,7 +74,7 @@ async def test_only_whole_frames_of_a_client_reach_the_vehicle() -> None:
         assert heard.data == last
 
 
-async def test_the_end_of_the_vehicle_side_is_a_lost_link() -> None:
+async def test_closed_vehicle_side_is_a_lost_link() -> None:
     port = free_port()
     async with serving(port) as (vehicle, _), client(port) as (_link, answered):
         vehicle.close()
@@ -82,22 +82,20 @@ async def test_the_end_of_the_vehicle_side_is_a_lost_link() -> None:
         assert "the vehicle side was closed" in str(answered.losses[0])
 
 
-async def test_nobody_of_that_name() -> None:
+async def test_unknown_name() -> None:
     port = free_port()
     with router(port):
         async with serving(port, "beta", "connect"), serving(port, "gamma", "connect"):
-            with pytest.raises(LinkOpenError, match=r"nobody is called alpha .*there are: beta, gamma"):
+            with pytest.raises(LinkOpenError, match=r"no vehicle side named alpha .*available: beta, gamma"):
                 async with client(port, "&timeout=0.3"):
                     pass
-        with pytest.raises(LinkOpenError, match="nobody else either"):
+        with pytest.raises(LinkOpenError, match="the fleet is empty"):
             async with client(port, "&timeout=0.3"):
                 pass
 
 
 async def test_no_router() -> None:
-    with pytest.raises(
-        LinkOpenError, match=r"cannot open zenoh://north/alpha: nobody can be reached at tcp/127"
-    ):
+    with pytest.raises(LinkOpenError, match=r"cannot open zenoh://north/alpha: cannot connect to tcp/127"):
         async with client(free_port()):
             pass
     with pytest.raises(LinkOpenError, match="cannot open zenohin://north/alpha"):
@@ -105,7 +103,7 @@ async def test_no_router() -> None:
             pass
 
 
-async def test_a_port_that_is_taken() -> None:
+async def test_port_in_use() -> None:
     port = free_port()
     async with serving(port):
         with pytest.raises(LinkOpenError, match="cannot open zenohin://north/beta"):
@@ -113,7 +111,7 @@ async def test_a_port_that_is_taken() -> None:
                 pass
 
 
-async def test_a_name_that_is_taken() -> None:
+async def test_name_in_use() -> None:
     port = free_port()
     with router(port):
         async with serving(port, how="connect"):
@@ -124,7 +122,7 @@ async def test_a_name_that_is_taken() -> None:
             pass
 
 
-async def test_a_link_is_opened_once(tmp_path: Path) -> None:
+async def test_zenoh_link_is_opened_once(tmp_path: Path) -> None:
     port = free_port()
     async with serving(port) as (vehicle, _), client(port) as (link, _told):
         for each in (vehicle, link):
@@ -153,7 +151,7 @@ async def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 # ------------------------------------------------------------------------------------ broken connections
 
 
-async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
+async def test_orders_held_back_by_broken_connection_are_refused() -> None:
     port = free_port()
     async with serving(port) as (vehicle, heard), HoldingProxy(port) as line:  # noqa: SIM117 - the line's port
         async with client(line.port, "&client=ground") as (link, told):
@@ -167,9 +165,7 @@ async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
                 written += 1
                 await asyncio.sleep(0.02)
             assert line.held_bytes > 1000
-            await asyncio.sleep(
-                0.5
-            )  # until the youngest of them is too old: its stamp is one period older than it
+            await asyncio.sleep(0.5)  # until the youngest of them is too old: its stamp is one period older than it
             line.release()
             await eventually(lambda: vehicle.late_datagrams >= written - 1)
             assert heard.data == before  # not one of them
@@ -185,7 +181,7 @@ async def test_orders_that_a_broken_connection_kept_back_are_refused() -> None:
 
 
 @pytest.mark.exhaustive
-async def test_a_router_is_killed_and_comes_back() -> None:
+async def test_killed_router_returns() -> None:
     port = free_port()
     with router(port) as first:
         async with serving(port, how="connect") as (vehicle, heard), reconnecting(port) as (link, told):
@@ -205,7 +201,7 @@ async def test_a_router_is_killed_and_comes_back() -> None:
 
 
 @pytest.mark.exhaustive
-async def test_a_vehicle_side_is_killed_and_replaced() -> None:
+async def test_killed_vehicle_side_is_replaced() -> None:
     port = free_port()
     address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"
     with router(port), process(VEHICLE_SIDE, address) as first:
@@ -218,19 +214,19 @@ async def test_a_vehicle_side_is_killed_and_replaced() -> None:
                 await eventually(lambda: told.restored >= 1 and told.data != b"")
 
 
-async def test_a_late_joiner_finds_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not by the next beacon, which does not come."""
+async def test_late_client_finds_vehicle_side_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next beacon is disabled."""
     port = free_port()
     with router(port):
         async with serving(port, how="connect") as (vehicle, _):
-            monkeypatch.setattr(zenoh_listen, "BEACON_EVERY_S", 3600.0)
+            monkeypatch.setattr(zenoh_listen, "BEACON_INTERVAL_S", 3600.0)
             await asyncio.sleep(1.0)  # longer does no harm: the last beacon has gone
             async with client(port):
                 pass
             await eventually(lambda: vehicle.peers == ())
 
 
-# ------------------------------------------------------------------------------------ the helm
+# ---------------------------------------------------------------------------- the control lease
 
 
 async def test_two_programs_order_the_same_vehicle() -> None:
@@ -242,35 +238,35 @@ async def test_two_programs_order_the_same_vehicle() -> None:
             client(port, "&client=two") as (two, told),
         ):
             one.write(frame())
-            await eventually(lambda: vehicle.helm == "one" == two.helm)
+            await eventually(lambda: vehicle.lease_holder == "one" == two.lease_holder)
             heard.pieces.clear()
             two.write(frame())
             two.write(frame(SET_POINT))
             two.write(read := frame(ParamRequestList(1, 1)))
             await eventually(lambda: len(told.refused) == 2)
-            assert told.refused[0] == ("COMMAND_LONG", "one has the helm", "one")
+            assert told.refused[0] == ("COMMAND_LONG", "one has control", "one")
             assert len(told.answers[0]) == 2
             assert heard.data == read
             assert vehicle.refused_frames == 2 == two.dropped_writes
             one.close()
             await one.wait_closed()
-            await eventually(lambda: vehicle.helm is None)
+            await eventually(lambda: vehicle.lease_holder is None)
             two.write(frame())
-            await eventually(lambda: vehicle.helm == "two")
+            await eventually(lambda: vehicle.lease_holder == "two")
             async with (
-                client(port, "&client=three&helm=take") as (three, _),
-                client(port, "&helm=never") as (four, no),
+                client(port, "&client=three&control=take") as (three, _),
+                client(port, "&control=never") as (four, no),
             ):
-                await eventually(lambda: vehicle.helm == "three" == three.helm)
+                await eventually(lambda: vehicle.lease_holder == "three" == three.lease_holder)
                 four.write(frame())
                 await eventually(
-                    lambda: no.refused == [("COMMAND_LONG", "this link never orders (helm=never)", None)]
+                    lambda: no.refused == [("COMMAND_LONG", "this link is read-only (control=never)", None)]
                 )
                 two.write(frame())
-                await eventually(lambda: told.refused[-1] == ("COMMAND_LONG", "three has the helm", "three"))
+                await eventually(lambda: told.refused[-1] == ("COMMAND_LONG", "three has control", "three"))
 
 
-async def test_who_may_see_and_who_may_order_is_the_routers_to_say(tmp_path: Path) -> None:
+async def test_router_restricts_reading_and_ordering(tmp_path: Path) -> None:
     """The configuration of docs/network.md."""
     port = free_port()
     page = (Path(__file__).parents[2] / "docs" / "network.md").read_text(encoding="utf-8")
@@ -280,9 +276,7 @@ async def test_who_may_see_and_who_may_order_is_the_routers_to_say(tmp_path: Pat
     assert config.count("tcp/0.0.0.0:7447") == config.count("/etc/zenoh/users.txt") == 1
     files["router"] = tmp_path / "router.json5"
     files["router"].write_text(
-        config.replace("tcp/0.0.0.0:7447", f"tcp/127.0.0.1:{port}").replace(
-            "/etc/zenoh/users.txt", str(users)
-        )
+        config.replace("tcp/0.0.0.0:7447", f"tcp/127.0.0.1:{port}").replace("/etc/zenoh/users.txt", str(users))
     )
     for user, password in (("alpha", "a"), ("ground-1", "g"), ("onlooker", "o")):
         files[user] = tmp_path / f"{user}.json5"
@@ -294,11 +288,10 @@ async def test_who_may_see_and_who_may_order_is_the_routers_to_say(tmp_path: Pat
     with router(port, str(files["router"])):
         vehicle, heard = create_link(f"zenohin://north/alpha?config={files['alpha']}"), Recorder()
         pilot, onlooker = (
-            create_link(f"zenoh://north/alpha?client={name}&config={files[name]}")
-            for name in ("ground-1", "onlooker")
+            create_link(f"zenoh://north/alpha?client={name}&config={files[name]}") for name in ("ground-1", "onlooker")
         )
         liar = create_link(f"zenohin://north/beta?config={files['ground-1']}")
-        seen, told = Told(), Told()
+        seen, told = RefusalRecorder(), RefusalRecorder()
         opened = ((vehicle, heard), (pilot, told), (onlooker, seen), (liar, Recorder()))
         for link, receiver in opened:
             await link.open(receiver)
@@ -310,10 +303,8 @@ async def test_who_may_see_and_who_may_order_is_the_routers_to_say(tmp_path: Pat
         pilot.write(order := frame())
         await heard.until_data(order)
         assert heard.peers == ["ground-1"]
-        with pytest.raises(
-            LinkOpenError, match=r"nobody is called beta in the fleet north \(there are: alpha\)"
-        ):
-            await create_link(f"zenoh://north/beta?timeout=0.3&config={files['onlooker']}").open(Told())
+        with pytest.raises(LinkOpenError, match=r"no vehicle side named beta in the fleet north \(available: alpha\)"):
+            await create_link(f"zenoh://north/beta?timeout=0.3&config={files['onlooker']}").open(RefusalRecorder())
         for link, _ in opened:
             link.close()
         for link, _ in opened:
@@ -329,7 +320,7 @@ def what_is_left() -> tuple[int, int]:
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="Linux counts files")
-async def test_nothing_is_left() -> None:
+async def test_closed_links_leave_nothing() -> None:
     async def once() -> None:
         port = free_port()
         async with serving(port) as (vehicle, heard), client(port) as (link, answered):
@@ -349,7 +340,7 @@ async def test_nothing_is_left() -> None:
 
 
 @pytest.mark.parametrize("after_s", [0, 0.001, 0.005, 0.02, 0.3])
-async def test_given_up_while_it_is_being_opened(after_s: float) -> None:
+async def test_cancelled_while_opening(after_s: float) -> None:
     port = free_port()
     link = create_link(f"zenoh://north/alpha?listen=tcp/127.0.0.1:{port}&timeout=5")
     opening = asyncio.get_running_loop().create_task(link.open(Recorder()))
@@ -360,7 +351,7 @@ async def test_given_up_while_it_is_being_opened(after_s: float) -> None:
     link.close()
     await link.wait_closed()
 
-    def is_free() -> bool:
+    def is_port_free() -> bool:
         import socket
 
         with socket.socket() as sock:
@@ -371,32 +362,32 @@ async def test_given_up_while_it_is_being_opened(after_s: float) -> None:
                 return False
             return True
 
-    await eventually(is_free)
+    await eventually(is_port_free)
 
 
-async def test_a_slow_loop_costs_no_memory() -> None:
+async def test_slow_loop_costs_bounded_memory() -> None:
     taken: list[int] = []
-    handover: Handover[int] = Handover(taken.append, most=100)
+    queue: LoopQueue[int] = LoopQueue(taken.append, limit=100)
 
     def post() -> None:
         for number in range(10_000):
-            handover.post(number)
+            queue.post(number)
 
     thread = threading.Thread(target=post)
     thread.start()
     thread.join()  # the loop does not come round
-    assert handover.dropped == 9_900
+    assert queue.dropped == 9_900
     await eventually(lambda: len(taken) == 100)
     assert taken == list(range(9_900, 10_000))
-    handover.post(1)
-    handover.close()
-    handover.post(2)
+    queue.post(1)
+    queue.close()
+    queue.post(2)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert len(taken) == 100
 
 
-async def test_a_handover_goes_on_after_a_mistake() -> None:
+async def test_loop_queue_continues_after_exception() -> None:
     taken: list[int] = []
 
     def take(number: int) -> None:
@@ -406,50 +397,50 @@ async def test_a_handover_goes_on_after_a_mistake() -> None:
 
     mistakes: list[Any] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: mistakes.append(context))
-    handover: Handover[int] = Handover(take)
+    queue: LoopQueue[int] = LoopQueue(take)
     for number in range(600):
-        handover.post(number)
+        queue.post(number)
     await eventually(lambda: len(taken) == 599)
     assert len(mistakes) == 1
 
 
-def test_the_told_of_the_harness_is_a_listener() -> None:
-    from aerokit.transport import HelmListener
+def test_recorder_of_harness_is_a_refusal_listener() -> None:
+    from aerokit.transport import OrderRefusalListener
 
-    assert isinstance(Told, type)
-    assert issubclass(Told, HelmListener)
+    assert isinstance(RefusalRecorder, type)
+    assert issubclass(RefusalRecorder, OrderRefusalListener)
     assert frame(Heartbeat(6, 8, 0, 0, 4, 3))
 
 
-async def test_names_that_only_put_something_keep_nobody_away(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_foreign_keys_do_not_block_clients(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client is greeted by its token; whoever just puts on its key is forgotten when there is no room."""
     link, now = ZenohListen("north", "alpha"), 100.0
     monkeypatch.setattr(link, "_now", lambda: now)
     for number in range(MAX_CLIENTS):
-        link._hear(f"noise-{number}", b"", b"")
+        link._on_datagram(f"noise-{number}", b"", b"")
     assert len(link.peers) == MAX_CLIENTS
-    assert link._come("ground-1") is None
-    now += SILENT_AFTER_S + 1
-    link._hear("noise-7", b"", b"")
-    assert link._come("ground-1") is not None
+    assert link._add_client("ground-1") is None
+    now += CLIENT_TIMEOUT_S + 1
+    link._on_datagram("noise-7", b"", b"")
+    assert link._add_client("ground-1") is not None
     assert len(link.peers) == MAX_CLIENTS
     assert "noise-7" in link.peers
 
 
-async def test_a_datagram_that_comes_twice_reaches_the_vehicle_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_duplicated_datagram_reaches_vehicle_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Doubled on its way, or replayed by somebody on the network: an order is carried out once, and in order."""
     link, taken = ZenohListen("north", "alpha"), list[bytes]()
     monkeypatch.setattr(link, "_now", lambda: 100.0)
     monkeypatch.setattr(link, "_deliver", lambda data, peer: taken.append(data))
-    epoch = link._judge.beacon(100.0).epoch
+    epoch = link._freshness.beacon(100.0).epoch
     orders = [frame(ParamRequestList(1, 1)) for _ in range(3)]
     for sequence in (1, 1, 3, 2, 3):
-        link._hear("ground", orders[sequence - 1], Stamp(epoch, 1, 7, sequence).encode())
+        link._on_datagram("ground", orders[sequence - 1], Stamp(epoch, 1, 7, sequence).encode())
     assert taken == [orders[0], orders[2]]
-    assert (link._judge.doubled, link.late_datagrams) == (3, 0)
+    assert (link._freshness.duplicates, link.late_datagrams) == (3, 0)
 
 
-async def test_what_is_larger_than_a_datagram_is_not_listened_to() -> None:
+async def test_payload_larger_than_datagram_is_ignored() -> None:
     """On either side: nobody who may publish on the network fills the other's memory or keeps its loop busy."""
     port = free_port()
     async with serving(port) as (vehicle, heard), client(port, "&client=ground") as (link, answered):

@@ -114,7 +114,7 @@ class Program:
         return self.line()
 
 
-def test_a_cable_is_pulled_out(machines: tuple[str, str]) -> None:
+def test_unplugged_cable(machines: tuple[str, str]) -> None:
     one, two = machines
     with Program(one, VEHICLE) as vehicle, Program(two, CLIENT) as client:
         assert client.ask("until sent") == "done"

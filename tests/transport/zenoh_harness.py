@@ -9,11 +9,11 @@ from link_harness import Recorder
 
 from aerokit.transport import ReconnectingLink, ZenohConnect, ZenohListen, create_link
 
-__all__ = ["Told", "client", "reconnecting", "serving"]
+__all__ = ["RefusalRecorder", "client", "reconnecting", "serving"]
 
 
-class Told(Recorder):
-    """A receiver that is told of refused orders, and of interruptions."""
+class RefusalRecorder(Recorder):
+    """A receiver that records refused orders and interruptions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -22,8 +22,8 @@ class Told(Recorder):
         self.interruptions = 0
         self.restored = 0
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
-        self.refused.append((message, reason, helm))
+    def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
+        self.refused.append((message, reason, lease_holder))
         self.answers.append(answers)
 
     def link_interrupted(self, error: Exception) -> None:
@@ -34,9 +34,7 @@ class Told(Recorder):
 
 
 @contextlib.asynccontextmanager
-async def serving(
-    port: int, name: str = "alpha", how: str = "listen"
-) -> AsyncIterator[tuple[ZenohListen, Recorder]]:
+async def serving(port: int, name: str = "alpha", how: str = "listen") -> AsyncIterator[tuple[ZenohListen, Recorder]]:
     """A vehicle side that listens on a port, or connects to it."""
     link = create_link(f"zenohin://north/{name}?{how}=tcp/127.0.0.1:{port}")
     assert isinstance(link, ZenohListen)
@@ -52,11 +50,11 @@ async def serving(
 @contextlib.asynccontextmanager
 async def client(
     port: int, more: str = "", *, name: str = "alpha"
-) -> AsyncIterator[tuple[ZenohConnect, Told]]:
+) -> AsyncIterator[tuple[ZenohConnect, RefusalRecorder]]:
     """A client that connects to a port."""
     link = create_link(f"zenoh://north/{name}?connect=tcp/127.0.0.1:{port}{more}")
     assert isinstance(link, ZenohConnect)
-    answered = Told()
+    answered = RefusalRecorder()
     await link.open(answered)
     try:
         yield link, answered
@@ -66,10 +64,10 @@ async def client(
 
 
 @contextlib.asynccontextmanager
-async def reconnecting(port: int) -> AsyncIterator[tuple[ReconnectingLink, Told]]:
+async def reconnecting(port: int) -> AsyncIterator[tuple[ReconnectingLink, RefusalRecorder]]:
     """The same, opened again when it is lost."""
     address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&timeout=1"
-    link, answered = ReconnectingLink(lambda: create_link(address), longest_delay_s=0.4), Told()
+    link, answered = ReconnectingLink(lambda: create_link(address), max_delay_s=0.4), RefusalRecorder()
     await link.open(answered)
     try:
         yield link, answered

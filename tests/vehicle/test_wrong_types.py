@@ -45,18 +45,18 @@ USED_BY_THE_LIBRARY = {
         "check_types",
         "close",
         "counts",
-        "describe_signatures",
+        "describe_signature_problems",
         "fail",
-        "heard_at",
+        "last_heartbeat_at",
     }
-    | {"on_end", "record", "tap", "tap_sent", "order_refused"}
-    | {"one_link_changed", "one_link_not_opened", "one_link_stalled"},
+    | {"on_end", "record", "observe_frames", "observe_sent_frames", "order_refused"}
+    | {"member_link_changed", "member_link_open_failed", "member_link_stalled"},
 }
-"""Nobody else calls them."""
+"""Only called by the library itself."""
 
 
 async def misuse_it(misuse: Misuse) -> BaseException | None:
-    """What it raises; it is given no time to do anything."""
+    """Return the exception of a misuse; the call gets no time to act."""
     error: BaseException | None = None
     with anyio.move_on_after(1.0):
         try:
@@ -83,13 +83,11 @@ async def quiet_flight() -> AsyncIterator[Flight]:
 
 
 @pytest.mark.parametrize("owner", OWNERS)
-async def test_nothing_is_done(owner: str) -> None:
+async def test_connection_unused_does_nothing(owner: str) -> None:
     async with quiet_flight() as flight:
         mode = flight.copter.mode.number
         wrong = []
-        for misuse in misuses(
-            OWNERS[owner](flight.vehicle), leave_out=USED_BY_THE_LIBRARY.get(owner, frozenset())
-        ):
+        for misuse in misuses(OWNERS[owner](flight.vehicle), leave_out=USED_BY_THE_LIBRARY.get(owner, frozenset())):
             error = await misuse_it(misuse)
             wrong.append(refusal_of(misuse, error))
         assert not (found := list(filter(None, wrong))), "\n".join(found)
@@ -100,10 +98,8 @@ async def test_nothing_is_done(owner: str) -> None:
 
 
 @pytest.mark.parametrize("function", [aerokit.connect, aerokit.open_connection])
-async def test_nothing_is_opened(function: Callable[..., Any]) -> None:
-    wrong = [
-        refusal_of(misuse, await misuse_it(misuse)) for misuse in misuses_of(function, function.__name__)
-    ]
+async def test_connect_invalid_arguments_opens_nothing(function: Callable[..., Any]) -> None:
+    wrong = [refusal_of(misuse, await misuse_it(misuse)) for misuse in misuses_of(function, function.__name__)]
     assert not (found := list(filter(None, wrong))), "\n".join(found)
 
 
@@ -117,7 +113,7 @@ async def test_values_of_parameters(values: Any) -> None:
         assert [message for _, message in flight.wire.sent if not isinstance(message, m.Heartbeat)] == []
 
 
-async def test_a_time_that_no_clock_has() -> None:
+async def test_invalid_system_time_is_unknown() -> None:
     async with quiet_flight() as flight:
         with pytest.raises(InvalidArgument, match=r"timeout = .* is not allowed: seconds above 0"):
             await flight.vehicle.set_mode("LOITER", timeout=10**400)

@@ -1,12 +1,12 @@
-"""``checks_arguments``: public methods refuse an argument of a wrong type before they do anything.
+"""Run-time checks of arguments: public methods reject values of a wrong type before they do anything.
 
-Only what leads to a vehicle, a network or a link is checked: values come from keyboards, files and JSON, programs run
-without a type checker, and a wrong one must not stop an order half-way. Nor do type checkers see an empty time-out or
-a text where several names are meant. Reading logs, arithmetic with places and the like have Python's own errors.
+Only calls that lead to a vehicle, a network or a link are checked, because a wrong value must not stop a command
+half-way. Values come from keyboards, files and JSON, and many programs run without a type checker. Type checkers also
+accept a timeout of 0, or one string where several names are expected. Other functions raise Python's own errors.
 
-What is allowed is what the annotations say; they are read as text, so that nothing is imported for it. A class of ours
-is known by its name, callables, mappings and iterables by what they can do. What is called a time by its name is above
-zero. Other ranges, and whatever else a method knows better, are its own business.
+The annotations define what is allowed. They are evaluated as text, so that nothing is imported for it: classes of this
+package are compared by name; callables, mappings and iterables by their abilities. Parameters whose names denote a time
+must be above zero. Methods check other ranges themselves.
 """
 
 from __future__ import annotations
@@ -20,20 +20,15 @@ from numbers import Integral, Real
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from aerokit._internal.wording import one, shown
+from aerokit._internal.formatting import short_repr, with_article
 from aerokit.errors import InvalidArgument, LinkOpenError
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-
 ClassT = TypeVar("ClassT")
 
+# A check, and a check with a description of what is allowed.
 Check = Callable[[Any], bool]
-"""Whether a value is allowed."""
-
 Rule = tuple[Check, str]
-"""The same, and what is allowed in words."""
-
-_TEXTS = (str, bytes, bytearray)
 
 _SIMPLE: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
@@ -44,7 +39,7 @@ _SIMPLE: dict[str, Rule] = {
     "None": (lambda value: value is None, "None"),
     "Callable": (callable, "a function"),
     "OnProgress": (callable, "a function"),
-    "Peers": (lambda _: True, "addresses and networks"),  # links know better, and say so
+    "PeerFilter": (lambda _: True, "addresses and networks"),  # checked by the links, with a better message
     "PathLike": (lambda value: isinstance(value, os.PathLike), "a path"),
 }
 
@@ -63,7 +58,7 @@ _SECONDS: dict[str, Rule] = {
 
 
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
-    """Have all public methods of a class check their arguments; InvalidArgument names the first wrong one."""
+    """Class decorator: all public methods check their arguments and raise InvalidArgument for the first invalid one."""
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):
             setattr(cls, name, checked(member, times_are_above_zero=True))
@@ -71,54 +66,54 @@ def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
 
 
 def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> FunctionT:
-    """The same of one function or method; a time of zero may mean there: do not wait."""
+    """Function decorator: check the arguments. By default a time may be zero, which often means not to wait."""
     rules = _Rules(inspect.unwrap(function), times_are_above_zero)
     if inspect.iscoroutinefunction(function):
 
         @wraps(function)
-        async def awaiting(*args: Any, **kwargs: Any) -> Any:
+        async def checked_async(*args: Any, **kwargs: Any) -> Any:
             rules.check(args, kwargs)
             return await function(*args, **kwargs)
 
-        return awaiting  # type: ignore[return-value]  # of the same signature
+        return checked_async  # type: ignore[return-value]  # same signature
 
     @wraps(function)
-    def calling(*args: Any, **kwargs: Any) -> Any:
+    def checked_sync(*args: Any, **kwargs: Any) -> Any:
         rules.check(args, kwargs)
         try:
             return function(*args, **kwargs)
-        except LinkOpenError as error:  # where in here it came from says nothing to a program
+        except LinkOpenError as error:  # the traceback inside this library does not help a user
             raise error.with_traceback(None) from error.__cause__
 
-    return calling  # type: ignore[return-value]  # the same
+    return checked_sync  # type: ignore[return-value]  # same signature
 
 
 class _Rules:
-    """What the arguments of one function may be; worked out at its first call."""
+    """Rules for the arguments of one function, computed at its first call."""
 
     def __init__(self, function: Callable[..., Any], times_are_above_zero: bool) -> None:
         self._function, self._times_are_above_zero = function, times_are_above_zero
         self._by_name: dict[str, Rule] | None = None
-        self._in_order: tuple[str, ...] = ()
-        self._rest = ""
+        self._positional: tuple[str, ...] = ()
+        self._var_positional = ""
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         rules = self._read() if self._by_name is None else self._by_name
-        for name, value in zip(self._in_order, args):  # noqa: B905 - too many of them are Python's to refuse
+        for name, value in zip(self._positional, args):  # noqa: B905 - Python rejects surplus arguments itself
             if name in rules:
-                _complain_unless(rules[name], name, value)
-        if self._rest:
-            for value in args[len(self._in_order) :]:
-                _complain_unless(rules[self._rest], self._rest, value)
+                _check_value(rules[name], name, value)
+        if self._var_positional:
+            for value in args[len(self._positional) :]:
+                _check_value(rules[self._var_positional], self._var_positional, value)
         for name, value in kwargs.items():
             if name in rules:
-                _complain_unless(rules[name], name, value)
+                _check_value(rules[name], name, value)
 
     def _read(self) -> dict[str, Rule]:
         parameters = inspect.signature(self._function).parameters.values()
-        rules = {each.name: self._rule(each) for each in parameters if each.annotation is not each.empty}
-        self._in_order = tuple(each.name for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD)
-        self._rest = next((each.name for each in parameters if each.kind is each.VAR_POSITIONAL), "")
+        rules = {p.name: self._rule(p) for p in parameters if p.annotation is not p.empty}
+        self._positional = tuple(p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD)
+        self._var_positional = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
         self._by_name = rules
         return rules
 
@@ -129,23 +124,24 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    """Seconds to wait, by its name: not metres or degrees a second."""
+    """Return True if the name denotes seconds, rather than metres or degrees per second."""
     name, is_speed = parameter.name, parameter.name.endswith(("m_s", "deg_s"))
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
-def _complain_unless(rule: Rule, name: str, value: object) -> None:
+def _check_value(rule: Rule, name: str, value: object) -> None:
     check, allowed = rule
     if not check(value):
-        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: {allowed}")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {allowed}")
 
 
 # ------------------------------------------------------------------------------------- annotations
+
+
 def _rule(node: ast.expr, names: Mapping[str, Any]) -> Rule:
-    """What an annotation allows, and that in words."""
     if isinstance(node, ast.BinOp):
-        (one, first), (other, second) = _rule(node.left, names), _rule(node.right, names)
-        return (lambda value: one(value) or other(value)), f"{first} or {second}"
+        (is_left, left), (is_right, right) = _rule(node.left, names), _rule(node.right, names)
+        return (lambda value: is_left(value) or is_right(value)), f"{left} or {right}"
     if isinstance(node, ast.Constant):
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):
@@ -162,16 +158,16 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
         return _SIMPLE[name]
     found = names.get(name)
     if isinstance(found, type):
-        return (lambda value: isinstance(value, found)), one(name)
+        return (lambda value: isinstance(value, found)), with_article(name)
     if get_origin(found) is Literal:
         choices = get_args(found)
         return partial(_is_one_of, choices), f"one of {', '.join(map(str, choices))}"
     if isinstance(found, UnionType):
-        kinds = tuple(get_origin(each) or each for each in get_args(found))
-        return (lambda value: isinstance(value, kinds)), " or ".join(each.__name__ for each in kinds)
+        kinds = tuple(get_origin(kind) or kind for kind in get_args(found))
+        return (lambda value: isinstance(value, kinds)), " or ".join(kind.__name__ for kind in kinds)
     if name in ("Any", "object") or isinstance(found, TypeVar):
-        return _anything, "anything"
-    return partial(_is_ours, name), one(name)
+        return (lambda _: True), "anything"
+    return partial(_has_class_name, name), with_article(name)
 
 
 def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
@@ -183,15 +179,15 @@ def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
         kinds = _class_names(_name_of(parts[0]), names)
         return partial(_is_class, kinds), f"a class{' of ' if kinds else ''}{' or '.join(kinds)}"
     if name == "Mapping":
-        (of_keys, _), (of_values, words) = rules
-        return partial(_is_mapping, of_keys, of_values), f"a mapping to {words} each"
+        (is_key, _), (is_value, description) = rules
+        return partial(_is_mapping, is_key, is_value), f"a mapping to {description} each"
     if name in ("Iterable", "Sequence", "list", "tuple"):
-        return partial(_are, rules[0][0]), f"several, each {rules[0][1]}"
-    return partial(_is_ours, name), one(name)
+        return partial(_are_items, rules[0][0]), f"several, each {rules[0][1]}"
+    return partial(_has_class_name, name), with_article(name)
 
 
 def _class_names(name: str, names: Mapping[str, Any]) -> tuple[str, ...]:
-    """What a ``type[name]`` is a class of; nothing when any class will do."""
+    """Return the names of the classes that ``type[name]`` allows; empty if it allows any class."""
     found = names.get(name)
     if not isinstance(found, TypeVar):
         return () if name == "Any" else (name,)
@@ -201,45 +197,41 @@ def _class_names(name: str, names: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(bound.__forward_arg__.split(" | "))
 
 
-def _anything(_value: object) -> bool:
-    return True
-
-
 def _is_one_of(choices: tuple[object, ...], value: object) -> bool:
     return isinstance(value, type(choices[0])) and value in choices
 
 
-def _is_ours(name: str, value: object) -> bool:
-    return any(each.__name__ == name for each in type(value).__mro__)
+def _has_class_name(name: str, value: object) -> bool:
+    return any(cls.__name__ == name for cls in type(value).__mro__)
 
 
 def _is_class(names: tuple[str, ...], value: object) -> bool:
-    return isinstance(value, type) and (not names or any(each.__name__ in names for each in value.__mro__))
+    return isinstance(value, type) and (not names or any(cls.__name__ in names for cls in value.__mro__))
 
 
-def _is_mapping(of_keys: Check, of_values: Check, value: object) -> bool:
-    return isinstance(value, Mapping) and all(of_keys(key) and of_values(value[key]) for key in value)
+def _is_mapping(is_key: Check, is_value: Check, value: object) -> bool:
+    return isinstance(value, Mapping) and all(is_key(key) and is_value(value[key]) for key in value)
 
 
-def _are(of_each: Check, value: object) -> bool:
-    """Texts have parts, too, and are never meant; what can be gone through once only is left alone."""
-    if isinstance(value, _TEXTS) or not isinstance(value, Iterable):
+def _are_items(is_item: Check, value: object) -> bool:
+    # A string is iterable, but never meant. An iterator is not checked, because that would exhaust it.
+    if isinstance(value, (str, bytes, bytearray)) or not isinstance(value, Iterable):
         return False
-    return not isinstance(value, (list, tuple, set, frozenset)) or all(map(of_each, value))
+    return not isinstance(value, (list, tuple, set, frozenset)) or all(map(is_item, value))
 
 
 def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidArgument unless ``value`` is of that class: where type hints say "of the same kind" only."""
+    """Raise InvalidArgument unless ``value`` is an instance of ``kind``, where the annotation is a type variable."""
     if not isinstance(value, kind):
-        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: {one(kind.__name__)}")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {with_article(kind.__name__)}")
 
 
-def check_range(name: str, value: float, lowest: float, highest: float, *, above: bool = False) -> None:
-    """Raise InvalidArgument unless ``value`` is from ``lowest`` (with ``above``: above it) to ``highest``."""
+def check_range(name: str, value: float, minimum: float, maximum: float, *, above: bool = False) -> None:
+    """Raise InvalidArgument unless ``value`` is between the limits. With ``above``, ``minimum`` itself is invalid."""
     try:
-        is_allowed = lowest <= value <= highest and not (above and value == lowest)
+        is_allowed = minimum <= value <= maximum and not (above and value == minimum)
     except TypeError:
         is_allowed = False
     if not is_allowed:
-        begin = f"above {lowest:g}" if above else f"{lowest:g}"
-        raise InvalidArgument(f"{name} = {shown(value)} is not allowed: {begin} to {highest:g}")
+        low = f"above {minimum:g}" if above else f"{minimum:g}"
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: {low} to {maximum:g}")

@@ -1,4 +1,4 @@
-"""``async_block``: ``contextlib.asynccontextmanager`` whose blocks say what to write when they are used another way."""
+"""``async_block`` and ``ReadOnly``, whose errors tell how to use the public API correctly."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, LinkOpenError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ T = TypeVar("T")
 def async_block(
     function: Callable[P, AsyncIterator[T]],
 ) -> Callable[P, AbstractAsyncContextManager[T]]:
-    """Make a function that yields once one whose result is entered by ``async with``, and by nothing else."""
+    """Like contextlib.asynccontextmanager, but any use without ``async with`` raises a helpful TypeError."""
     make = asynccontextmanager(function)
 
     @wraps(function)
@@ -42,7 +42,7 @@ class _Block(AbstractAsyncContextManager[T]):
             asyncio.get_running_loop()
         except RuntimeError:  # trio.run, for example
             raise InvalidArgument(
-                f"{self._name}(…) runs on asyncio, and no event loop of asyncio is running here: start the program by"
+                f"{self._name}(…) requires asyncio, and no asyncio event loop is running here: start the program with"
                 " asyncio.run(…), or, on trio, use aerokit.sync in a thread (trio.to_thread.run_sync)"
             ) from None
         try:
@@ -50,7 +50,7 @@ class _Block(AbstractAsyncContextManager[T]):
         except (
             LinkOpenError,
             InvalidArgument,
-        ) as error:  # where in here it came from says nothing to a program
+        ) as error:  # the traceback inside this library does not help a user
             raise error.with_traceback(None) from error.__cause__
 
     async def __aexit__(
@@ -65,7 +65,7 @@ class _Block(AbstractAsyncContextManager[T]):
         raise self._misused("with")
 
     def __exit__(self, *_: object) -> None:
-        """Never: it cannot be entered so. Python looks for it first."""
+        """Never called. Python looks it up before it calls ``__enter__``."""
 
     def __getattr__(self, name: str) -> None:
         raise AttributeError(
@@ -76,12 +76,13 @@ class _Block(AbstractAsyncContextManager[T]):
 
     def _misused(self, word: str) -> TypeError:
         return TypeError(
-            f"{self._name}(…) is not for `{word}`: write `async with {self._name}(…) as …:` in an async function,"
-            " or take aerokit.sync for a program without async"
+            f"{self._name}(…) does not support `{word}`: write `async with {self._name}(…) as …:` in an async function,"
+            " or use aerokit.sync in a program without async"
         )
 
 
-CALLS = {
+# Attribute → the call that changes the value it reports.
+_SETTER_CALLS = {
     "mode": "set_mode({value})",
     "mode_name": "set_mode({value})",
     "armed": "arm() or disarm()",
@@ -92,28 +93,28 @@ CALLS = {
     "ground_speed_m_s": "set_speed(metres per second)",
     "current": "set_current(item)",
 }
-"""Attribute → the call that changes what it tells."""
 
 
 class ReadOnly:
-    """A base of public objects. ``vehicle.mode = "GUIDED"`` raises AttributeError, which names ``set_mode``.
+    """Base class of public objects whose attributes report the state of the vehicle.
 
-    What the vehicle tells (cells, properties, parts) is refused; a program may add attributes of its own.
+    Assigning to a cell, a property or a part raises AttributeError, which names the method to call: ``set_mode`` for
+    ``vehicle.mode = "GUIDED"``. A program may add attributes of its own.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
         found = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(found, property) and found.fset is not None
-        if name.startswith("_") or is_setter or callable(found) or not hasattr(type(found), "__get__"):
-            object.__setattr__(
-                self, name, value
-            )  # of the program, or made in the constructor; a method in a mock
+        is_descriptor = hasattr(type(found), "__get__")
+        # Callable: a method replaced by a mock. No descriptor: set in the constructor, or added by the program.
+        if name.startswith("_") or is_setter or callable(found) or not is_descriptor:
+            object.__setattr__(self, name, value)
             return
-        text = f"{type(self).__name__}.{name} = {shown(value)} is not allowed"
-        call = CALLS.get(name)
+        text = f"{type(self).__name__}.{name} = {short_repr(value)} is not allowed"
+        call = _SETTER_CALLS.get(name)
         if call is None or not hasattr(type(self), call.partition("(")[0]):
-            raise AttributeError(f"{text}: it is only read")
+            raise AttributeError(f"{text}: it is read-only")
         wait = "" if type(self).__module__.startswith("aerokit.sync") else "await "
         raise AttributeError(
-            f"{text}: it tells what the vehicle does; write {wait}….{call.format(value=shown(value))}"
+            f"{text}: it reports the state of the vehicle; write {wait}….{call.format(value=short_repr(value))}"
         )

@@ -1,4 +1,4 @@
-"""``write_whole``: a text file that appears whole or not at all; ``read_bounded``, ``unpacked``: not too long a one."""
+"""Atomic writing of text files, and reading of files with a size limit."""
 
 from __future__ import annotations
 
@@ -12,96 +12,104 @@ from aerokit.errors import FileFormatError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-LARGEST_FILE = 16 << 20
-"""Bytes of the largest file of parameters, metadata, plans or definitions that is read; real ones have 5 MB at most."""
+MAX_FILE_SIZE = 16 << 20
+"""Size limit in bytes for files of parameters, metadata, plans and definitions; real ones have at most 5 MB."""
 
-_XZ = b"\xfd7zXZ\x00"
+_XZ_MAGIC = b"\xfd7zXZ\x00"
+_XZ_MEMORY_LIMIT = 128 << 20  # xz -9 needs 65 MB
 
-_MOST_MEMORY = 128 << 20  # xz -9 takes 65 MB
 
-
-def write_whole(path: str | os.PathLike[str], text: str) -> None:
-    """Write a file, UTF-8 and with Unix line ends; what was there before stays when that goes wrong (OSError)."""
+def write_atomically(path: str | os.PathLike[str], text: str) -> None:
+    """Write a UTF-8 file with Unix line ends. If writing fails (OSError), the previous content is kept."""
     target = Path(path)
     part = target.with_name(target.name + ".part")
-    part.unlink(
-        missing_ok=True
-    )  # what was left, or a link to a file of somebody's, through which we would write
+    # A leftover of an earlier attempt, or a symbolic link that would redirect the writing.
+    part.unlink(missing_ok=True)
     try:
         with part.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
             file.flush()
-            os.fsync(file.fileno())  # else a power cut may leave the new name with nothing in it
+            os.fsync(file.fileno())  # otherwise a power failure may leave an empty file under the new name
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
 
 
 def read_bounded(path: str | os.PathLike[str]) -> bytes:
-    """All bytes of a file; FileFormatError beyond :data:`LARGEST_FILE`, OSError when it cannot be read."""
+    """Read a file.
+
+    Raises:
+        FileFormatError: it is larger than :data:`MAX_FILE_SIZE`.
+        OSError: it cannot be read.
+    """
     with open(path, "rb") as file:
-        data = file.read(LARGEST_FILE + 1)
-    if len(data) > LARGEST_FILE:
-        raise too_large(os.fspath(path))
+        data = file.read(MAX_FILE_SIZE + 1)
+    if len(data) > MAX_FILE_SIZE:
+        raise file_too_large(os.fspath(path))
     return data
 
 
-def too_large(name: str) -> FileFormatError:
-    """The complaint about a file beyond :data:`LARGEST_FILE`."""
-    return FileFormatError(f"{name} has more than {LARGEST_FILE >> 20} MB: that is no such file")
+def file_too_large(name: str) -> FileFormatError:
+    """Create the error for a file larger than :data:`MAX_FILE_SIZE`."""
+    return FileFormatError(f"{name} is too large: more than {MAX_FILE_SIZE >> 20} MB")
 
 
-def unpacked(data: bytes, name: str) -> bytes:
-    """What an ``.xz`` file holds, and other bytes as they are.
+def decompress(data: bytes, name: str) -> bytes:
+    """Decompress ``.xz`` data. Other data is returned unchanged.
 
-    FileFormatError, which begins with ``name``, when it is damaged or holds more than :data:`LARGEST_FILE`.
+    Raises:
+        FileFormatError: the data is damaged or decompresses to more than :data:`MAX_FILE_SIZE`; begins with ``name``.
     """
-    if not data.startswith(_XZ):
+    if not data.startswith(_XZ_MAGIC):
         return data
-    import lzma  # some builds of Python are without it
+    import lzma  # not available in all builds of Python
 
-    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
+    decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY_LIMIT)
     try:
-        found = unpacker.decompress(data, LARGEST_FILE + 1)
+        found = decompressor.decompress(data, MAX_FILE_SIZE + 1)
     except lzma.LZMAError as error:
         raise FileFormatError(f"{name} is damaged: {error}") from None
-    if len(found) > LARGEST_FILE:
-        raise too_large(name)
-    if not unpacker.eof:
-        raise FileFormatError(f"{name} is damaged: it is cut off")
+    if len(found) > MAX_FILE_SIZE:
+        raise file_too_large(name)
+    if not decompressor.eof:
+        raise FileFormatError(f"{name} is damaged: it is truncated")
     return found
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a file; :class:`FileFormatError` when it is no UTF-8 or too long, OSError when it cannot be read."""
+    """Read a text file, with Unix line ends.
+
+    Raises:
+        FileFormatError: it is not UTF-8, or too large.
+        OSError: it cannot be read.
+    """
     try:
         text = read_bounded(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         name = Path(path).name
-        raise FileFormatError(f"{name}: byte {error.start}: no text (UTF-8 was expected)") from error
+        raise FileFormatError(f"{name}: byte {error.start} is not valid UTF-8 text") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 class PartFile:
-    """``<to>.part`` until ``finish``; what is in it is always the beginning of what shall be in it.
+    """A download in progress: ``<to>.part`` until ``finish``, always the beginning of the complete file.
 
-    ``mark`` goes before ``.part``, so that beginnings of different things are not taken for each other.
+    ``mark`` is inserted before ``.part``, so that a partial download of another file is not continued.
     """
 
     def __init__(self, to: str | os.PathLike[str], mark: str = "") -> None:
         self._to = os.fspath(to)
         self.path: Path = Path(f"{self._to}{mark}.part")
-        """Where it is meanwhile."""
+        """Path of the partial file."""
 
     @property
     def size(self) -> int:
-        """Bytes that an earlier attempt has left; 0 when there was none."""
+        """Size in bytes of the partial file; 0 if there is none."""
         return self.path.stat().st_size if self.path.exists() else 0
 
     @contextmanager
     def writing(self, start: int) -> Iterator[BinaryIO]:
-        """Open it for writing from ``start`` on; what was behind is gone. Nothing stays of
-        an attempt that has brought nothing.
+        """Open for writing from offset ``start`` on, truncating what follows. An empty file is removed on errors.
 
         Raises:
             OSError: it cannot be written.
@@ -117,5 +125,5 @@ class PartFile:
             raise
 
     def finish(self) -> None:
-        """Give it its name, in place of the file that may have it."""
+        """Rename the partial file to its final name, replacing any existing file."""
         os.replace(self.path, self._to)

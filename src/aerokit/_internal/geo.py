@@ -1,4 +1,4 @@
-"""Geodesy on the WGS 84 ellipsoid, by geographiclib: places in degrees, lengths in metres."""
+"""Geodesy on the WGS 84 ellipsoid (geographiclib). Positions are in degrees, lengths in metres."""
 
 from __future__ import annotations
 
@@ -12,24 +12,20 @@ if TYPE_CHECKING:
     from geographiclib.geodesic import Geodesic
 
 
-def distance_m(
-    latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float
-) -> float:
-    """Metres along the ellipsoid between two places, without their altitudes."""
+def distance_m(latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float) -> float:
+    """Return the distance along the ellipsoid, ignoring altitudes."""
     line = _wgs84().Inverse(latitude_deg, longitude_deg, to_latitude_deg, to_longitude_deg)
     return float(line["s12"])
 
 
-def bearing_deg(
-    latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float
-) -> float:
-    """The direction in which to leave the first place for the second: 0 to 360, clockwise from north."""
+def bearing_deg(latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float) -> float:
+    """Return the initial bearing from the first place to the second: 0 to below 360, clockwise from north."""
     line = _wgs84().Inverse(latitude_deg, longitude_deg, to_latitude_deg, to_longitude_deg)
     return wrap_360(float(line["azi1"]))
 
 
 def offset(latitude_deg: float, longitude_deg: float, north_m: float, east_m: float) -> tuple[float, float]:
-    """Latitude and longitude of the place that many metres north and east (negative: south and west)."""
+    """Return latitude and longitude of the place ``north_m`` north and ``east_m`` east of the given one."""
     distance, azimuth = math.hypot(north_m, east_m), math.degrees(math.atan2(east_m, north_m))
     line = _wgs84().Direct(latitude_deg, longitude_deg, azimuth, distance)
     return float(line["lat2"]), wrap_longitude(float(line["lon2"]))
@@ -38,32 +34,32 @@ def offset(latitude_deg: float, longitude_deg: float, north_m: float, east_m: fl
 def north_east_m(
     latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float
 ) -> tuple[float, float]:
-    """How many metres the second place is north and east of the first; the inverse of :func:`offset`."""
+    """Return how far the second place is north and east of the first; the inverse of :func:`offset`."""
     line = _wgs84().Inverse(latitude_deg, longitude_deg, to_latitude_deg, to_longitude_deg)
     azimuth = math.radians(line["azi1"])
     return float(line["s12"] * math.cos(azimuth)), float(line["s12"] * math.sin(azimuth))
 
 
 def check_place(latitude_deg: float, longitude_deg: float) -> None:
-    """Raise :class:`InvalidArgument`, which names the field, unless this is a place on earth."""
+    """Raise :class:`InvalidArgument` unless latitude and longitude are numbers in range."""
     for name, value, limit in (("latitude_deg", latitude_deg, 90), ("longitude_deg", longitude_deg, 180)):
         if not isinstance(value, (float, int, Real)) or not -limit <= value <= limit:
             raise InvalidArgument(f"{name} = {value!r} is not allowed: -{limit} to {limit} degrees")
 
 
 def wrap_360(angle_deg: float) -> float:
-    """The same direction, at least 0 and below 360."""
+    """Normalise an angle to 0 to below 360."""
     wrapped = angle_deg % 360.0
-    return 0.0 if wrapped == 360.0 else wrapped  # a tiny negative angle is rounded up to 360
+    return 0.0 if wrapped == 360.0 else wrapped  # rounding turns a tiny negative angle into 360
 
 
 def wrap_longitude(longitude_deg: float) -> float:
-    """The same meridian, from -180 to below 180."""
+    """Normalise a longitude to -180 to below 180."""
     return wrap_360(longitude_deg + 180.0) - 180.0 if not -180.0 <= longitude_deg < 180.0 else longitude_deg
 
 
 def _wgs84() -> Geodesic:
-    """Imported when first needed: it takes longer than the rest of this package together."""
+    # Imported on first use, because it takes longer than the rest of this package together.
     from geographiclib.geodesic import Geodesic
 
     return Geodesic.WGS84

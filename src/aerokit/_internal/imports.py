@@ -1,8 +1,4 @@
-"""Whether what is installed as ``aerokit`` is this library alone.
-
-PyPI has another project of this name, for compressible flow. Its files go to the same folder as ours, so that
-installing both leaves a mixture of which neither may work.
-"""
+"""Lazy package exports, and detection of a second project called aerokit in the same folder."""
 
 from __future__ import annotations
 
@@ -11,16 +7,17 @@ import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 
-_OTHERS = ("aero", "engine", "stability")
-"""Packages that only the other project has: ``aerokit.aero`` and so on."""
+# Packages of the other project only: ``aerokit.aero`` and so on.
+_OTHER_PACKAGES = ("aero", "engine", "stability")
 
 
-def complaint(folder: str, *, is_ours: bool = True) -> str | None:
-    """What is wrong with the files in the folder of the package, and what to do; None: nothing.
+def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
+    """Describe what is wrong with the installation in ``folder`` and how to repair it; None if nothing is wrong.
 
-    ``is_ours`` says whether the package's ``__init__`` was this library's.
+    PyPI has another project called aerokit, for compressible flow. It installs into the same folder, so that with both
+    installed neither may work. ``is_ours`` is True if the ``__init__.py`` there is this library's.
     """
-    others = [name for name in _OTHERS if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
+    others = [name for name in _OTHER_PACKAGES if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
     if is_ours and not others:
         return None
     found = f"aerokit.{others[0]}" if others else "its __init__.py"
@@ -33,22 +30,22 @@ def complaint(folder: str, *, is_ours: bool = True) -> str | None:
 def lazy_exports(
     package: str, exports: Mapping[str, tuple[str, ...]]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package, whose names are imported when they are first used.
+    """Create ``__getattr__``, ``__dir__`` and ``__all__`` of a package that imports its names on first use.
 
-    ``exports`` has the names by module; a name that its module does not have is the module itself. The package repeats
-    them as ``import name as name`` under TYPE_CHECKING, because type checkers do not run this.
+    ``exports`` maps modules to names; a name that the module does not define is the module itself. For type checkers,
+    the package repeats the names as ``import name as name`` under TYPE_CHECKING.
     """
-    homes = {name: module for module, names in exports.items() for name in names}
+    modules = {name: module for module, names in exports.items() for name in names}
 
-    def find(name: str) -> object:
-        if name not in homes:
+    def get_attribute(name: str) -> object:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        home = import_module(homes[name])
-        value = getattr(home, name, home)
+        module = import_module(modules[name])
+        value = getattr(module, name, module)
         setattr(sys.modules[package], name, value)
         return value
 
-    def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *homes})
+    def list_names() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *modules})
 
-    return find, names, sorted(homes)
+    return get_attribute, list_names, sorted(modules)

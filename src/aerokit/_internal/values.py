@@ -1,10 +1,7 @@
-"""``Snapshot``: an immutable value with named fields, like a dataclass, but quick to define and to make.
+"""``Snapshot``: base class of immutable values, like a frozen dataclass but faster to define and to create.
 
-Thirty frozen, slotted dataclasses cost more to import than the rest of the package. This writes the one
-method that must be written, ``__init__``, for the first value that is made, and shares the others.
-
-What the command line prints with ``--json``, what ``aerokit serve`` answers and what is given to other programs is
-made by this one function, so that a value has one shape everywhere.
+Thirty frozen dataclasses with slots take longer to import than the rest of the package. Only ``__init__`` is generated
+here, when the first value of a class is created; all other methods are shared.
 """
 
 from __future__ import annotations
@@ -17,16 +14,15 @@ if TYPE_CHECKING:
     from inspect import Signature
 
     from typing_extensions import Self, dataclass_transform
-else:  # importing typing_extensions would cost more than everything else here
+else:  # typing_extensions takes longer to import than this package
 
     def dataclass_transform(**_: object) -> Any:
-        """Only the type checker cares."""
         return lambda cls: cls
 
 
 @dataclass_transform(frozen_default=True)
 class _SnapshotType(type):
-    """Turns annotated names into slots and writes ``__init__``; the module must postpone annotations."""
+    """Turns annotated names into slots and generates ``__init__``. The module must postpone annotations."""
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
         annotations: dict[str, str] = namespace.get("__annotations__", {})
@@ -36,37 +32,36 @@ class _SnapshotType(type):
         fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own)
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own, "__match_args__": fields})
         if own:
-            type.__setattr__(cls, "__init__", _init_later(cls))
+            type.__setattr__(cls, "__init__", _lazy_init(cls))
         type.__setattr__(cls, "_defaults", defaults)
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 
     @property
     def __signature__(cls) -> Signature:
-        """What editors and notebooks show of a class before the first value of it is made."""
+        """The signature of the constructor, for editors and notebooks, even before ``__init__`` is generated."""
         from inspect import Signature, signature
 
         init: Any = getattr(cls, "__init__")  # noqa: B009 - mypy calls the plain access unsound
         if init is object.__init__:
             return Signature()
-        to_be_written = getattr(init, "of", None)
-        return signature((init if to_be_written is None else _written_init(to_be_written)).__get__(object()))
+        pending = getattr(init, "of", None)
+        return signature((init if pending is None else _generate_init(pending)).__get__(object()))
 
 
-def _init_later(cls: Any) -> Callable[..., None]:
-    """What writes ``__init__`` when it is first called: a program makes few of all the kinds of values there are."""
-
-    def write_and_call(self: object, *args: Any, **kwargs: Any) -> None:
-        init = _written_init(cls)
+def _lazy_init(cls: Any) -> Callable[..., None]:
+    # A program creates values of few classes, so __init__ is generated at the first call.
+    def generate_and_call(self: object, *args: Any, **kwargs: Any) -> None:
+        init = _generate_init(cls)
         type.__setattr__(cls, "__init__", init)
         init(self, *args, **kwargs)
 
-    setattr(write_and_call, "of", cls)  # noqa: B010 - a plain assignment looks wrong to the type checker
-    return write_and_call
+    setattr(generate_and_call, "of", cls)  # noqa: B010 - a plain assignment looks wrong to the type checker
+    return generate_and_call
 
 
-def _written_init(cls: Any) -> Any:
-    """``def __init__(self, a, b=default)``, which sets the slots directly, behind __setattr__'s back."""
+def _generate_init(cls: Any) -> Any:
+    """Generate ``def __init__(self, a, b=default)``, which sets the slots directly, bypassing ``__setattr__``."""
     fields, defaults = cls.__match_args__, cls._defaults
     scope: dict[str, Any] = {f"_set_{field}": getattr(cls, field).__set__ for field in fields}
     scope.update({f"_default_{field}": value for field, value in defaults.items()})
@@ -81,21 +76,21 @@ def _written_init(cls: Any) -> Any:
 
 
 class Snapshot(metaclass=_SnapshotType):
-    """Base of the values that programs read: immutable, comparable, printable.
+    """Base class of immutable, comparable, printable values.
 
-    A subclass may have a method ``_check(self)``, which raises when the fields make no sense together. The fields of
-    a base class come first, with their defaults.
+    A subclass may define ``_check(self)`` to raise InvalidArgument for invalid fields. Fields of base classes come
+    first, with their defaults.
     """
 
     __match_args__: ClassVar[tuple[str, ...]]
     _values: ClassVar[attrgetter[Any]]
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with these fields changed."""
+        """Return a copy with some fields changed."""
         return type(self)(**{**self.to_dict(), **changes})
 
     def to_dict(self) -> dict[str, Any]:
-        """Field names and values, in the order of the fields."""
+        """Return the fields as a dictionary, in order."""
         return {field: getattr(self, field) for field in self.__match_args__}
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -121,5 +116,5 @@ class Snapshot(metaclass=_SnapshotType):
 
 
 def _short(value: object) -> str:
-    """Seven digits behind the point are a centimetre on the globe."""
+    # Seven decimal places of a degree are a centimetre on earth.
     return repr(round(value, 7) if isinstance(value, float) else value)

@@ -1,7 +1,6 @@
-"""Everything that differs between autopilots and vehicle types: mode tables and quirks, and nowhere else.
+"""Differences between autopilots and vehicle types: mode tables and special behaviour.
 
-``autopilot_for(heartbeat)`` gives the :class:`Autopilot` that describes a vehicle; it does no IO, has no
-state.
+``autopilot_for(heartbeat)`` returns the :class:`Autopilot` that describes a vehicle. It does no IO and has no state.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ __all__ = [
 
 
 def autopilot_for(heartbeat: Heartbeat) -> Autopilot:
-    """The autopilot and vehicle type that a HEARTBEAT tells; a cautious general one for all others."""
+    """Return the description for the autopilot and vehicle type of a HEARTBEAT; a generic one if they are unknown."""
     if heartbeat.autopilot == MavAutopilot.ARDUPILOTMEGA:
         return ardupilot_for(heartbeat.type)
     if heartbeat.autopilot == MavAutopilot.PX4:

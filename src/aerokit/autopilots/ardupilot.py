@@ -1,7 +1,7 @@
-"""ArduPilot: one class for each of its vehicles (https://ardupilot.org/dev/docs/mavlink-commands.html).
+"""ArduPilot's vehicles (https://ardupilot.org/dev/docs/mavlink-commands.html).
 
-From ``enum class Number`` in each vehicle's mode.h. Names are those of the ground stations and of pymavlink
-(``SMART_RTL``, ``FBWA``); what AVAILABLE_MODES calls them otherwise is an alias.
+Modes are from ``enum class Number`` in each vehicle's mode.h. Their names are those of ground stations and pymavlink
+(``SMART_RTL``, ``FBWA``); different names in AVAILABLE_MODES are aliases.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from aerokit.autopilots import ardupilot as ardupilot_modes
 from aerokit.autopilots.base import Autopilot, GimbalRules, Purpose, Reposition, SetpointRules, TakeOff
 from aerokit.autopilots.modes import ModeTable
-from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, names_of
+from aerokit.autopilots.telemetry import ARDUPILOT_GROUPS, ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, bit_names
 from aerokit.mavlink.enums import EkfStatusFlags, MavCmd, MavLandedState, MavState, MavType
 
 if TYPE_CHECKING:
@@ -133,9 +132,7 @@ BLIMP = ModeTable(
     }  # 5, 6: pymavlink only
 )
 
-TRACKER = ModeTable(
-    {0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUIDED", 10: "AUTO", 16: "INITIALISING"}
-)
+TRACKER = ModeTable({0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUIDED", 10: "AUTO", 16: "INITIALISING"})
 
 EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
 
@@ -162,12 +159,10 @@ COPTERS = (
 
 
 class ArduPilot(Autopilot):
-    """What ArduPilot's vehicles have in common, and all that is said of one whose type is not known."""
+    """Base class of ArduPilot's vehicles, and the description of one with an unknown type."""
 
     name = "ArduPilot"
-    gimbals: GimbalRules = GimbalRules(
-        has_secondary=False, looks_with_each=False, looking_needs_control=False
-    )
+    gimbals: GimbalRules = GimbalRules(has_secondary=False, roi_per_gimbal=False, roi_needs_control=False)
     firmware = "ArduPilot"
     home_is_item_0 = True
     runs_prearm_checks = True
@@ -177,39 +172,35 @@ class ArduPilot(Autopilot):
     mission_upload_window = 6
     mission_download_window = 10
     writes_partial_missions = True
-    replaced_as_they_come: frozenset[int] = frozenset((0, 2))
-    completes_at_home = True
+    overwrites_plans_in_place: frozenset[int] = frozenset((0, 2))
+    mission_completes_at_home = True
     mission_starts_by_command = True
     sets_current_by_command = True
-    takes_file_sessions = True
+    accepts_ftp_session_ids = True
     has_upper_case_parameters = True
     log_suffix = ".bin"
-    video_by_camera = True
+    video_addresses_camera = True
     log_directories: ClassVar[tuple[str, str]] = ("/APM/LOGS", "/logs")
     first_log_id = 1
-    logs_by_messages = True
+    prefers_log_messages = True
     stream_groups = ARDUPILOT_GROUPS
-    never_sent: frozenset[str] = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE")) - {
-        "ATTITUDE_QUATERNION"  # on request
-    }
+    # ATTITUDE_QUATERNION is sent on request, and so not listed.
+    unsupported_messages: frozenset[str] = frozenset(("ESTIMATOR_STATUS", "WIND_COV", "ALTITUDE", "CURRENT_MODE"))
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
-        """What EKF_STATUS_REPORT lacks; a predicted absolute position is enough to arm."""
         return (
             *self._missing_estimates(
                 flags,
                 required=ATTITUDE_AND_HEIGHT,
                 horizontal=POS_HORIZ_ABS | EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
             ),
-            *names_of(flags, EKF_PROBLEMS),
+            *bit_names(flags, EKF_PROBLEMS),
         )
 
     def arming_reason(self, text: str) -> str | None:
-        """The reason in ``PreArm: …`` and ``Arm: …`` texts."""
         return _after(text, "PreArm: ", "Arm: ")
 
     def is_refusal(self, text: str) -> bool:
-        """Also mode changes that failed say so."""
         lower = text.lower()
         return super().is_refusal(text) or ("mode change" in lower and "failed" in lower)
 
@@ -218,12 +209,12 @@ class ArduPilot(Autopilot):
 
 
 class ArduCopter(ArduPilot):
-    """Multicopters and helicopters."""
+    """ArduCopter: multicopters and helicopters."""
 
     firmware = "ArduCopter"
-    modes: ModeTable = ardupilot_modes.COPTER
+    modes: ModeTable = COPTER
     purposes: ClassVar[Mapping[str, str]] = {
-        "hold": "BRAKE",  # LOITER obeys the throttle stick, which is down or missing when a program flies
+        "hold": "BRAKE",  # LOITER follows the throttle stick, which is down or absent while a program flies
         "land": "LAND",
         "return": "RTL",
         "setpoint": "GUIDED",
@@ -252,23 +243,21 @@ class ArduCopter(ArduPilot):
         )
     )
 
-    def take_off(
-        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
-    ) -> TakeOff:
-        """GUIDED, arm, NAV_TAKEOFF with the altitude above home; it stays in GUIDED."""
+    def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
+        # The vehicle stays in GUIDED after the take-off.
         guided = self.modes.find("GUIDED")
         return TakeOff(guided, MavCmd.NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, altitude_relative_m), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
-        """STANDBY is said on the ground only, ACTIVE in the air only; a failsafe (CRITICAL) hides both."""
+        # STANDBY is reported on the ground only, ACTIVE in the air only. A failsafe (CRITICAL) hides both.
         return _landed_state(heartbeat)
 
 
 class ArduPlane(ArduPilot):
-    """Planes, and the planes with lifting rotors that ArduPilot calls QuadPlanes."""
+    """ArduPlane: planes, and VTOL planes, which ArduPilot calls QuadPlanes."""
 
     firmware = "ArduPlane"
-    modes: ModeTable = ardupilot_modes.PLANE
+    modes: ModeTable = PLANE
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "AUTOLAND",
@@ -282,7 +271,7 @@ class ArduPlane(ArduPilot):
     )
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     arrival_radius_m: float = 90.0  # it circles at WP_LOITER_RAD, 60 m by default
-    arming_mode: ClassVar[str | None] = "FBWA"  # the throttle is the pilot's: armed in TAKEOFF it would start
+    arming_mode: ClassVar[str | None] = "FBWA"  # manual throttle; armed in TAKEOFF it would start
     unarmable_modes: frozenset[str] = frozenset(("AUTOLAND", "INITIALISING", "QLAND", "QRTL", "RTL"))
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
@@ -290,17 +279,14 @@ class ArduPlane(ArduPilot):
             return _QUADPLANE[purpose]
         return super()._purpose_name(purpose, is_vtol)
 
-    def take_off(
-        self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
-    ) -> TakeOff:
-        """A QuadPlane rises in GUIDED; a plane armed in TAKEOFF climbs to its parameter TKOFF_ALT."""
+    def take_off(self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool) -> TakeOff:
+        # A QuadPlane climbs in GUIDED. A plane armed in TAKEOFF climbs to its parameter TKOFF_ALT.
         if self._can_hover(is_vtol):
             params = (0, 0, 0, 0, 0, 0, altitude_relative_m)
             return TakeOff(self.modes.find("GUIDED"), MavCmd.NAV_TAKEOFF, params, None)
         return TakeOff(self.modes.find("TAKEOFF"), None, (), None)
 
     def landed_state_of(self, heartbeat: Heartbeat) -> int | None:
-        """STANDBY is said on the ground only, ACTIVE while flying."""
         return _landed_state(heartbeat)
 
     def _can_hover(self, is_vtol: bool) -> bool:
@@ -311,11 +297,11 @@ _QUADPLANE: Mapping[str, str] = {"land": "QLAND", "return": "QRTL", "take_off": 
 
 
 class ArduRover(ArduPilot):
-    """Rovers and boats."""
+    """ArduRover: rovers and boats."""
 
     firmware = "Rover"
-    stays_on_the_ground = True
-    modes: ModeTable = ardupilot_modes.ROVER
+    is_surface_vehicle = True
+    modes: ModeTable = ROVER
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "HOLD",
         "return": "RTL",
@@ -330,40 +316,40 @@ class ArduRover(ArduPilot):
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
         if purpose == "hold" and self.vehicle_type == MavType.SURFACE_BOAT:
-            return "LOITER"  # in HOLD the motors are off and a boat drifts away
+            return "LOITER"  # in HOLD the motors are off, and a boat drifts
         return super()._purpose_name(purpose, is_vtol)
 
 
 class ArduSub(ArduPilot):
-    """Remotely operated and autonomous underwater vehicles."""
+    """ArduSub: remotely operated and autonomous underwater vehicles."""
 
     firmware = "ArduSub"
-    modes: ModeTable = ardupilot_modes.SUB
+    modes: ModeTable = SUB
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "POSHOLD",
         "land": "SURFACE",
         "setpoint": "GUIDED",
         "mission": "AUTO",
     }
-    setpoints: SetpointRules = SetpointRules(acceleration=False, place_restarts_path=True)
-    landing_ends_in: ClassVar[str | None] = "ALT_HOLD"  # at the surface
+    setpoints: SetpointRules = SetpointRules(acceleration=False, position_restarts_path=True)
+    mode_when_landed: ClassVar[str | None] = "ALT_HOLD"  # at the surface
     reposition: Reposition | None = Reposition(relative_altitude=True, yaw=False, speed=False)
     condition_yaw = True
 
 
 class Blimp(ArduPilot):
-    """Airships."""
+    """ArduPilot's Blimp: airships."""
 
     firmware = "Blimp"
-    modes: ModeTable = ardupilot_modes.BLIMP
+    modes: ModeTable = BLIMP
     purposes: ClassVar[Mapping[str, str]] = {"hold": "LOITER", "land": "LAND", "return": "RTL"}
 
 
 class AntennaTracker(ArduPilot):
-    """Antenna trackers."""
+    """ArduPilot's antenna tracker."""
 
     firmware = "AntennaTracker"
-    modes: ModeTable = ardupilot_modes.TRACKER
+    modes: ModeTable = TRACKER
     purposes: ClassVar[Mapping[str, str]] = {"hold": "STOP", "setpoint": "GUIDED"}
 
 
@@ -380,7 +366,6 @@ _BY_TYPE: Mapping[int, type[ArduPilot]] = {
 
 
 def ardupilot_for(vehicle_type: int) -> ArduPilot:
-    """ArduPilot's firmware for a MAV_TYPE."""
     return _BY_TYPE.get(vehicle_type, ArduPilot)(vehicle_type)
 
 

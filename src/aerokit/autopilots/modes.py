@@ -1,30 +1,28 @@
-"""Flight modes: the value a program sees, and the table that knows their names and numbers."""
+"""``Mode`` and ``ModeTable``: flight modes with their names and numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+from aerokit._internal.formatting import did_you_mean, short_repr
 from aerokit._internal.values import Snapshot
-from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavModeFlag
 
 CUSTOM_MODE_ENABLED = MavModeFlag.CUSTOM_MODE_ENABLED.value
-"""``custom_mode`` tells the mode."""
 SAFETY_ARMED = MavModeFlag.SAFETY_ARMED.value
 
 NO_MODES: Mapping[int, str] = {}
-"""No modes beside the built-in ones."""
 _UNKNOWN = "MODE"
 _MAX_CUSTOM_MODE = 0xFFFF_FFFF
 
 
 class Mode(Snapshot):
-    """A flight mode, as HEARTBEAT tells it (https://mavlink.io/en/messages/minimal.html#HEARTBEAT).
+    """A flight mode as reported by HEARTBEAT (https://mavlink.io/en/messages/minimal.html#HEARTBEAT).
 
-    ``name`` is the autopilot's own name for it (``"GUIDED"``, ``"POSCTL"``), ``"MODE 42"`` for a number that
-    no table knows; ``custom_mode`` is its number. ``base_mode`` (MAV_MODE_FLAG bits) is left out of
-    comparisons, because it changes with arming. ``str(mode)`` is the name.
+    ``name`` is the autopilot's name (``"GUIDED"``, ``"POSCTL"``), or ``"MODE 42"`` for an unknown number;
+    ``custom_mode`` is the number. ``base_mode`` (MAV_MODE_FLAG) is not compared, because it changes with arming.
+    ``str(mode)`` is the name.
     """
 
     name: str
@@ -44,7 +42,7 @@ class Mode(Snapshot):
 
 
 class ModeTable:
-    """Names and numbers of one kind of vehicle. Case, spaces and underscores do not matter."""
+    """Names and numbers of the modes of one vehicle type. Lookups ignore case, spaces and underscores."""
 
     def __init__(self, names: Mapping[int, str], aliases: Mapping[str, str] | None = None) -> None:
         self._names = dict(names)
@@ -54,22 +52,23 @@ class ModeTable:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names in the order of their numbers."""
+        """Names of the modes, in the order of their numbers."""
         return tuple(name for _, name in sorted(self._names.items()))
 
     @property
     def numbers(self) -> Mapping[int, str]:
-        """custom_mode → name."""
+        """Maps custom_mode to name."""
         return self._names
 
     def name_of(self, custom_mode: int, extra: Mapping[int, str] = NO_MODES) -> str:
-        """The name of a number; ``extra`` holds modes that the vehicle told by AVAILABLE_MODES."""
+        """Return the name of a number. ``extra`` has the modes that the vehicle reported by AVAILABLE_MODES."""
         return self._names.get(custom_mode) or extra.get(custom_mode) or f"{_UNKNOWN} {custom_mode}"
 
     def find(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """The mode of this name or number.
+        """Find a mode by name or number.
 
-        Raises :class:`InvalidArgument` with the names that are known when there is none of this name.
+        Raises:
+            InvalidArgument: the name is unknown; the text lists the known names.
         """
         if isinstance(mode, Mode):
             mode = mode.custom_mode
@@ -90,22 +89,22 @@ class ModeTable:
 
     def _check(self, number: int) -> int:
         if not 0 <= number <= _MAX_CUSTOM_MODE:
-            raise InvalidArgument(f"mode = {number}: a custom_mode is a number from 0 to {_MAX_CUSTOM_MODE}")
+            raise InvalidArgument(f"mode = {number} is not allowed: a custom_mode from 0 to {_MAX_CUSTOM_MODE}")
         return int(number)
 
     def _unknown(self, name: str, extra: Mapping[int, str]) -> str:
         known = [*self.names, *(extra[n] for n in sorted(extra) if n not in self._names)]
         hint = did_you_mean(name, known)
-        return f"mode = {shown(name)} is not known{hint}; this vehicle's modes are " + ", ".join(known)
+        return f"mode = {short_repr(name)} is not known{hint}; this vehicle's modes are " + ", ".join(known)
 
 
 def is_armed(base_mode: int) -> bool:
-    """Whether HEARTBEAT.base_mode says that the motors are armed."""
+    """Return True if HEARTBEAT.base_mode has the armed flag."""
     return bool(base_mode & SAFETY_ARMED)
 
 
 def base_mode_name(base_mode: int) -> str:
-    """A name for a mode that is told by the flags of base_mode alone (MAV_MODE_FLAG)."""
+    """Return a name for a mode without custom_mode, from its MAV_MODE_FLAG bits."""
     for bit, name in ((4, "AUTO"), (8, "GUIDED"), (16, "STABILIZE"), (64, "MANUAL")):
         if base_mode & bit:
             return name
@@ -113,4 +112,4 @@ def base_mode_name(base_mode: int) -> str:
 
 
 def _key(name: str) -> str:
-    return "".join(character for character in name.upper() if character.isalnum())
+    return "".join(char for char in name.upper() if char.isalnum())

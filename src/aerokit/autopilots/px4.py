@@ -1,4 +1,4 @@
-"""PX4 (https://docs.px4.io/main/en/mavlink/): main and sub modes, and what it does its own way."""
+"""PX4 (https://docs.px4.io/main/en/mavlink/): main and sub modes, and PX4's special behaviour."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from aerokit.autopilots.base import (
     Reposition,
     SetpointRules,
     TakeOff,
-    whole_numbers,
+    mode_numbers,
 )
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED, NO_MODES, Mode, ModeTable
-from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, names_of
+from aerokit.autopilots.telemetry import ATTITUDE_AND_HEIGHT, POS_HORIZ_ABS, PREARM_CHECK, SENSORS, bit_names
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import EstimatorStatusFlags, MavCmd, MavType
 
@@ -31,7 +31,7 @@ ESTIMATOR_PROBLEMS: Mapping[int, str] = {
 
 
 def px4_custom_mode(main: int, sub: int = 0) -> int:
-    """PX4's custom_mode: main mode in the third byte, sub mode in the fourth."""
+    """Compose PX4's custom_mode: the main mode is the third byte, the sub mode the fourth."""
     return main << 16 | sub << 24
 
 
@@ -39,6 +39,7 @@ def _auto(sub: int) -> int:
     return px4_custom_mode(MAIN_AUTO, sub)
 
 
+# From px4_custom_mode.h. Names are those of pymavlink; those of QGroundControl are aliases.
 MODES = ModeTable(
     {
         px4_custom_mode(1): "MANUAL",
@@ -66,10 +67,7 @@ MODES = ModeTable(
         px4_custom_mode(11): "ALTITUDE_CRUISE",
     },
     {
-        **{
-            f"AUTO.{name}": name
-            for name in ("READY", "TAKEOFF", "LOITER", "MISSION", "RTL", "LAND", "PRECLAND")
-        },
+        **{f"AUTO.{name}": name for name in ("READY", "TAKEOFF", "LOITER", "MISSION", "RTL", "LAND", "PRECLAND")},
         "AUTO.FOLLOW_TARGET": "FOLLOWME",
         "FOLLOW_TARGET": "FOLLOWME",
         "ALTITUDE": "ALTCTL",
@@ -81,22 +79,21 @@ MODES = ModeTable(
         "DESCEND": "LAND",
     },
 )
-"""From px4_custom_mode.h; names as in pymavlink, those of QGroundControl are aliases."""
 
 _EXTERNAL = range(_auto(11), _auto(19))
 
 
 class Px4(Autopilot):
-    """PX4, any vehicle type."""
+    """PX4, for all vehicle types."""
 
     name = "PX4"
     firmware = "PX4"
-    keys_are_taken = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
+    signing_key_restriction = "PX4 takes a key on its USB port only, and before 1.17 nowhere"
     modes = MODES
     modes_are_numbered = False
-    # The MAVLink module acks with ACCEPTED at once, the commander with the result after it.
+    # The MAVLink module acknowledges with ACCEPTED at once, then the commander with the result.
     acks_per_command: ClassVar[Mapping[int, int]] = {MavCmd.DO_SET_MODE: 2}
-    setpoints: SetpointRules = SetpointRules(before_mode=True)
+    setpoints: SetpointRules = SetpointRules(stream_before_mode=True)
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(*[False] * 6)
     log_suffix = ".ulg"
@@ -104,14 +101,13 @@ class Px4(Autopilot):
     silent_without_logs = True
     _bytewise_by_default = True
     has_parameter_hash = True
-    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # inside PX4, −1 A is "unknown"
+    unknown_currents_ca: frozenset[int] = frozenset((-1, -100))  # inside PX4, −1 A means "unknown"
     reposition_purpose: Purpose = "hold"
-    judges_by_mode = True
-    cameras_by_trigger = True
+    prearm_depends_on_mode = True
+    camera_by_trigger_only = True
     arming_mode: ClassVar[str | None] = "LOITER"
-    unarmable_modes: frozenset[str] = frozenset(
-        ("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION")
-    )  # OFFBOARD: without set-points
+    # OFFBOARD needs set-points.
+    unarmable_modes: frozenset[str] = frozenset(("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION"))
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",
         "land": "LAND",
@@ -122,46 +118,46 @@ class Px4(Autopilot):
     }
     mission_storage = "px4"
     mission_upload_window = 6
-    tells_mission_checksum = True
-    replaced_as_they_come: frozenset[int] = frozenset()  # the new items go into a second place
+    reports_mission_checksum = True
+    overwrites_plans_in_place: frozenset[int] = frozenset()  # new items go into a second storage area
     repeats_item_reached = True
-    never_sent: frozenset[str] = frozenset(
+    unsupported_messages: frozenset[str] = frozenset(
         ("EKF_STATUS_REPORT", "WIND", "RANGEFINDER", "AHRS", "AHRS2", "MEMINFO", "POWER_STATUS", "RAW_IMU")
     )
 
     def __init__(self, vehicle_type: int) -> None:
         super().__init__(vehicle_type)
-        self.stays_on_the_ground: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
-        self.lands_after_return: bool = not self._stays_down and vehicle_type != MavType.FIXED_WING
+        self.is_surface_vehicle: bool = vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT)
+        self.lands_after_return: bool = not self._cannot_fly and vehicle_type != MavType.FIXED_WING
         if vehicle_type == MavType.FIXED_WING:
-            self.arrival_radius_m: float = 120.0  # it circles at NAV_LOITER_RAD, 80 m by default
+            self.arrival_radius_m: float = 120.0  # it circles with NAV_LOITER_RAD, 80 m by default
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """The mode of these numbers; what an external mode calls itself goes before EXTERNAL1 and so on."""
+        """Return the mode of these numbers. An external mode's own name takes precedence over EXTERNAL1 etc."""
         if custom_mode in _EXTERNAL and custom_mode in extra:
             return Mode(extra[custom_mode], custom_mode, base_mode)
         return super().mode(custom_mode, base_mode, extra)
 
     def find_mode(self, mode: str | int | Mode, extra: Mapping[int, str] = NO_MODES) -> Mode:
-        """The mode of this name or number; external modes are found by their own names too."""
+        """Find a mode by name or number. External modes are also found by their own names."""
         found = super().find_mode(mode, extra)
         return Mode(extra.get(found.custom_mode, found.name), found.custom_mode)
 
     def mode_order(self, mode: Mode) -> ModeOrder:
-        """DO_SET_MODE takes main and sub mode in param2 and param3."""
+        # param2 is the main mode, param3 the sub mode.
         main, sub = mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
     def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
-        base, main, sub = whole_numbers((*params, 0.0, 0.0, 0.0)[:3])
+        base, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])
         if not base & CUSTOM_MODE_ENABLED:
             return ()
         if main == MAIN_AUTO and not sub:
-            sub = SUB_MISSION  # which PX4 takes for none
+            sub = SUB_MISSION  # PX4's default
         return (self.mode((main & 0xFF) << 16 | (sub & 0xFF) << 24, CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Names of external modes; places without a registered mode say "(Mode not available)"."""
+        """Return the names of external modes. Slots without a registered mode are called "(Mode not available)"."""
         if name.startswith("("):
             return None
         if custom_mode in _EXTERNAL:
@@ -171,54 +167,53 @@ class Px4(Autopilot):
     def take_off(
         self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
-        """NAV_TAKEOFF with the altitude above the sea, here, with the present heading; then LOITER.
+        """NAV_TAKEOFF to the altitude above mean sea level, at the current position and heading; then LOITER.
 
-        Raises :class:`InvalidArgument` when the altitude of home is not given.
+        Raises:
+            InvalidArgument: the altitude of home is not given.
         """
-        if self._stays_down:
+        if self._cannot_fly:
             return None
         if home_altitude_amsl_m is None:
-            raise InvalidArgument("take-off on PX4 needs the altitude of home: it counts from the sea")
+            raise InvalidArgument("take-off on PX4 needs the altitude of home: NAV_TAKEOFF is above mean sea level")
         params = (NAN, 0, 0, NAN, NAN, NAN, home_altitude_amsl_m + altitude_relative_m)
         return TakeOff(None, MavCmd.NAV_TAKEOFF, params, self.modes.find("LOITER"))
 
     def take_off_needs_home(self) -> bool:
-        """True: param7 of NAV_TAKEOFF is above the sea."""
-        return not self._stays_down
+        """True, because the altitude of NAV_TAKEOFF is above mean sea level."""
+        return not self._cannot_fly
 
     def failing_sensors(self, present: int, enabled: int, health: int) -> tuple[str, ...]:
-        """A part that is required but missing is enabled without being present."""
-        missing = names_of(enabled & ~present & ~health & ~PREARM_CHECK, SENSORS)
+        # A required but missing sensor is enabled without being present.
+        missing = bit_names(enabled & ~present & ~health & ~PREARM_CHECK, SENSORS)
         return (
             *super().failing_sensors(present, enabled, health),
             *(f"{name} (missing)" for name in missing),
         )
 
     def prearm_checks_pass(self, present: int, enabled: int, health: int) -> bool:
-        """PX4 sets the bit in ``health`` alone, when it could be armed in its present mode."""
+        # PX4 sets the bit in ``health`` only, if the vehicle can be armed in its current mode.
         return bool(health & PREARM_CHECK)
 
     def missing_estimates(self, flags: int) -> tuple[str, ...]:
-        """What ESTIMATOR_STATUS lacks for modes that need a global position."""
         missing = self._missing_estimates(flags, required=ESTIMATES_REQUIRED, horizontal=POS_HORIZ_ABS)
-        return (*missing, *names_of(flags, ESTIMATOR_PROBLEMS))
+        return (*missing, *bit_names(flags, ESTIMATOR_PROBLEMS))
 
     def arming_reason(self, text: str) -> str | None:
-        """The reason in ``Preflight Fail: …`` and ``Arming denied: …`` texts."""
         for prefix in ("Preflight Fail: ", "Preflight: ", "Arming denied: ", "Arming denied! "):
             if text.startswith(prefix):
                 return text[len(prefix) :].strip()
         return None
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:
-        if self._stays_down and purpose in ("take_off", "land"):
+        if self._cannot_fly and purpose in ("take_off", "land"):
             return None
         return super()._purpose_name(purpose, is_vtol)
 
     @property
-    def _stays_down(self) -> bool:
+    def _cannot_fly(self) -> bool:
         return self.vehicle_type in (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
 
     def _git_hash(self, custom_version: bytes) -> str:
-        """The commit stands backwards, behind three bytes for the vendor's own version."""
+        # The commit hash is stored in reverse order, after three bytes with the vendor's version.
         return custom_version[3:8][::-1].hex() if any(custom_version[3:8]) else ""

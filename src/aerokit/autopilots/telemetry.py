@@ -1,4 +1,4 @@
-"""What the bits of SYS_STATUS, EKF_STATUS_REPORT and ESTIMATOR_STATUS say, in words."""
+"""Names for the bits of SYS_STATUS, EKF_STATUS_REPORT and ESTIMATOR_STATUS, stream groups, and firmware versions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from aerokit.mavlink.messages import INDEX
 
 _E, _S = EstimatorStatusFlags, MavSysStatusSensor
 
+# The summary of all checks, not a sensor.
 PREARM_CHECK = _S.MAV_SYS_STATUS_PREARM_CHECK.value
-"""MAV_SYS_STATUS_PREARM_CHECK: the summary of all checks, not a sensor."""
 
 POS_HORIZ_ABS = _E.POS_HORIZ_ABS.value
 
+# Required, besides the position itself, to arm in a mode that needs a position.
 ATTITUDE_AND_HEIGHT = _E.ATTITUDE.value | _E.POS_VERT_ABS.value
-"""What arming in a mode that needs a position takes at least, besides the position itself."""
 
+# MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR)
 SENSORS: Mapping[int, str] = {
     _S.SENSOR_3D_GYRO.value: "gyroscope",
     _S.SENSOR_3D_ACCEL.value: "accelerometer",
@@ -51,8 +52,8 @@ SENSORS: Mapping[int, str] = {
     _S.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE.value: "obstacle avoidance",
     _S.PROPULSION.value: "propulsion",
 }
-"""MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR) in words."""
 
+# The bits that EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS have in common.
 ESTIMATES: Mapping[int, str] = {
     _E.ATTITUDE.value: "attitude",
     _E.VELOCITY_HORIZ.value: "horizontal velocity",
@@ -65,11 +66,10 @@ ESTIMATES: Mapping[int, str] = {
     _E.PRED_POS_HORIZ_REL.value: "predicted relative horizontal position",
     _E.PRED_POS_HORIZ_ABS.value: "predicted absolute horizontal position",
 }
-"""The bits that EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS have in common, in words."""
 
 
-def names_of(bits: int, names: Mapping[int, str]) -> tuple[str, ...]:
-    """The names of the bits that are set; a bit without a name is left out."""
+def bit_names(bits: int, names: Mapping[int, str]) -> tuple[str, ...]:
+    """Return the names of the bits that are set. Bits without a name are ignored."""
     return tuple(name for bit, name in names.items() if bits & bit)
 
 
@@ -120,18 +120,12 @@ _GROUPS: Mapping[int, tuple[str, ...]] = {
 
 _IDS: Mapping[str, int] = {row[0]: message_id for message_id, row in INDEX.items()}
 
-ARDUPILOT_GROUPS: Mapping[int, int] = {
-    _IDS[name]: group for group, names in _GROUPS.items() for name in names
-}
-"""Message id → MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp."""
+# Message id → MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp.
+ARDUPILOT_GROUPS: Mapping[int, int] = {_IDS[name]: group for group, names in _GROUPS.items() for name in names}
 
 _ALSO_STREAMED = (
     *("ActuatorControlTarget", "ActuatorOutputStatus", "Ahrs2", "Ahrs3", "Altitude", "AttitudeQuaternion"),
-    *(
-        "AttitudeTarget",
-        "Battery2",
-        "EfiStatus",
-    ),
+    *("AttitudeTarget", "Battery2", "EfiStatus"),
     *("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "GlobalPositionIntCov", "GpsStatus", "Gps2Raw"),
     *("HighLatency2", "HighresImu", "HilActuatorControls", "HygrometerSensor", "LocalPositionNedCov"),
     *("LocalPositionNedSystemGlobalOffset", "ManualControl", "NavControllerOutput", "ObstacleDistance"),
@@ -139,19 +133,19 @@ _ALSO_STREAMED = (
     *("PositionTargetLocalNed", "RawRpm", "ScaledImu", "UtmGlobalPosition", "WaterDepth", "WheelDistance"),
 )
 
-STREAMED = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
-"""Class names of the messages that come in streams, of any autopilot; the others are sent when there is need."""
+# Class names of messages that any autopilot sends as a stream. Others are sent when needed.
+STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
-_KINDS = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
-"""FIRMWARE_VERSION_TYPE: each kind begins at its number."""
+# First number of each FIRMWARE_VERSION_TYPE.
+_VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 
 
 class AutopilotVersion(Snapshot):
-    """Firmware and hardware of an autopilot.
+    """Firmware and hardware of an autopilot (AUTOPILOT_VERSION).
 
-    ``firmware`` is ``"4.7.0-dev"``, ``number`` its (major, minor, patch) for comparisons, ``git_hash`` the
-    beginning of the firmware's commit or an empty text. ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits;
-    ``uid`` identifies the hardware, 0 when it is not told.
+    ``firmware`` is for example ``"4.7.0-dev"``, ``number`` its (major, minor, patch), ``git_hash`` the beginning of the
+    commit hash or an empty string. ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits. ``uid`` identifies the hardware,
+    0 if not reported.
     """
 
     firmware: str
@@ -168,7 +162,7 @@ class AutopilotVersion(Snapshot):
 
 
 def version_text(flight_sw_version: int) -> tuple[str, tuple[int, int, int]]:
-    """Turn ``flight_sw_version`` into a text and its (major, minor, patch): ``("4.6.1-rc", (4, 6, 1))``."""
+    """Convert ``flight_sw_version`` to text and (major, minor, patch): ``("4.6.1-rc", (4, 6, 1))``."""
     major, minor, patch, kind = flight_sw_version.to_bytes(4, "big")
-    suffix = next(text for begin, text in _KINDS if kind >= begin)
+    suffix = next(text for first, text in _VERSION_TYPES if kind >= first)
     return f"{major}.{minor}.{patch}{suffix}", (major, minor, patch)

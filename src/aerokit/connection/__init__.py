@@ -1,1 +1,1 @@
-"""Where sans-IO protocols meet the event loop."""
+"""One MAVLink node: connections, cells and routes on the event loop."""

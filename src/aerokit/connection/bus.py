@@ -1,4 +1,4 @@
-"""Who wants which message: the bus decodes a frame once, when someone wants it, and never otherwise."""
+"""``Bus``: delivers messages and events to subscribers. A frame is decoded once, and only if a subscriber needs it."""
 
 from __future__ import annotations
 
@@ -26,57 +26,55 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.frame import Frame
 
-    Ender = Callable[[Exception], object]
+    EndCallback = Callable[[Exception], object]
 
-__all__ = ["Bus", "Detach", "Ending", "Overflow", "Sink", "Subscription", "once", "raisable"]
+__all__ = ["Bus", "Detach", "EndSignal", "Overflow", "Sink", "Subscription", "copy_exception", "once"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 Detach = Callable[[], None]
-"""Calling it ends an attachment; calling it again does nothing."""
+"""Ends an attachment. Calling it a second time does nothing."""
 
 Sink = Callable[[Any], None]
-"""Takes one message, frame or event; it must be quick and must not await."""
+"""Callback for one message, frame or event. It must return quickly; it cannot await."""
 
 EventT = TypeVar("EventT", bound=Event)
 
+# MESSAGE, FRAME or BOTH, and the sink.
 _Entry = tuple[int, Callable[..., None]]
-"""What it takes (`MESSAGE`, `FRAME`, `BOTH`), and who takes it."""
 
 MESSAGE, FRAME, BOTH = range(3)
 
-_Plan = tuple[bool, tuple[_Entry, ...]]
-"""Whether anyone takes the message, and all who take it or its frame."""
+# True if any sink needs the decoded message, and all sinks.
+_DeliveryPlan = tuple[bool, tuple[_Entry, ...]]
 
 EVERY_SYSTEM = 0
 
 
 class Bus:
-    """Brings messages and events to those who asked for them, in the order in which they attached.
+    """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` is the live set of message ids somebody wants: a framer that holds it builds no frame for the others.
+    ``wanted`` is the live set of message ids with a sink; a framer that holds it skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
-        self.wanted: dict[int, int] = {}
+        self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
-        self._plans: dict[int, _Plan] = {}  # system and message id → all sinks, when needed
+        self._plans: dict[int, _DeliveryPlan] = {}  # cache, by system and message id
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
 
     def attach(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
-        """Have every ``message_type`` of ``system_id`` (0: of every system) delivered to ``sink``."""
+        """Deliver every ``message_type`` of ``system_id`` (0: of every system) to ``sink``."""
         return self._attach((system_id, message_type.ID), (MESSAGE, sink))
 
-    def want(self, *message_types: type[Message]) -> None:
-        """Have frames of these made although nobody subscribes: who asks for this looks at them on their way here."""
-        for each in message_types:
-            self.attach(each, _ignore)
+    def require_frames(self, *message_types: type[Message]) -> None:
+        """Make the framer build frames of these types even without subscribers, for code that inspects every frame."""
+        for message_type in message_types:
+            self.attach(message_type, _ignore)
 
-    def attach_frames(
-        self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM
-    ) -> Detach:
-        """As :meth:`attach`, for who may never need what is in the message: ``sink`` gets the frame, not decoded."""
+    def attach_frames(self, message_type: type[Message], sink: Sink, *, system_id: int = EVERY_SYSTEM) -> Detach:
+        """Like :meth:`attach`, but ``sink`` gets the undecoded frame."""
         return self._attach((system_id, message_type.ID), (FRAME, sink))
 
     def attach_lazily(
@@ -86,27 +84,27 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """As :meth:`attach_frames`; ``sink`` gets the message as a second argument if somebody else has it decoded."""
+        """Like :meth:`attach_frames`; if another sink has the message decoded, ``sink`` gets it as second argument."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
-    def attach_first(
-        self, message_ids: Iterable[int], make: Callable[[], object], *, system_id: int = EVERY_SYSTEM
+    def create_on_first(
+        self, message_ids: Iterable[int], create: Callable[[], object], *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
-        """Call ``make()``, once, when the first of these messages comes; what it attaches to that kind gets it.
+        """Call ``create()`` once, when the first of these messages arrives; sinks that it attaches get that message.
 
-        Ahead of who attached before: none of them can have made it while the message is delivered.
+        The call happens before all sinks that are attached already.
         """
 
         def first(frame: Frame) -> None:
             before = self._plan(frame)[1]
-            make()
+            create()
             detach_all()
             for entry in self._plan(frame)[1]:
                 if entry not in before:
                     kind, sink = entry
                     sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
 
-        attached = [self._attach((system_id, each), (FRAME, first), ahead=True) for each in message_ids]
+        attached = [self._attach((system_id, message_id), (FRAME, first), ahead=True) for message_id in message_ids]
 
         def detach_all() -> None:
             for detach in attached:
@@ -115,17 +113,17 @@ class Bus:
         return detach_all
 
     def attach_event(self, event_type: type[EventT], sink: Callable[[EventT], None]) -> Detach:
-        """Have every event of this class and of its subclasses delivered to ``sink``."""
+        """Deliver every event of this class and of its subclasses to ``sink``."""
         self._event_sinks[event_type] = (*self._event_sinks.get(event_type, ()), sink)
         return once(lambda: self._detach_event(event_type, sink))
 
     def deliver(self, frame: Frame) -> None:
-        """Decode the frame if anyone wants it and hand it over; a sink that raises is logged, the others go on."""
+        """Deliver a frame, decoded if needed. Exceptions of sinks are logged; the other sinks still get it."""
         try:
-            is_read, entries = self._plans[frame.system_id << 24 | frame.message_id]
+            is_decoded, entries = self._plans[frame.system_id << 24 | frame.message_id]
         except KeyError:
-            is_read, entries = self._plan(frame)
-        if not is_read:  # nearly always: who takes frames, or both, takes the frame alone
+            is_decoded, entries = self._plan(frame)
+        if not is_decoded:  # the common case: FRAME and BOTH sinks take the frame alone
             for _, sink in entries:
                 try:
                     sink(frame)
@@ -145,7 +143,7 @@ class Bus:
                 _report(sink)
 
     def publish(self, event: Event) -> None:
-        """Hand an event to those who want its class."""
+        """Deliver an event to the sinks of its class and base classes."""
         for event_type in type(event).__mro__[:-1]:
             for sink in self._event_sinks.get(event_type, ()):
                 try:
@@ -160,8 +158,8 @@ class Bus:
         self.wanted[key[1]] = self.wanted.get(key[1], 0) + 1
         return once(lambda: self._detach(key, entry))
 
-    def _plan(self, frame: Frame) -> _Plan:
-        """Who gets such a frame: those of its system before those of every system; nobody if it cannot be decoded."""
+    def _plan(self, frame: Frame) -> _DeliveryPlan:
+        """Sinks for such a frame: those of its system first. Empty if the dialect cannot decode it."""
         system_id, message_id = frame.system_id, frame.message_id
         sinks = self._sinks.get((system_id, message_id), ()) if system_id != EVERY_SYSTEM else ()
         sinks += self._sinks.get((EVERY_SYSTEM, message_id), ())
@@ -185,7 +183,7 @@ class Bus:
 
 
 def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    """Take one occurrence of the sink out; deliveries under way keep the tuple they began with."""
+    """Remove one occurrence of the sink. Tuples are replaced, not changed: a delivery in progress keeps its own."""
     left = list(table[key])
     left.remove(sink)
     if left:
@@ -195,7 +193,7 @@ def _drop(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
 
 
 def once(action: Callable[[], None]) -> Detach:
-    """What calls ``action`` the first time it is called."""
+    """Return a function that calls ``action`` the first time it is called, and does nothing afterwards."""
     pending = [action]
 
     def detach() -> None:
@@ -210,60 +208,60 @@ def _ignore(message: object) -> None:
 
 
 def _report(sink: Callable[..., None]) -> None:
-    logger.exception("a subscriber (%r) raised; the message was delivered to the others", sink)
+    logger.exception("subscriber %r raised an exception; the message was delivered to the others", sink)
 
 
 ErrorT = TypeVar("ErrorT", bound=BaseException)
 
 
-def raisable(error: ErrorT) -> ErrorT:
-    """A copy of a kept error, to be raised once.
+def copy_exception(error: ErrorT) -> ErrorT:
+    """Return a copy of a stored exception, to be raised once.
 
-    One object raised again and again would gather the tracebacks of all who got it, keep their frames alive and pass
-    the context of one task to the next. ``__cause__`` says why, as in the original.
+    Raising one object repeatedly would collect the tracebacks of all tasks, keep their frames alive and pass the
+    context of one task to the next. The copy keeps ``__cause__``.
     """
     try:
         fresh = copy.copy(error)
-    except Exception:  # its constructor wants more than its args tell
+    except Exception:  # its constructor requires more than `args`
         return error.with_traceback(None)
     fresh.__cause__, fresh.__suppress_context__ = error.__cause__, error.__suppress_context__
     return fresh
 
 
-class Ending:
-    """Whether something has ended, by what, and who is told when it does."""
+class EndSignal:
+    """One-shot signal that something has ended with an error; calls back the registered functions."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
-        """What has ended it; None: it goes on."""
-        self._enders: list[Ender] = []
+        """The error that ended it; None while it is active."""
+        self._callbacks: list[EndCallback] = []
 
     def raise_if_ended(self) -> None:
-        """Raise what has ended it, if it has ended."""
+        """Raise a copy of :attr:`error` if it is set."""
         if self.error is not None:
-            raise raisable(self.error)
+            raise copy_exception(self.error)
 
-    def on_end(self, ender: Ender) -> Detach:
-        """Have ``ender(error)`` called at the end; at once if it has ended already."""
+    def on_end(self, callback: EndCallback) -> Detach:
+        """Call ``callback(error)`` at the end, or immediately if it has ended already."""
         if self.error is not None:
-            ender(self.error)
+            callback(self.error)
             return _nothing
-        self._enders.append(ender)
+        self._callbacks.append(callback)
 
         def detach() -> None:
-            if ender in self._enders:
-                self._enders.remove(ender)
+            if callback in self._callbacks:
+                self._callbacks.remove(callback)
 
         return detach
 
-    def tell(self, error: Exception) -> None:
-        """Tell everybody that it has ended by this error."""
-        enders, self._enders = self._enders, []
-        for ender in enders:
+    def notify(self, error: Exception) -> None:
+        """Call all registered functions with this error."""
+        callbacks, self._callbacks = self._callbacks, []
+        for callback in callbacks:
             try:
-                ender(error)
+                callback(error)
             except Exception:
-                logger.exception("a mistake at the end of a connection; the others are told all the same")
+                logger.exception("a callback for the end of a connection raised an exception; the others are called")
 
 
 def _nothing() -> None:
@@ -273,15 +271,14 @@ def _nothing() -> None:
 ItemT = TypeVar("ItemT")
 
 Overflow = Literal["drop_oldest", "drop_newest", "error"]
-"""What happens to an item that finds the queue full: the oldest goes, it goes itself, or the reader gets an error."""
+"""Policy for an item that arrives at a full queue: drop the oldest, drop the new one, or raise in the reader."""
 
 
 class Subscription(Generic[ItemT]):
-    """Items as they come, for one reader: registered on entry of its ``with``, gone at its exit.
+    """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
-    ``capacity=1`` with ``drop_oldest``, the default, is "always the latest": a reader slower than the stream never
-    sees an old value, and ``missed`` counts what it did not see. When the connection ends, what is queued can still
-    be read; then reading raises the reason.
+    The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped ones.
+    When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     def __init__(
@@ -294,13 +291,11 @@ class Subscription(Generic[ItemT]):
         if capacity < 1:
             raise InvalidArgument(f"capacity = {capacity} is not allowed: at least 1")
         if overflow not in ("drop_oldest", "drop_newest", "error"):
-            raise InvalidArgument(
-                f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'"
-            )
+            raise InvalidArgument(f"overflow = {overflow!r} is not allowed: 'drop_oldest', 'drop_newest' or 'error'")
+        # Explains in a time-out error why no items arrive; "" if unknown.
         self._explain_timeout: Callable[[], str] = str
-        """Says, for the text of a time-out, what keeps items from coming; empty when nothing is known."""
         self.missed: int = 0
-        """How many items were dropped because the reader was slow."""
+        """Number of items dropped because the reader was slow."""
         self._attach = attach
         self._detach: list[Detach] = []
         self._capacity, self._overflow = capacity, overflow
@@ -329,7 +324,7 @@ class Subscription(Generic[ItemT]):
     async def __anext__(self) -> ItemT:
         while not self._queue:
             if self._error is not None:
-                raise raisable(self._error)
+                raise copy_exception(self._error)
             if self._closed:
                 raise StopAsyncIteration
             await self._wait()
@@ -340,26 +335,24 @@ class Subscription(Generic[ItemT]):
         """Return the next item.
 
         Raises:
-            OperationTimeout: none came within ``timeout`` seconds.
+            OperationTimeout: no item arrived within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
-            InvalidArgument: it is read outside its ``with``.
+            InvalidArgument: the subscription is closed; read it inside its ``with`` block.
         """
         with anyio.move_on_after(timeout):
             try:
                 return await self.__anext__()
             except StopAsyncIteration:
-                raise InvalidArgument("this subscription is closed: read it inside its `with`") from None
+                raise InvalidArgument("the subscription is closed: read it inside its `with` block") from None
         why = self._explain_timeout()
-        raise OperationTimeout(
-            f"nothing came on this subscription within {timeout:g} s{f'; {why}' if why else ''}"
-        )
+        raise OperationTimeout(f"the subscription received nothing within {timeout:g} s{f'; {why}' if why else ''}")
 
     def get_nowait(self) -> ItemT | None:
-        """Return the next item if there is one."""
+        """Return the next item, or None if the queue is empty."""
         return self._queue.popleft() if self._queue else None
 
     def close(self, error: Exception | None = None) -> None:
-        """Take no more items; a waiting reader gets ``error``, or the end of the iteration without one."""
+        """Stop taking items. A waiting reader gets ``error``, or the end of the iteration if there is none."""
         for detach in self._detach:
             detach()
         self._detach = []
@@ -368,7 +361,7 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
-        if self._closed:  # in the middle of a delivery that had begun
+        if self._closed:  # closed by an earlier sink of the same delivery
             return
         if len(self._queue) < self._capacity:
             self._queue.append(item)
@@ -382,13 +375,11 @@ class Subscription(Generic[ItemT]):
             self._queue.popleft()
             self._queue.append(item)
         elif self._overflow == "error":
-            self.close(
-                SubscriptionOverflow(f"{self._capacity} items were waiting and were not read fast enough")
-            )
+            self.close(SubscriptionOverflow(f"the reader was too slow: {self._capacity} items are already queued"))
 
     async def _wait(self) -> None:
         if self._waiter is not None:
-            raise InvalidArgument("a subscription has one reader; open a second one for a second reader")
+            raise InvalidArgument("a subscription has one reader; open a second subscription for a second reader")
         self._waiter = asyncio.get_running_loop().create_future()
         try:
             await self._waiter

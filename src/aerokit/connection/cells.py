@@ -1,4 +1,4 @@
-"""``StateCell``: the latest value of one thing that a vehicle told, its age and source, and ways to wait."""
+"""``StateCell``: the latest value of one telemetry item, with its age and source, and ways to wait for it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Generic, NoReturn, Protocol, TypeVar
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.values import Snapshot
-from aerokit.connection.bus import raisable
+from aerokit.connection.bus import copy_exception
 from aerokit.errors import OperationTimeout, StaleValueError, ValueUnknownError
 
 __all__ = ["Changes", "Feed", "Source", "StateCell"]
@@ -20,25 +20,25 @@ T = TypeVar("T")
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-_SEEN = 3  # how many of the last distinct values a time-out names
+_NAMED_VALUES = 3  # distinct values that a time-out error lists
 
 
 class Feed(Protocol):
-    """What works out values only when somebody looks; it calls :meth:`StateCell.set`."""
+    """Decodes messages into cells on demand, by calling :meth:`StateCell.set`."""
 
     @property
     def pending(self) -> object:
-        """Whether something has come that was not worked out yet."""
+        """True if received messages are not decoded yet."""
 
     def catch_up(self) -> None:
-        """Work it out now."""
+        """Decode the pending messages now."""
 
     def watchers_changed(self) -> None:
-        """Somebody begins or ends to wait for values of one of the cells (their ``_is_watched``)."""
+        """Called when ``_is_watched`` of one of the cells may have changed."""
 
 
 class Source(Snapshot):
-    """Who said it: system id, component id and the name of the message it came in."""
+    """Origin of a value: system id, component id and message name."""
 
     system_id: int
     component_id: int
@@ -46,12 +46,11 @@ class Source(Snapshot):
 
 
 class StateCell(Generic[T]):
-    """The latest value of one thing: read it at once, ask for its age, wait for it, follow it.
+    """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
-    Reading never talks to the vehicle. ``clock`` gives the time in seconds (the event loop's), ``waits_for``
-    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread;
-    other threads may read it (never a torn value, and never one called younger than it is), but not wait or
-    write.
+    Reading never sends anything. ``clock`` returns seconds (event loop time); ``waits_for`` names the source messages
+    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (values are never torn,
+    and ages never too small), but must not wait or write.
     """
 
     __slots__ = (
@@ -81,13 +80,13 @@ class StateCell(Generic[T]):
         stamp: Callable[[], float] | None = None,
     ) -> None:
         self.name: str = name
-        """What it is the value of."""
+        """Name of the value, for error texts."""
         self._clock = clock
-        self._stamp = clock if stamp is None else stamp  # the time that a value set now came at
+        self._stamp = clock if stamp is None else stamp  # receive time of a value that is set now
         self.waits_for: str = waits_for
-        """The messages that the value comes from."""
+        """Names of the messages that carry the value."""
+        # Explains in a time-out error why no values arrive; "" if unknown.
         self._explain_timeout: Callable[[], str] = str
-        """Says, for the text of a time-out, what keeps values from coming; empty when nothing is known."""
         self._known = False
         self._latest: T | None = None
         self._source: Source | None = None
@@ -103,7 +102,7 @@ class StateCell(Generic[T]):
 
     @property
     def value(self) -> T:
-        """The latest value, however old; :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
         self._catch_up()
         if not self._known:
             raise ValueUnknownError(f"{self.name} is not known yet: no {self.waits_for} has been received")
@@ -117,40 +116,41 @@ class StateCell(Generic[T]):
 
     @property
     def is_known(self) -> bool:
-        """Whether a value has come."""
+        """True once a value has been received."""
         self._catch_up()
         return self._known
 
     @property
     def updated_at(self) -> float:
-        """When the latest value came, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
         self._catch_up()
         return self._updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value came; inf before the first."""
+        """Seconds since the latest value was received; inf before the first."""
         self._catch_up()
         return self._clock() - self._updated_at
 
     @property
     def source(self) -> Source | None:
-        """Who sent the latest value, and in which message; None before the first."""
+        """Sender and message of the latest value; None before the first."""
         self._catch_up()
         return self._source
 
     @checked
     def fresh(self, within: float) -> T:
-        """The latest value if it is at most ``within`` seconds old.
+        """Return the latest value if it is at most ``within`` seconds old.
 
-        Raises :class:`StaleValueError` when it is older, :class:`ValueUnknownError` when there is none.
+        Raises:
+            StaleValueError: the value is older.
+            ValueUnknownError: no value has been received.
         """
-        age = self.age  # before the value: read from another thread, it is never younger than the value is
+        age = self.age  # read before the value: another thread then never gets an age that is too small
         value = self.value
         if age > within:
             raise StaleValueError(
-                f"{self.name} is {age:.1f} s old, older than the {within:g} s asked for:"
-                f" no {self.waits_for} since"
+                f"{self.name} is {age:.1f} s old, the limit is {within:g} s: no {self.waits_for} since"
             )
         return value
 
@@ -165,11 +165,13 @@ class StateCell(Generic[T]):
         timeout: float | None = None,
         description: str = "",
     ) -> T:
-        """Wait until ``predicate(value)`` is true, ``held_for`` seconds on end, and return the value.
+        """Wait until ``predicate(value)`` has been true for ``held_for`` seconds, and return the value.
 
-        The predicate is tried on the present value and on every value that comes, so one that lasted a single
-        message is not missed; an exception of it is raised here. After ``timeout`` seconds
-        :class:`OperationTimeout` says what was waited for (``description``) and what was seen meanwhile.
+        The predicate is checked for the current value and for every value received, so a condition that lasts a
+        single message is not missed. Exceptions of the predicate are raised here.
+
+        Raises:
+            OperationTimeout: not reached within ``timeout`` seconds; the text has ``description`` and the last values.
         """
         self._raise_if_closed()
         waiter = _Waiter(self, predicate, held_for)
@@ -179,25 +181,22 @@ class StateCell(Generic[T]):
         return await waiter.wait(timeout, description)
 
     def changes(self) -> Changes[T]:
-        """Follow the values that differ from the one before; a slow reader gets the latest only.
+        """Iterate over values that differ from their predecessor, starting with the current one if there is one.
 
-        The present value, when there is one, comes first. Nothing is left behind when the loop is left early.
+        A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self, every_arrival=False)
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but each value that comes counts, also when it equals the one before."""
+        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
         return Changes(self, every_arrival=True)
 
     @checked
-    def observe(
-        self, callback: Callable[[T | None, T], None], *, every_arrival: bool = False
-    ) -> Callable[[], None]:
-        """Call ``callback(previous, value)`` at every change, inside :meth:`set`; returns what ends that.
+    def observe(self, callback: Callable[[T | None, T], None], *, every_arrival: bool = False) -> Callable[[], None]:
+        """Call ``callback(previous, value)`` on every change; return a function that ends this.
 
-        With ``every_arrival`` also when a value equals the one before.
-
-        The callback must be quick; what it raises is logged.
+        With ``every_arrival``, call it for every received value. The callback runs inside :meth:`set` and must return
+        quickly; its exceptions are logged.
         """
         observer = _Observer(self, callback, every_arrival)
         self._add(observer)
@@ -206,7 +205,7 @@ class StateCell(Generic[T]):
     # ------------------------------------------------------------------------------ writing
 
     def set(self, value: T, source: Source) -> None:
-        """Take ``value`` as the latest, and wake whoever waits for it."""
+        """Store a new value and wake the waiters."""
         if not self._known or value != self._latest:
             self._changes += 1
         self._latest = value
@@ -218,38 +217,37 @@ class StateCell(Generic[T]):
             for sink in tuple(self._sinks):
                 sink.receive(value)
 
-    def _grow_older(self, seconds: float) -> None:
-        """Count the time in which the clock stood still: the value is older by that."""
+    def _add_age(self, seconds: float) -> None:
+        """Make the value older, for time that the clock did not count (the computer slept)."""
         self._catch_up()
         self._updated_at -= seconds
 
     def forget(self) -> None:
-        """Make the value unknown again, as after a reboot; whoever waits goes on waiting."""
-        self._known = False  # the value itself stays for a thread that has just seen that it is known
+        """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
+        self._known = False  # `_latest` stays for a thread that has just seen `_known`
         self._source = None
         self._updated_at = -math.inf
         for sink in tuple(self._sinks):
             sink.forget()
 
     def _feed_from(self, *feeds: Feed) -> None:
-        """Say where values come from that are worked out when somebody looks."""
         self._feeds = feeds
 
     @property
     def _is_watched(self) -> bool:
-        """Whether somebody waits for values, observes or follows them, so that each one counts."""
+        """True while the cell has waiters, observers or iterators, so that every value must be decoded."""
         return bool(self._followers or self._sinks)
 
     def close(self, error: BaseException) -> None:
-        """No value will come any more: whoever waits, now or later, gets ``error``. Reading still works."""
+        """Raise ``error`` in current and later waiters, because no more values will arrive. Reading still works."""
         if self._closed_by is None:
             self._closed_by = error
             for sink in tuple(self._sinks):
-                sink.fail(raisable(error))
+                sink.fail(copy_exception(error))
 
     def _raise_if_closed(self) -> None:
         if self._closed_by is not None:
-            raise raisable(self._closed_by)
+            raise copy_exception(self._closed_by)
 
     def _catch_up(self) -> None:
         for feed in self._feeds:
@@ -259,51 +257,51 @@ class StateCell(Generic[T]):
     def _add(self, sink: _Sink[T]) -> None:
         self._catch_up()
         self._sinks.append(sink)
-        self._tell_feeds()
+        self._notify_feeds()
 
     def _remove(self, sink: _Sink[T]) -> None:
         self._sinks.remove(sink)
-        self._tell_feeds()
+        self._notify_feeds()
 
     def _follow(self) -> None:
         self._catch_up()
         self._followers += 1
-        self._tell_feeds()
+        self._notify_feeds()
 
     def _unfollow(self) -> None:
         self._followers -= 1
-        self._tell_feeds()
+        self._notify_feeds()
 
-    def _tell_feeds(self) -> None:
+    def _notify_feeds(self) -> None:
         for feed in self._feeds:
             feed.watchers_changed()
 
     def _describe(self) -> str:
         if not self.is_known:
-            return f"{self.name} is not known yet, no {self.waits_for} has been received"
+            return f"{self.name} is not known yet: no {self.waits_for} has been received"
         return f"{self.name} is {self._latest!r}, {self.age:.1f} s old"
 
     def __repr__(self) -> str:
         return f"<StateCell {self._describe()}>"
 
-    if not TYPE_CHECKING:  # type checkers know what a cell has
+    if not TYPE_CHECKING:  # type checkers know the attributes of a cell
 
         def __getattr__(self, name: str) -> NoReturn:
-            """``vehicle.position.latitude_deg``: the attribute is one of the value."""
+            """Suggest ``.value`` for an attribute of the value, e.g. ``vehicle.position.latitude_deg``."""
             if not name.startswith("_") and hasattr(self.latest, name):
                 raise AttributeError(f"{self.name} is a StateCell: did you mean .value.{name}?")
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def __bool__(self) -> NoReturn:
-        """``if vehicle.armed:`` would be true for ever."""
-        raise TypeError(f"a StateCell is neither true nor false: write .value or .latest behind {self.name}")
+        """Raise TypeError, because ``if vehicle.armed:`` would always be true."""
+        raise TypeError(f"a StateCell has no truth value: use {self.name}.value or {self.name}.latest")
 
 
 class Changes(AsyncIterator[T]):
-    """An endless asynchronous iterator over a cell; the latest value wins.
+    """Endless asynchronous iterator over the values of a cell.
 
-    Raises the error that the cell was closed with. It is registered at the cell only while it waits. Until it is
-    dropped, each value is decoded as it comes.
+    Raises the error that the cell was closed with. Until the iterator is garbage-collected, every received message of
+    the cell is decoded.
     """
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
@@ -319,7 +317,7 @@ class Changes(AsyncIterator[T]):
 
     @property
     def missed(self) -> int:
-        """How many values were overwritten before this reader came to them."""
+        """Number of values that were replaced before this reader got them."""
         return self._missed
 
     def __aiter__(self) -> Changes[T]:
@@ -344,7 +342,7 @@ class Changes(AsyncIterator[T]):
 
 
 class _Sink(Generic[T]):
-    """What a cell tells when something happens to it."""
+    """Receiver of the notifications of a cell."""
 
     __slots__ = ()
 
@@ -352,14 +350,14 @@ class _Sink(Generic[T]):
         raise NotImplementedError
 
     def forget(self) -> None:
-        """The value became unknown."""
+        """Handle that the value became unknown."""
 
     def fail(self, error: BaseException) -> None:
-        """The cell was closed."""
+        """Handle that the cell was closed."""
 
 
 class _Waiter(_Sink[T]):
-    """One call of ``wait_until``: a future, and at most one timer for ``held_for``."""
+    """One call of ``wait_until``: a future, and a timer for ``held_for``."""
 
     __slots__ = (
         "_cell",
@@ -381,13 +379,11 @@ class _Waiter(_Sink[T]):
         self._future: asyncio.Future[T | None] = self._loop.create_future()
         self._error: BaseException | None = None
         self._hold_timer: asyncio.TimerHandle | None = None
-        self._seen: deque[T] = deque(maxlen=_SEEN)
+        self._seen: deque[T] = deque(maxlen=_NAMED_VALUES)
         self._seen_count = 0
 
     async def wait(self, timeout: float | None, description: str) -> T:
-        timer = (
-            None if timeout is None else self._loop.call_later(timeout, self._expire, timeout, description)
-        )
+        timer = None if timeout is None else self._loop.call_later(timeout, self._expire, timeout, description)
         try:
             value = await self._future
         finally:
@@ -402,10 +398,10 @@ class _Waiter(_Sink[T]):
     def receive(self, value: T) -> None:
         if self._future.done():
             return
-        self._note(value)
+        self._record(value)
         try:
             holds = bool(self._predicate(value))
-        except Exception as error:  # the predicate belongs to the one who waits, so does its error
+        except Exception as error:  # a predicate's exception belongs to the caller of wait_until
             self.fail(error)
             return
         if not holds:
@@ -419,7 +415,7 @@ class _Waiter(_Sink[T]):
         self._stop_hold()
 
     def fail(self, error: BaseException) -> None:
-        # Not set_exception: a caller cancelled just now would leave it unread, and the loop complains.
+        # Not set_exception: asyncio logs an exception that a cancelled caller never retrieves.
         if not self._future.done():
             self._error = error
             self._future.set_result(None)
@@ -436,7 +432,7 @@ class _Waiter(_Sink[T]):
     def _expire(self, timeout: float, description: str) -> None:
         self.fail(OperationTimeout(self._timeout_text(timeout, description)))
 
-    def _note(self, value: T) -> None:
+    def _record(self, value: T) -> None:
         self._seen_count += 1
         if not self._seen or self._seen[-1] != value:
             self._seen.append(value)
@@ -452,13 +448,11 @@ class _Waiter(_Sink[T]):
 
 
 class _Observer(_Sink[T]):
-    """A callback for every change."""
+    """A callback registered by ``observe``."""
 
     __slots__ = ("_callback", "_cell", "_every_arrival", "_previous")
 
-    def __init__(
-        self, cell: StateCell[T], callback: Callable[[T | None, T], None], every_arrival: bool
-    ) -> None:
+    def __init__(self, cell: StateCell[T], callback: Callable[[T | None, T], None], every_arrival: bool) -> None:
         self._cell = cell
         self._every_arrival = every_arrival
         self._callback = callback
@@ -469,8 +463,8 @@ class _Observer(_Sink[T]):
         if self._every_arrival or previous is None or previous != value:
             try:
                 self._callback(previous, value)
-            except Exception:  # what one observer does wrong must not keep the state from the others
-                logger.exception("an observer of %s raised", self._cell.name)
+            except Exception:  # a faulty observer must not keep the value from the others
+                logger.exception("an observer of %s raised an exception", self._cell.name)
 
     def forget(self) -> None:
         self._previous = None

@@ -1,4 +1,4 @@
-"""``Connection``: we, as one MAVLink node on one link, with our heartbeat, our bus and our routes."""
+"""``Connection``: this program as one MAVLink node on a link."""
 
 from __future__ import annotations
 
@@ -12,15 +12,20 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import anyio
 
 from aerokit._internal.arguments import checked
-from aerokit.connection.bus import Bus, Ending, Overflow, Subscription
+from aerokit.connection.bus import Bus, EndSignal, Overflow, Subscription
 from aerokit.connection.cells import StateCell
-from aerokit.connection.components import found_by
-from aerokit.connection.frame_receiver import Intake
-from aerokit.connection.link_state import LinkStateWatch
-from aerokit.connection.own_heartbeat import BLOCKING_FED_WITHIN_S, HeartbeatSwitch, OwnHeartbeat, ProofOfLife
-from aerokit.connection.routes import MOST_ROUTES, Routes
+from aerokit.connection.frame_receiver import FrameReceiver
+from aerokit.connection.heartbeats import (
+    BLOCKING_MAX_IDLE_S,
+    ActivityMonitor,
+    HeartbeatWatchdog,
+    LinkStateTracker,
+    OwnHeartbeat,
+    discovery_event,
+)
+from aerokit.connection.routes import MAX_ROUTES, Routes
 from aerokit.connection.signatures import SignatureGate, check_signing
-from aerokit.connection.tasks import Background, Deadlines
+from aerokit.connection.tasks import BackgroundTasks, Deadlines
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.events import (
     Event,
@@ -46,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 
     from aerokit.connection.bus import Detach, Sink
-    from aerokit.connection.multilink.routes import SeveralRoutes
+    from aerokit.connection.multilink.routes import MultiLinkRoutes
     from aerokit.errors import LinkOpenError
     from aerokit.events import LinkStatus
     from aerokit.mavlink.dialect import Dialect
@@ -54,21 +59,21 @@ if TYPE_CHECKING:
     from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.transport.link import Peer
 
-    Tap = Callable[[Frame, Peer], object]
+    FrameObserver = Callable[[Frame, Peer], object]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
-HEARTBEAT_PERIOD_S = 1.0
+HEARTBEAT_INTERVAL_S = 1.0
 
 
 class Connection:
     """One MAVLink node (system id, component id) on one link.
 
-    Frames come in through ``bytes_received``, are checked by one framer for each remote peer, and go to ``bus``. Who
-    may speak in whose name is said in :class:`aerokit.connection.routes.Routes`; ``may_move`` is its own.
-    ``send`` numbers a message and writes it to where its target was last heard. Everything runs on the loop's thread.
+    Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
+    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which peer
+    that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     def __init__(
@@ -90,7 +95,7 @@ class Connection:
         _check_version(mavlink_version)
         if dialect.get(Heartbeat.ID) is not Heartbeat:
             raise InvalidArgument(
-                f"dialect {dialect.name!r} has no HEARTBEAT: pass Dialect.extended_by of the standard one"
+                f"dialect {dialect.name!r} has no HEARTBEAT: pass the standard dialect, or one extended from it"
             )
         self.link = link
         self.bus: Bus = Bus(dialect)
@@ -98,45 +103,41 @@ class Connection:
         self.source_component: int = source_component
         self.attached: set[int] = set()
         """System ids that have a vehicle object on this connection."""
+        # (system id, component id) → function from loop time to milliseconds since boot; None while unknown.
         self.boot_clocks: dict[tuple[int, int], Callable[[float], float | None]] = {}
-        """Of some (system id, component id): its time since boot in milliseconds, by our time; None while unknown."""
         self.link_state: StateCell[LinkState] = StateCell("link_state", self.now, "frame")
-        """Whether frames come at all, from whomever; ``vehicle.link_state`` is about one vehicle."""
+        """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
         self.deadlines: Deadlines = Deadlines()
-        """What has to happen at a time, as long as the connection is open."""
         self._clock = asyncio.get_running_loop().time
-        self._wall_at_0 = time.time() - self._clock()
+        self._unix_epoch_s = time.time() - self._clock()
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
-        make_routes = partial(
-            Routes, link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move
-        )
-        self._several = self._make_several(make_routes) if link.is_several else None
-        self._routes: Routes | SeveralRoutes = self._several or make_routes()
-        self._intake = Intake(link, self.bus, self._routes, self._several, self._gate, self._clock)
-        self._taps = self._intake.taps
-        self.heard: dict[tuple[int, int], Heartbeat] = self._intake.heard
-        """The last HEARTBEAT of every (system id, component id) on the link."""
+        make_routes = partial(Routes, link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
+        self._multilink = self._make_multilink(make_routes) if link.is_multilink else None
+        self._routes: Routes | MultiLinkRoutes = self._multilink or make_routes()
+        self._receiver = FrameReceiver(link, self.bus, self._routes, self._multilink, self._gate, self._clock)
+        self._observers = self._receiver.observers
+        self.heartbeats: dict[tuple[int, int], Heartbeat] = self._receiver.heartbeats
+        """Last HEARTBEAT of every (system id, component id) on the link."""
         self.keeps_peers = True
-        self._background = Background(self.fail)
+        self._background = BackgroundTasks(self.fail)
         self._is_on_link = True
-        self._state_watch = LinkStateWatch(self.link_state, self.bus, system_id=0)
-        self._ending = Ending()
-        self._heartbeat = (
-            None if heartbeat is None else HeartbeatSwitch(heartbeat, self._clock, self.bus.publish)
-        )
+        self._state_watch = LinkStateTracker(self.link_state, self.bus, system_id=0)
+        self._end_signal = EndSignal()
+        self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
 
-    def _make_several(self, make_routes: Callable[[], Routes]) -> SeveralRoutes:
-        from aerokit.connection.multilink.routes import SeveralRoutes
-        from aerokit.transport.several import SeveralLinks  # few programs have several
+    def _make_multilink(self, make_routes: Callable[[], Routes]) -> MultiLinkRoutes:
+        # Imported here because few programs have several links.
+        from aerokit.connection.multilink.routes import MultiLinkRoutes
+        from aerokit.transport.multilink import MultiLink
 
-        assert isinstance(self.link, SeveralLinks)
-        return SeveralRoutes(
+        assert isinstance(self.link, MultiLink)
+        return MultiLinkRoutes(
             self.link,
             make_routes,
             self.bus,
-            we=(self.source_system, self.source_component),
+            own_source=(self.source_system, self.source_component),
             attached=self.attached,
             send=self._send_to_peer,
             now=self.now,
@@ -146,11 +147,11 @@ class Connection:
 
     @checked
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Number, frame and write a message; never blocks.
+        """Number, frame and write a message. Never blocks.
 
-        It goes to where its ``target_component`` of the system ``to`` (None: its ``target_system``) was last heard;
-        to every peer with components of that system when it names none of them; and to every peer when it is for all
-        or for one that was never heard.
+        It goes to the peer behind which its ``target_component`` of system ``to`` (None: its ``target_system``) was
+        last received; if it names no component, to every peer with components of that system; if its target is
+        broadcast or unknown, to every peer.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -160,67 +161,67 @@ class Connection:
         now = 0.0 if self._encoder.signing is None else self.unix_time()
         data = self._encoder.encode(message, now)
         self._write(data, message, to)
-        self._taps.give_sent(data)
+        self._observers.notify_sent(data)
 
     @checked
     def write_raw(self, data: bytes) -> None:
-        """Write one whole frame of somebody else as it is, for programs that forward; never blocks.
+        """Write one complete frame of another sender unchanged, for programs that forward frames. Never blocks.
 
-        It goes where :meth:`send` would send its message: where its target was last heard, or to every peer. Its
-        signature, or that it has none, stays as it is.
+        It goes to the peers that :meth:`send` would choose for its message. A signature is kept.
 
         Raises:
-            InvalidArgument: this is not exactly one MAVLink frame; nothing was sent.
+            InvalidArgument: ``data`` is not exactly one MAVLink frame; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
         if not is_whole_frame(data):
             raise InvalidArgument(
-                f"{len(data)} bytes beginning with {bytes(data[:3]).hex()!r} are not one frame"
+                f"data is not exactly one MAVLink frame: {len(data)} bytes starting with {bytes(data[:3]).hex()!r}"
             )
         frame = Frame.parse(bytes(data))
-        known = self.bus.dialect.get(frame.message_id)
-        self._write(frame.raw, None if known is None else self.bus.dialect.decode(frame), None)
+        message_type = self.bus.dialect.get(frame.message_id)
+        self._write(frame.raw, None if message_type is None else self.bus.dialect.decode(frame), None)
 
     def feed(self) -> None:
-        """Show that the program runs: our heartbeat is sent for another ``fed_within_s`` seconds (`OwnHeartbeat`).
+        """Show that the program is running: our heartbeat continues for ``fed_within_s`` seconds (`OwnHeartbeat`).
 
-        Any thread may call it.
+        May be called from any thread.
         """
         if self._heartbeat is not None:
-            self._heartbeat.proof.feed()
+            self._heartbeat.activity.feed()
 
-    def _prove_life_by(self, proof: ProofOfLife) -> None:
-        """The program calls from other threads than the loop's, which goes on when it hangs."""
+    def _use_activity_monitor(self, activity: ActivityMonitor) -> None:
+        """Pause our heartbeat when the program's own threads hang; the loop's thread would keep running."""
         if self._heartbeat is not None:
-            self._heartbeat.require(proof, BLOCKING_FED_WITHIN_S)
+            self._heartbeat.require(activity, BLOCKING_MAX_IDLE_S)
 
     @property
     def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
-        """How each of several links does; None where there is one link only. Told once a second, and at each change."""
-        return None if self._several is None else self._several.status
+        """Status of each of several links, updated once a second and on every change; None with a single link."""
+        return None if self._multilink is None else self._multilink.status
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that were sent and have not left this machine, as far as the link can tell: they may still arrive.
+        """Bytes sent but still on this machine, as far as the link can tell; they may still be transmitted.
 
-        Above 0 for longer than a moment when a link does not drain (TCP without a network, a serial port that is held
-        up): :class:`LinkStalled`. 0 for UDP.
+        A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
+        control asserted): :class:`LinkStalled`. Always 0 for UDP.
         """
         return self.link.unsent_bytes
 
     def discard_unsent(self) -> None:
-        """Take back what was sent and has not left, as far as that is possible: an order that is not wanted any more.
+        """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        All that waits goes, whoever it is for. What the system has of a TCP connection stays in :attr:`unsent_bytes`.
+        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and stays
+        in :attr:`unsent_bytes`.
         """
         self.link.discard_unsent()
 
     @property
     def mavlink_version(self) -> int:
-        """Of what we send, 1 or 2. MAVLink 1 has no message ids above 255 and no extension fields.
+        """MAVLink version of sent messages, 1 or 2. MAVLink 1 has no message ids above 255 and no extension fields.
 
-        May be set while the connection is open, to what the vehicle speaks; InvalidArgument for another number.
+        May be set while the connection is open. Other numbers raise InvalidArgument.
         """
         return self._encoder.version
 
@@ -232,10 +233,10 @@ class Connection:
 
     @property
     def signing(self) -> Signing | None:
-        """What signs the frames that we send and checks those that we receive; None: neither.
+        """Key that signs sent frames and verifies received ones; None: frames are neither signed nor verified.
 
-        It has the time stamp to keep (``signing.timestamp``) and counts refused frames (``signing.refused``). May be
-        set while the connection is open; InvalidArgument while we send MAVLink 1, which has no signatures.
+        ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
+        the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
         """
         return self._encoder.signing
 
@@ -251,10 +252,10 @@ class Connection:
         capacity: int = 1,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
-        """Return a stream of these messages or events, of one system (or of all: 0), for use in a ``with`` block.
+        """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
 
         Raises:
-            InvalidArgument: no type, or a type that the dialect does not hold.
+            InvalidArgument: no type is given, or the dialect does not have it.
         """
         self.check_types(types)
 
@@ -265,7 +266,7 @@ class Connection:
         return subscription
 
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
-        """Each autopilot once: those that were heard already, then those that will be, until the connection ends.
+        """Yield each autopilot once, those already received first, until the connection ends.
 
         ``async for found in connection.vehicles(): async with aerokit.connect(connection, system_id=found.system_id)…``
 
@@ -273,36 +274,36 @@ class Connection:
             ConnectionClosed, LinkLost: the connection ended.
         """
         self.raise_if_ended()
-        with self.subscribe(VehicleFound, capacity=MOST_ROUTES) as news:
-            known = [found_by(heartbeat, self.now(), *source) for source, heartbeat in self.heard.items()]
+        with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
+            known = [discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()]
             for found in known:
                 if isinstance(found, VehicleFound):
                     yield found
-            async for each in news:
-                yield each
+            async for found in discoveries:
+                yield found
 
     def attach(self, types: Sequence[type[Any]], sink: Sink, *, system_id: int = 0) -> list[Detach]:
-        """Have these messages and events, of one system or of all (0), delivered to ``sink``."""
+        """Deliver these messages and events, of one system (0: of all), to ``sink``."""
         return [self._attach(item, sink, system_id) for item in types]
 
-    def tap(self, sink: Tap) -> Detach:
-        """Have every frame that is received given to ``sink(frame, peer)``, after those who subscribed to its message.
+    def observe_frames(self, callback: FrameObserver) -> Detach:
+        """Call ``callback(frame, peer)`` with every received frame, after the subscribers of its message.
 
-        Frames of messages that the dialect does not know come too, their checksums unchecked; what a second peer says
-        in the name of a component of the first (:class:`HeardTwice`) does not. ``sink`` must be quick and must not
-        await; what it raises is logged. While nobody taps, frames that nobody subscribed to are not even made.
+        Frames of message ids outside the dialect are included, with unchecked checksums; refused frames of a second
+        peer under the ids of a known component are not. The callback must return quickly; its exceptions are logged.
+        Without observers, frames without subscribers are not even built.
         """
-        return self._taps.add(sink)
+        return self._observers.add(callback)
 
-    def tap_sent(self, sink: Callable[[bytes], object]) -> Detach:
-        """Have every frame of our own that is sent given to ``sink(raw)``, signed if we sign; not those of `write_raw`.
+    def observe_sent_frames(self, callback: Callable[[bytes], object]) -> Detach:
+        """Call ``callback(raw)`` with every frame that :meth:`send` writes, signature included; not with `write_raw`.
 
-        ``sink`` must be quick and must not await; what it raises is logged.
+        The callback must return quickly; its exceptions are logged.
         """
-        return self._taps.add_sent(sink)
+        return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument unless each of these can be subscribed to."""
+        """Raise InvalidArgument unless all types can be subscribed to."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -311,150 +312,150 @@ class Connection:
             if issubclass(item, Message) and self.bus.dialect.get(item.ID) is None:
                 raise InvalidArgument(f"{item.NAME} is not in this connection's dialect")
 
-    def on_end(self, ender: Callable[[Exception], None]) -> Detach:
-        """Have ``ender(error)`` called when the connection ends; at once if it has ended already."""
-        return self._ending.on_end(ender)
+    def on_end(self, callback: Callable[[Exception], None]) -> Detach:
+        """Call ``callback(error)`` when the connection ends, or immediately if it has ended already."""
+        return self._end_signal.on_end(callback)
 
     # ---------------------------------------------------------------------------------- state
 
     @property
     def is_open(self) -> bool:
-        """Whether messages can still be sent and received."""
-        return self._ending.error is None
+        """True while messages can be sent and received."""
+        return self._end_signal.error is None
 
     def raise_if_ended(self) -> None:
-        """Raise what ended the connection (ConnectionClosed, LinkLost), if it has ended."""
-        self._ending.raise_if_ended()
+        """Raise the error that ended the connection (ConnectionClosed, LinkLost), if it has ended."""
+        self._end_signal.raise_if_ended()
 
-    def heard_at(self, system_id: int, component_id: int) -> float:
-        """When the last HEARTBEAT of a component came, on :meth:`now`'s clock; −inf: none has."""
-        heartbeat = self.heard.get((system_id, component_id))
+    def last_heartbeat_at(self, system_id: int, component_id: int) -> float:
+        """Return the receive time of a component's last HEARTBEAT, on the clock of :meth:`now`; −inf if none."""
+        heartbeat = self.heartbeats.get((system_id, component_id))
         frame = None if heartbeat is None else heartbeat.received_frame
         return -math.inf if frame is None else frame.received_at
 
     def now(self) -> float:
-        """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
+        """Return the event loop's time in seconds; all ages and deadlines use this clock."""
         return self._clock()
 
     @checked
     def new_cell(self, name: str, waits_for: str) -> StateCell[Any]:
-        """Make a cell whose values are as old as the messages they came in; see :class:`StateCell`."""
+        """Make a cell whose values are time-stamped with the receive time of their message; see :class:`StateCell`."""
         return StateCell(name, self.now, waits_for, stamp=self.arrived_at)
 
     def arrived_at(self) -> float:
-        """When the message that is delivered now arrived, on the clock of :meth:`now`; the time stamp of cells.
+        """Return the receive time of the message being delivered, on the clock of :meth:`now`.
 
-        That is earlier than now if the event loop was kept from reading: the message may have waited in the socket.
+        It is earlier than now if the event loop was blocked: the message may have waited in the socket.
         """
-        return self._intake.arrived_at()
+        return self._receiver.arrived_at()
 
     def unix_time(self) -> float:
-        """Seconds since 1970, as the system had them at the beginning, gone on by :meth:`now`: nobody sets it back."""
-        return self._wall_at_0 + self._clock()
+        """Return seconds since 1970: the system time at the start, advanced by :meth:`now`. It never jumps."""
+        return self._unix_epoch_s + self._clock()
 
-    def describe_signatures(self, system_id: int = 0, component_id: int = 0) -> str:
-        """What signatures keep from us, or us from this component (0: all), for error texts; empty when nothing."""
+    def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
+        """Describe for error texts which signatures block communication with this component (0: any); "" if none."""
         return self._gate.describe(
             heartbeat
-            for (system, component), heartbeat in self.heard.items()
+            for (system, component), heartbeat in self.heartbeats.items()
             if system == system_id and component_id in (0, component)
         )
 
     def statistics(self) -> Iterator[FramerStatistics]:
-        """The counters of every peer that is remembered."""
-        return self._intake.statistics()
+        """Iterate over the counters of every remembered peer."""
+        return self._receiver.statistics()
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Frames of this system that were received, and frames that its sequence numbers say were lost."""
-        return self._intake.counts(system_id)
+        """Return how many frames of this system were received, and how many were lost by sequence number."""
+        return self._receiver.counts(system_id)
 
     def close(self, error: Exception | None = None) -> None:
-        """End it: what waits gets ``error``, the link closes, our tasks are cancelled. Never blocks; idempotent.
+        """Close the link, cancel background tasks and raise ``error`` in all waiters. Never blocks; idempotent.
 
-        Inside the connection's block as well: the block goes on, and whatever it asks of the connection raises.
+        May be called inside the connection's block; the block continues, and its calls on the connection raise.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
         if self._is_on_link:
             self.link.close()
-        self._taps.close()
+        self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close it because of a mistake inside aerokit: whoever waits is told, and it never surfaces elsewhere."""
+        """Close the connection because of an internal error of aerokit. Waiters get it as the cause of their error."""
         if not self.is_open and isinstance(error, AerokitError):
-            return  # a task of ours was told of the end
-        logger.error("a mistake inside aerokit closes the connection", exc_info=error)
-        closed = ConnectionClosed(f"a mistake inside aerokit closed the connection: {error!r}")
+            return  # a background task got the connection's own error
+        logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
+        closed = ConnectionClosed(f"an internal error of aerokit closed the connection: {error!r}")
         closed.__cause__ = error
         self.close(closed)
 
     def record(self, path: str | os.PathLike[str]) -> None:
-        """Write everything sent and received from now on to a ``.tlog`` file, until the connection is closed.
+        """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
         Raises:
             LinkOpenError: the file cannot be written.
-            BusyError: a recording is under way.
+            BusyError: the connection is already being recorded.
             ConnectionClosed, LinkLost: the connection has ended.
         """
         self.raise_if_ended()
-        self._taps.record(path, self._clock())
+        self._observers.record(path, self._clock())
 
-    # -------------------------------------------------------------------- what the link calls
+    # -------------------------------------------------------- called by the link (transport.link.Receiver)
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Take bytes off the link (called by the link); never raises."""
+        """Process received bytes. Never raises."""
         try:
-            self._intake.receive(data, peer)
+            self._receiver.receive(data, peer)
         except Exception as error:
             self.fail(error)
 
     def link_interrupted(self, error: LinkLost) -> None:
-        """The link has gone and is being opened again (called by the link)."""
-        self._state_watch.lost(self._clock())
+        """Handle that the link was lost and is being reopened."""
+        self._state_watch.mark_lost(self._clock())
         self.bus.publish(LinkInterrupted(self._clock(), 0, error))
 
     def link_restored(self, away_s: float) -> None:
-        """The link is back (called by the link)."""
-        self._intake.begin_anew()
-        self._state_watch.heard(self._clock())
+        """Handle that the link is open again."""
+        self._receiver.reset()
+        self._state_watch.record_activity(self._clock())
         self.bus.publish(LinkRestored(self._clock(), 0, away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """What is written does not leave (called by the link)."""
+        """Handle that written data does not leave."""
         self.bus.publish(LinkStalled(self._clock(), 0, unsent_bytes))
 
     def link_drained(self, stalled_s: float) -> None:
-        """It does again (called by the link)."""
+        """Handle that written data leaves again."""
         self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
 
-    def one_link_changed(self, link: int, is_there: bool) -> None:
-        """One of several links has gone or is there again (called by the link)."""
-        if self._several is not None:
-            self._several.link_changed(link, is_there)
+    def member_link_changed(self, link: int, is_available: bool) -> None:
+        """Handle that one of several links was lost or is available again."""
+        if self._multilink is not None:
+            self._multilink.link_changed(link, is_available)
 
-    def one_link_stalled(self, link: int, is_stalled: bool) -> None:
-        """What is written to one of several links does not leave, or does again (called by the link)."""
-        if self._several is not None:
-            self._several.link_stalled(link, is_stalled)
+    def member_link_stalled(self, link: int, is_stalled: bool) -> None:
+        """Handle that data written to one of several links does not leave, or leaves again."""
+        if self._multilink is not None:
+            self._multilink.link_stalled(link, is_stalled)
 
-    def one_link_not_opened(self, link: int, error: LinkOpenError) -> None:
-        """One of several links could not be opened, and is tried again (called by the link)."""
-        if self._several is not None:
-            self._several.link_not_opened(link, error)
+    def member_link_open_failed(self, link: int, error: LinkOpenError) -> None:
+        """Handle that one of several links could not be opened and will be retried."""
+        if self._multilink is not None:
+            self._multilink.link_open_failed(link, error)
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
-        """The other side of a network let no order of ours through (called by the link)."""
-        self.bus.publish(OrderRefused(self._clock(), 0, message, reason, helm))
-        for answer in answers:  # past the framers: they are nobody's of those that they count
+    def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
+        """Handle that the other end of a zenoh network refused one of our commands."""
+        self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
+        for answer in answers:  # not through a framer: its counters are for received frames only
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
-        """The link has gone (called by the link): whatever waits ends with this error."""
+        """Handle that the link was lost for good: all waiters get this error."""
         self._end(error)
 
-    # ------------------------------------------------------------------------------- inside
+    # ------------------------------------------------------------------------------- internal
 
     async def _open_link(self) -> None:
-        """Open the link; one that is open already is somebody else's, and stays as it is."""
+        """Open the link. If it is already open, it belongs to another connection and is not closed."""
         try:
             await self.link.open(self)
         except BusyError:
@@ -466,33 +467,33 @@ class Connection:
             await self.link.wait_closed()
 
     def _start(self) -> None:
-        self._state_watch.heard(self._clock())
-        self._intake.start()
+        self._state_watch.record_activity(self._clock())
+        self._receiver.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
-        if self._several is not None:
-            self._background.start(self._several.watch, "aerokit links")
+        if self._multilink is not None:
+            self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
         while self.is_open:
-            if self._heartbeat is not None and self._heartbeat.is_on():
+            if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
-            self._gate.tell_keeping()
-            self._state_watch.count(self._clock(), sum(each.frames for each in self.statistics()))
-            self._taps.flush()
-            await anyio.sleep(HEARTBEAT_PERIOD_S)
+            self._gate.log_storage_errors()
+            self._state_watch.update(self._clock(), sum(each.frames for each in self.statistics()))
+            self._observers.flush()
+            await anyio.sleep(HEARTBEAT_INTERVAL_S)
 
     def _end(self, error: Exception) -> None:
         if not self.is_open:
             return
-        self._ending.error = error
-        self._intake.close()
-        self._state_watch.lost(self._clock(), is_told=isinstance(error, LinkLost))
+        self._end_signal.error = error
+        self._receiver.close()
+        self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
-        if self._several is not None:
-            self._several.status.close(error)
+        if self._multilink is not None:
+            self._multilink.status.close(error)
         if isinstance(error, LinkLost):
             self.bus.publish(LinkClosed(self._clock(), 0, error))
-        self._ending.tell(error)
+        self._end_signal.notify(error)
         self.deadlines.close()
         self._background.cancel()
 
@@ -500,14 +501,14 @@ class Connection:
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)
-        self._taps.keep_sent(data, self._clock())
+        self._observers.record_sent(data, self._clock())
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
-        """Number, frame and write a message to one peer, whoever is behind it; for what is asked over each link."""
+        """Number, frame and write a message to one peer, e.g. a probe over each of several links."""
         now = 0.0 if self._encoder.signing is None else self.unix_time()
         data = self._encoder.encode(message, now)
         self.link.write(data, peer)
-        self._taps.keep_sent(data, self._clock())
+        self._observers.record_sent(data, self._clock())
 
     def _attach(self, item: type[Any], sink: Sink, system_id: int) -> Detach:
         if issubclass(item, Message):
@@ -516,7 +517,7 @@ class Connection:
 
 
 def _only(system_id: int, sink: Sink) -> Sink:
-    """Let events of this system through, and those of the link as a whole."""
+    """Wrap a sink so that it gets only events of this system and of the link as a whole."""
 
     def filtered(event: Event) -> None:
         if event.system_id in (0, system_id):

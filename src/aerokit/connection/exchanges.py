@@ -1,4 +1,4 @@
-"""Runs a sans-IO exchange on the event loop: one future, one deadline, and nothing left of either afterwards."""
+"""Runs a sans-IO exchange on the event loop, with one future and one deadline."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import asyncio
 from functools import partial
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from aerokit.connection.bus import raisable
-from aerokit.events import LinkChosen
+from aerokit.connection.bus import copy_exception
+from aerokit.events import LinkSelected
 
 if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
@@ -18,19 +18,17 @@ ResultT = TypeVar("ResultT")
 
 
 async def run_exchange(connection: Connection, system_id: int, exchange: Exchange[ResultT]) -> ResultT:
-    """Run ``exchange`` with the vehicle ``system_id`` to its end and return its result.
+    """Run ``exchange`` with the vehicle ``system_id`` and return its result.
 
-    Cancellation ends it at once. When the connection ends, the exchange ends with the connection's error; what goes
-    wrong in sending is raised here.
+    Cancellation ends it immediately. If the connection ends, its error is raised; so are errors in sending.
     """
     run = ExchangeRun(connection, exchange)
     detachments = [
-        connection.bus.attach(message_type, run.receive, system_id=system_id)
-        for message_type in exchange.expects
+        connection.bus.attach(message_type, run.receive, system_id=system_id) for message_type in exchange.expects
     ]
     detachments.append(connection.on_end(run.abort))
     if connection.links is not None:
-        detachments.append(connection.bus.attach_event(LinkChosen, partial(run.link_chosen, system_id)))
+        detachments.append(connection.bus.attach_event(LinkSelected, partial(run.link_chosen, system_id)))
     try:
         return await run.result()
     finally:
@@ -39,9 +37,9 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 
 
 class ExchangeRun(Generic[ResultT]):
-    """Gives one exchange its time and sends what it wants sent.
+    """Drives one exchange: sends its messages and calls it at its deadlines.
 
-    Its owner gives it the messages of its target, and tells it the end of the connection.
+    The owner passes in the messages of the target, and aborts it when the connection ends.
     """
 
     def __init__(self, connection: Connection, exchange: Exchange[ResultT]) -> None:
@@ -50,38 +48,34 @@ class ExchangeRun(Generic[ResultT]):
         self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     async def result(self) -> ResultT:
-        """Start it, await its end and return its result; once.
-
-        Cancellation ends it at once. What goes wrong in sending is raised here.
-        """
+        """Start the exchange and return its result. Call it once."""
         try:
             self._exchange.start(self._connection.now())
             self._after_step()
             await self._ended
         finally:
-            self._connection.deadlines.take_back(self._expire)
+            self._connection.deadlines.cancel(self._expire)
         return self._exchange.result()
 
     def receive(self, message: Message) -> None:
-        """Take a message of the target."""
         try:
             self._exchange.receive(message, self._connection.now())
-        finally:  # what a callback of the program raised is for the bus to report; the exchange goes on
+        finally:  # the bus logs exceptions of the program's callbacks; the exchange continues
             self._after_step()
 
-    def link_chosen(self, system_id: int, event: LinkChosen) -> None:
-        """Of several links another one is used."""
+    def link_chosen(self, system_id: int, event: LinkSelected) -> None:
+        """Handle that another of several links is used from now on."""
         if event.system_id == system_id and event.before is not None:
             self._exchange.link_changed(self._connection.now())
             self._after_step()
 
     def abort(self, error: Exception) -> None:
-        """End it with this error."""
-        self._exchange.abort(raisable(error))
+        """End the exchange with a copy of this error."""
+        self._exchange.abort(copy_exception(error))
         self._after_step()
 
     def _expire(self) -> None:
-        """The deadline has come; timers ring up to the clock's resolution early, which is no reason to wait again."""
+        # Timers may fire early by the clock's resolution; the exchange then must not wait again.
         now = self._connection.now()
         now, self._deadline = max(now, now if self._deadline is None else self._deadline), None
         try:
@@ -95,10 +89,10 @@ class ExchangeRun(Generic[ResultT]):
         try:
             for message in exchange.take_outbox():
                 self._connection.send(message)
-        except Exception as error:  # nobody else would tell the one who waits
+        except Exception as error:  # otherwise the caller of result() would never get it
             exchange.abort(error)
         if exchange.done:
-            self._connection.deadlines.take_back(self._expire)
+            self._connection.deadlines.cancel(self._expire)
             if not self._ended.done():
                 self._ended.set_result(None)
         elif exchange.deadline is not None and exchange.deadline != self._deadline:

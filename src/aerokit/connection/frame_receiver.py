@@ -1,14 +1,14 @@
-"""``Intake``: from the bytes that a link brings to the frames that are let in, listened to and delivered."""
+"""``FrameReceiver``: turns received bytes into checked frames, and delivers them to the bus and the observers."""
 
 from __future__ import annotations
 
 import logging
 from typing import TYPE_CHECKING
 
-from aerokit.connection.components import found_by
-from aerokit.connection.frame_observers import Taps
-from aerokit.connection.loop_watch import TERMINAL_IPYTHON, LoopWatch, stands_still_between_inputs
-from aerokit.connection.routes import MOST_ROUTES
+from aerokit.connection.frame_observers import FrameObservers
+from aerokit.connection.heartbeats import discovery_event
+from aerokit.connection.loop_watch import IPYTHON_HINT, LoopWatch, is_unintegrated_ipython
+from aerokit.connection.routes import MAX_ROUTES
 from aerokit.events import ComputerSlept, LoopBlocked
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Heartbeat
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from aerokit.connection.bus import Bus
-    from aerokit.connection.multilink.routes import SeveralRoutes
+    from aerokit.connection.multilink.routes import MultiLinkRoutes
     from aerokit.connection.routes import Routes
     from aerokit.connection.signatures import SignatureGate
     from aerokit.mavlink.dialect import Dialect
@@ -26,189 +26,183 @@ if TYPE_CHECKING:
     from aerokit.mavlink.statistics import FramerStatistics
     from aerokit.transport.link import Link, Peer
 
-MOST_PEERS = 256
-"""So many that have sent a good frame are remembered."""
+MAX_PEERS = 256
+"""Peers that are remembered after a valid frame."""
 
-MOST_STRANGERS = 32
-"""So many that have sent no good frame yet are listened to; one more pushes out the first of them, and nobody else."""
+MAX_UNVERIFIED_PEERS = 32
+"""Peers without a valid frame yet that are tracked; another one replaces the oldest of them."""
 
-MOST_SENDERS = 2048
-"""So many (system id, component id) of all peers together have counters of their own."""
+MAX_SENDERS = 2048
+"""(system id, component id) pairs of all peers together that have their own counters."""
 
 
-class Peers:
-    """Who sends a good frame becomes a peer, is written to, and is forgotten only for want of room.
+class PeerTable:
+    """Remote peers and their framers.
 
-    Then the first one makes room that no vehicle is behind; while there is none, nobody new is listened to.
-    ``least_wanted(peers, now)`` is which, as `Routes.least_wanted`; ``prepare(framer)`` is called with each new framer,
-    ``forgotten(peer)`` for each peer that makes room.
+    A sender becomes a peer with its first valid frame, and from then on gets broadcasts. When the table is full, the
+    first peer without a vehicle is evicted; if there is none, new senders are ignored.
+
+    ``evictable_peers`` is :meth:`Routes.evictable_peers`. ``prepare(framer)`` is called with each new framer,
+    ``on_evict(peer)`` with each evicted peer.
     """
 
     def __init__(
         self,
         link: Link,
         dialect: Dialect,
-        least_wanted: Callable[[Iterable[Peer], float], Iterable[Peer]],
+        evictable_peers: Callable[[Iterable[Peer], float], Iterable[Peer]],
         prepare: Callable[[Framer], object],
-        forgotten: Callable[[Peer], object] | None = None,
+        on_evict: Callable[[Peer], object] | None = None,
     ) -> None:
         self._link, self._dialect, self._prepare = link, dialect, prepare
-        self._least_wanted, self._forgotten = least_wanted, forgotten
+        self._evictable_peers, self._on_evict = evictable_peers, on_evict
         self.framers: dict[Peer, Framer] = {}
-        """One for each peer."""
-        self._strangers: dict[Peer, Framer] = {}
-        self._limit = SourceLimit(MOST_SENDERS)
+        """Framers of verified peers."""
+        self._unverified: dict[Peer, Framer] = {}
+        self._limit = SourceLimit(MAX_SENDERS)
 
     def __iter__(self) -> Iterator[Framer]:
-        """All framers, those of strangers too."""
         yield from self.framers.values()
-        yield from self._strangers.values()
+        yield from self._unverified.values()
 
-    def receive_from_stranger(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
-        """Bytes of somebody who is no peer (yet), and whose frames do not count while there is no room."""
-        framer = self._strangers.get(peer)
+    def receive_unverified(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
+        """Process bytes of a sender that is not in :attr:`framers`. Its frames are dropped while the table is full."""
+        framer = self._unverified.get(peer)
         if framer is None:
-            framer = self._new_stranger(peer)
+            framer = self._add_unverified(peer)
         frames = framer.receive(data, now)
         if framer.statistics.frames:
-            del self._strangers[peer]
-            if not self._has_room(now):
-                framer.retire()
+            del self._unverified[peer]
+            if not self._make_room(now):
+                framer.close()
                 return framer, []
             self.framers[peer] = framer
             self._link.keep_peer(peer)
         return framer, frames
 
-    def begin_anew(self) -> None:
-        """The link has been opened again: another one, which knows nobody yet."""
+    def reset(self) -> None:
+        """Reset the framers after the link was reopened, and register the peers at the new one."""
         for framer in self:
-            framer.begin_anew()
+            framer.reset()
         for peer in self.framers:
             self._link.keep_peer(peer)
 
     def forget(self, peer: Peer) -> Framer | None:
-        """A peer, or a stranger, has gone; its framer, if it had one."""
-        framer = self.framers.pop(peer, None) or self._strangers.pop(peer, None)
+        framer = self.framers.pop(peer, None) or self._unverified.pop(peer, None)
         if framer is not None:
-            framer.retire()
+            framer.close()
         self._link.forget_peer(peer)
         return framer
 
-    def _new_stranger(self, peer: Peer) -> Framer:
-        if len(self._strangers) >= MOST_STRANGERS:
-            self._strangers.pop(next(iter(self._strangers))).retire()
-        framer = self._strangers[peer] = Framer(self._dialect, self._limit)
+    def _add_unverified(self, peer: Peer) -> Framer:
+        if len(self._unverified) >= MAX_UNVERIFIED_PEERS:
+            self._unverified.pop(next(iter(self._unverified))).close()
+        framer = self._unverified[peer] = Framer(self._dialect, self._limit)
         self._prepare(framer)
         return framer
 
-    def _has_room(self, now: float) -> bool:
-        if len(self.framers) < MOST_PEERS:
+    def _make_room(self, now: float) -> bool:
+        if len(self.framers) < MAX_PEERS:
             return True
-        unwanted = list(self._least_wanted(self.framers, now))
-        for peer in unwanted:
-            if self._forgotten is not None:
-                self._forgotten(peer)
+        evicted = list(self._evictable_peers(self.framers, now))
+        for peer in evicted:
+            if self._on_evict is not None:
+                self._on_evict(peer)
             self.forget(peer)
-        return bool(unwanted)
+        return bool(evicted)
 
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-WARN_AFTER_S = 1.0
-"""A heartbeat is missing then."""
+# From this length on, a pause of the loop delays a heartbeat.
+BLOCKED_WARNING_S = 1.0
 
-BLOCKING_CODE = (
+BLOCKING_CODE_HINT = (
     "a coroutine did not await: use asyncio.sleep instead of time.sleep, and asyncio.to_thread for long work"
 )
 
 
-class Intake:
-    """Frames are checked by one framer for each remote peer, by their signature and by who may speak in whose name.
+class FrameReceiver:
+    """Checks received frames: framing by one framer per peer, signature, and the sender's route.
 
-    What is left goes to ``bus``, and then to the taps. ``several`` are the routes, where they are those of several
-    links; ``clock`` is the loop's.
+    Accepted frames go to ``bus``, then to the observers. ``multilink`` equals ``routes`` if there are several links.
+    ``clock`` is the event loop's.
     """
 
     def __init__(
         self,
         link: Link,
         bus: Bus,
-        routes: Routes | SeveralRoutes,
-        several: SeveralRoutes | None,
+        routes: Routes | MultiLinkRoutes,
+        multilink: MultiLinkRoutes | None,
         gate: SignatureGate,
         clock: Callable[[], float],
     ) -> None:
         self._bus, self._gate, self._clock = bus, gate, clock
-        self._routes, self._several = routes, several
-        self._peers = Peers(link, bus.dialect, routes.least_wanted, self._let_through)
+        self._routes, self._multilink = routes, multilink
+        self._peers = PeerTable(link, bus.dialect, routes.evictable_peers, self._update_framer)
         self.framers: dict[Peer, Framer] = self._peers.framers
-        """One for each peer."""
-        self.heard: dict[tuple[int, int], Heartbeat] = {}
-        """The last HEARTBEAT of every (system id, component id) on the link."""
-        self.taps: Taps = Taps(self._let_all_through)
+        self.heartbeats: dict[tuple[int, int], Heartbeat] = {}
+        """Last HEARTBEAT of every (system id, component id) on the link."""
+        self.observers: FrameObservers = FrameObservers(self._update_framers)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept)
         self._is_closed = False
-        bus.want(Heartbeat)  # routes and diagnosis need every heartbeat
+        bus.require_frames(Heartbeat)  # for routes and diagnosis
 
     def start(self) -> None:
-        """The link is open: notice when the loop is kept from running."""
         self._loop_watch.start()
-        if stands_still_between_inputs():
-            logger.warning("nothing is received and no heartbeat sent between inputs: %s", TERMINAL_IPYTHON)
+        if is_unintegrated_ipython():
+            logger.warning("no messages or heartbeats are processed between inputs: %s", IPYTHON_HINT)
 
     def close(self) -> None:
-        """Nothing more is delivered."""
         self._is_closed = True
         self._loop_watch.close()
 
-    def begin_anew(self) -> None:
-        """The link has been opened again."""
-        self._peers.begin_anew()
+    def reset(self) -> None:
+        """Discard partial frames after the link was reopened."""
+        self._peers.reset()
 
     def receive(self, data: bytes, peer: Peer) -> None:
-        """Take bytes off the link."""
-        framer, several, taps = self.framers.get(peer), self._several, self.taps
+        framer, multilink, observers = self.framers.get(peer), self._multilink, self.observers
         now = self._clock()
         if now > self._loop_watch.late_after:
             now = self._loop_watch.arrival(now)
         if framer is not None:
             frames = framer.receive(data, now)
         else:
-            framer, frames = self._peers.receive_from_stranger(peer, data, now)
+            framer, frames = self._peers.receive_unverified(peer, data, now)
         for frame in frames:
-            if self._is_closed:  # by a sink
+            if self._is_closed:  # by a sink of an earlier frame
                 return
-            if several is not None and several.is_copy(frame, peer):
+            if multilink is not None and multilink.is_copy(frame, peer):
                 continue
-            is_elsewhere = len(self.framers) > 1 and self._routes.is_elsewhere(frame, peer)
-            if not self._gate.is_open and not self._admits(frame, is_elsewhere):
+            is_other_peer = len(self.framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
+            if not self._gate.is_open and not self._is_admitted(frame, is_other_peer):
                 continue
-            if taps.recording is not None and several is None:
-                taps.recording.write(frame.raw, self._clock())
-            if is_elsewhere and not self._takes_place(framer, frame, peer):
+            if observers.recording is not None and multilink is None:
+                observers.recording.write(frame.raw, self._clock())
+            if is_other_peer and not self._claims_route(framer, frame, peer):
                 continue
             if (framer.late or framer.foreign) and self._is_stale(framer, frame):
                 continue
-            if several is not None:
-                if not several.takes(frame, peer, framer.counters_of(frame)):
+            if multilink is not None:
+                if not multilink.accepts(frame, peer, framer.counters_of(frame)):
                     continue
-                taps.keep_received(frame.raw, self._clock())
+                observers.record_received(frame.raw, self._clock())
             if frame.message_id == Heartbeat.ID:
-                self._note_heartbeat(framer, frame, peer)
+                self._record_heartbeat(framer, frame, peer)
             self._bus.deliver(frame)
-            if taps.received:
-                taps.give(frame, peer)
+            if observers.received:
+                observers.notify_received(frame, peer)
 
     def arrived_at(self) -> float:
-        """When what is delivered now arrived: now, or before a pause of the loop if it may have waited."""
+        """Return the receive time of the current frame: now, or before a pause of the loop if it may have waited."""
         return min(self._clock(), self._loop_watch.oldest_arrival)
 
     def statistics(self) -> Iterator[FramerStatistics]:
-        """The counters of every peer that is remembered."""
         return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Frames of this system that were received, and frames that its sequence numbers say were lost."""
         sources = [
             source
             for statistics in self.statistics()
@@ -217,64 +211,63 @@ class Intake:
         ]
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
-    # ------------------------------------------------------------------------------- inside
-
     def _on_blocked(self, seconds: float) -> None:
-        if seconds >= WARN_AFTER_S:
+        if seconds >= BLOCKED_WARNING_S:
             logger.warning(
-                "the event loop was blocked for %.1f s: nothing was received and no heartbeat sent meanwhile; %s",
+                "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",
                 seconds,
-                TERMINAL_IPYTHON if stands_still_between_inputs() else BLOCKING_CODE,
+                IPYTHON_HINT if is_unintegrated_ipython() else BLOCKING_CODE_HINT,
             )
         self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
 
     def _on_slept(self, seconds: float) -> None:
-        logger.warning("the computer slept for %.0f s: what is known of vehicles is older by that", seconds)
+        logger.warning("the computer slept for %.0f s: all values of vehicles are older by that time", seconds)
         self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
 
-    def _let_all_through(self) -> None:
+    def _update_framers(self) -> None:
         for framer in self._peers:
-            self._let_through(framer)
+            self._update_framer(framer)
 
-    def _let_through(self, framer: Framer) -> None:
-        """Recordings and taps get everything, also what nobody wants and what the dialect does not know."""
-        framer.keep_unknown = self.taps.want_all
+    def _update_framer(self, framer: Framer) -> None:
+        """Make the framer build all frames, unknown ones included, while there are observers."""
+        framer.keep_unknown = self.observers.want_all
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
-    def _admits(self, frame: Frame, is_elsewhere: bool) -> bool:
-        """By its signature; once for all copies of a frame, of which the first need not be the one that is taken."""
-        if self._several is not None and self._several.copies.was_admitted:
+    def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
+        # Copies of one frame are checked once: the accepted copy need not be the first, and a second check would take
+        # it for a replay.
+        if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
-        is_admitted = self._gate.admits(frame, may_hand_over=not is_elsewhere)
-        if is_admitted and self._several is not None:
-            self._several.copies.admit()
+        is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
+        if is_admitted and self._multilink is not None:
+            self._multilink.copies.admit()
         return is_admitted
 
-    def _takes_place(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
-        return self._routes.takes_place(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
+    def _claims_route(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
+        return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_checked(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Whether a frame out of order is not listened to: another sender's, or a heartbeat that was overtaken."""
+        """Return True if an out-of-order frame is to be dropped: a second sender's, or an outdated heartbeat."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
         counters = framer.counters_of(frame)
-        if counters is not None and counters.is_double(frame.received_at):
-            self._routes.hear_double(frame)
+        if counters is not None and counters.has_duplicates(frame.received_at):
+            self._routes.record_duplicate_sender(frame)
             if is_foreign:
                 return True
-        return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_overtaken(frame))
+        return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_outdated(frame))
 
-    def _note_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
+    def _record_heartbeat(self, framer: Framer, frame: Frame, peer: Peer) -> None:
         heartbeat = self._bus.dialect.decode(frame)
         if frame.system_id == 0 or not isinstance(heartbeat, Heartbeat):
             return
-        if self._routes.note(frame, peer, framer.counters_of(frame)):
+        if self._routes.record_heartbeat(frame, peer, framer.counters_of(frame)):
             source = frame.system_id, frame.component_id
-            is_new = source not in self.heard
-            self.heard[source] = heartbeat
+            is_new = source not in self.heartbeats
+            self.heartbeats[source] = heartbeat
             if is_new:
-                self._bus.publish(found_by(heartbeat, self._clock(), *source))
-            if len(self.heard) > MOST_ROUTES:
-                for source in [source for source in self.heard if not self._routes.is_known(source)]:
-                    del self.heard[source]
+                self._bus.publish(discovery_event(heartbeat, self._clock(), *source))
+            if len(self.heartbeats) > MAX_ROUTES:
+                for source in [source for source in self.heartbeats if not self._routes.has_route(source)]:
+                    del self.heartbeats[source]

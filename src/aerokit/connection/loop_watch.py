@@ -1,4 +1,4 @@
-"""``LoopWatch``: notices when the event loop is kept from running, and how old what is read then may be."""
+"""``LoopWatch``: detects a blocked event loop, and bounds the age of data that is read after the pause."""
 
 from __future__ import annotations
 
@@ -11,66 +11,62 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-PERIOD_S = 0.1
-"""How often it is looked, by a timer or by what is read."""
+CHECK_INTERVAL_S = 0.1
 
-LATE_AFTER_S = 0.1
+LATE_THRESHOLD_S = 0.1
 
-BLOCKED_AFTER_S = 0.25
+BLOCKED_THRESHOLD_S = 0.25
 
-QUIET_TURNS = 3
-"""So many turns of the loop in which nothing was read: what had waited has been read. Loops differ in what they do
-first in a turn, timers or sockets."""
+# After this many loop iterations without a read, all data that waited during the pause has been read. It is more than
+# one because loops differ in whether timers or sockets come first.
+IDLE_ITERATIONS = 3
 
+# Platform → a clock that includes suspended time, and the loop's clock. The loop's clock of Windows includes it.
 CLOCKS = {
     "linux": ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"),
     "darwin": ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW"),
 }
-"""System → a clock that goes on while the computer sleeps, and the loop's. That of Windows goes on."""
 
 
-def asleep_s() -> float:
-    """Seconds that the computer has slept since it was started, during which the loop's clock stood still."""
+def suspended_s() -> float:
+    """Return the seconds since boot that the computer was suspended and the loop's clock stood still."""
     clocks = CLOCKS.get(sys.platform)
     if clocks is None:
         return 0.0
-    all_of_it, awake = (time.clock_gettime(getattr(time, each)) for each in clocks)
-    return all_of_it - awake
+    total, awake = (time.clock_gettime(getattr(time, clock)) for clock in clocks)
+    return total - awake
 
 
 class LoopWatch:
-    """A timer that is always under way. When it comes late, the program, or the system, kept the loop from running.
-    What is read in time puts it off: each time that it wakes a sleeping process costs as much as a few messages.
+    """Detects pauses of the event loop by a timer that fires late.
 
-    What is read afterwards may have waited since the loop last ran: nobody knows better, so that is when it came, until
-    all that had waited has been read. A pause of less than ``PERIOD_S + LATE_AFTER_S`` is not noticed; what is read is
-    called younger than it is by so much at most. ``on_blocked`` is told the length of pauses above
-    ``BLOCKED_AFTER_S``; ``on_slept`` for how long the computer has slept, which the loop's clock does not show.
+    Data that is read after a pause may have waited since the loop last ran, so that is taken as its receive time until
+    all waiting data has been read. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected; ages
+    may be too small by that. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``, ``on_slept`` the
+    time that the computer was suspended.
     """
 
     def __init__(
         self,
         on_blocked: Callable[[float], None],
         on_slept: Callable[[float], None],
-        asleep: Callable[[], float] = asleep_s,
+        suspended: Callable[[], float] = suspended_s,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._on_blocked, self._on_slept = on_blocked, on_slept
-        self._asleep, self._slept_before = asleep, max(asleep() for _ in range(3))
+        self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
         self.late_after: float = math.inf
-        """What is read at a later time than this came at :meth:`arrival`, else when it was read."""
+        """For data read later than this, :meth:`arrival` returns the receive time."""
         self._ran_at = self._due = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
-        self._oldest: float | None = None  # while there may be something that has waited
+        self._oldest: float | None = None  # set while data may have waited
         self._has_read = False
-        self._quiet_turns = 0
+        self._idle_iterations = 0
 
     def start(self) -> None:
-        """Watch, until :meth:`close`."""
         self._set_timer(self._loop.time())
 
     def close(self) -> None:
-        """Watch no more."""
         self.late_after = math.inf
         if self._timer is not None:
             self._timer.cancel()
@@ -78,13 +74,14 @@ class LoopWatch:
 
     @property
     def oldest_arrival(self) -> float:
-        """When what is read now may have arrived at the earliest; infinite while nothing can have waited."""
+        """Earliest receive time of data that is read now; infinite while nothing can have waited."""
         return math.inf if self._oldest is None else self._oldest
 
     def arrival(self, now: float) -> float:
-        """When what is read came: now, or, if it may have waited, the earliest time at which it may have come."""
+        """Return the receive time of data that is read now: now, or the earliest possible one if it may have waited."""
+        # Data that is read in time postpones the timer: waking a sleeping process costs as much as a few messages.
         has_slept = self._has_slept()
-        if self._oldest is None and not has_slept and now <= self._due + LATE_AFTER_S:
+        if self._oldest is None and not has_slept and now <= self._due + LATE_THRESHOLD_S:
             if self._timer is not None:
                 self._timer.cancel()
             self._set_timer(now)
@@ -95,56 +92,55 @@ class LoopWatch:
     def _tick(self) -> None:
         now = self._loop.time()
         late = now - self._due
-        if self._has_slept() or late > LATE_AFTER_S:
+        if self._has_slept() or late > LATE_THRESHOLD_S:
             self._fall_behind()
         self._set_timer(now)
-        if late > BLOCKED_AFTER_S:
-            self._on_blocked(late + PERIOD_S)
+        if late > BLOCKED_THRESHOLD_S:
+            self._on_blocked(late + CHECK_INTERVAL_S)
 
     def _has_slept(self) -> bool:
-        # A process that is interrupted between the two clocks reads less than the truth, which never shrinks.
-        before, self._slept_before = self._slept_before, max(self._slept_before, self._asleep())
-        slept_s = self._slept_before - before
-        if slept_s <= LATE_AFTER_S:
+        # A process that is preempted between reading the two clocks gets too small a value; the true one never shrinks.
+        before = self._suspended_before
+        self._suspended_before = max(before, self._suspended())
+        slept_s = self._suspended_before - before
+        if slept_s <= LATE_THRESHOLD_S:
             return False
         self._ran_at -= slept_s
         self._on_slept(slept_s)
         return True
 
     def _set_timer(self, now: float) -> None:
-        self._ran_at, self._due = now, now + PERIOD_S
+        self._ran_at, self._due = now, now + CHECK_INTERVAL_S
         if self._oldest is None:
-            self.late_after = now + PERIOD_S / 2
+            self.late_after = now + CHECK_INTERVAL_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _fall_behind(self) -> float:
         if self._oldest is None:
-            self._oldest, self.late_after, self._quiet_turns = self._ran_at, -math.inf, 0
-            self._loop.call_soon(self._look)
+            self._oldest, self.late_after, self._idle_iterations = self._ran_at, -math.inf, 0
+            self._loop.call_soon(self._check_idle)
         return self._oldest
 
-    def _look(self) -> None:
-        """Once a turn, until everything that had waited has been read."""
-        self._quiet_turns = 0 if self._has_read else self._quiet_turns + 1
+    def _check_idle(self) -> None:
+        self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:
             return
-        if self._quiet_turns < QUIET_TURNS:
-            self._loop.call_soon(self._look)
+        if self._idle_iterations < IDLE_ITERATIONS:
+            self._loop.call_soon(self._check_idle)
         else:
             self._oldest = None
-            self.late_after = self._ran_at + PERIOD_S / 2
+            self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
 
 
-TERMINAL_IPYTHON = (
+IPYTHON_HINT = (
     "IPython in a terminal runs the loop only while a cell runs: type %gui asyncio before you connect,"
     " use aerokit.sync, or keep the whole flight in one cell"
 )
-"""What is wrong, and what to do."""
 
 
-def stands_still_between_inputs() -> bool:
-    """Whether the running loop is that of IPython in a terminal, and ``%gui asyncio`` was not typed."""
+def is_unintegrated_ipython() -> bool:
+    """Return True in IPython in a terminal without ``%gui asyncio``, which runs the loop only while a cell runs."""
     module = sys.modules.get("IPython.terminal.interactiveshell")
     shell: Any = getattr(getattr(module, "TerminalInteractiveShell", None), "_instance", None)
     if shell is None or getattr(shell, "active_eventloop", None) == "asyncio":

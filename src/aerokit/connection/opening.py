@@ -1,4 +1,4 @@
-"""``open_connection``: from an address to a connection, for the time of an ``async with`` block."""
+"""``open_connection``: open a connection for an ``async with`` block, and explain why no vehicle was found."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import anyio
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit._internal.wording import shown
-from aerokit.connection.components import is_autopilot
+from aerokit._internal.formatting import short_repr
 from aerokit.connection.connection import Connection
-from aerokit.connection.own_heartbeat import OwnHeartbeat
+from aerokit.connection.heartbeats import OwnHeartbeat, is_autopilot
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent, MavType
@@ -26,13 +25,13 @@ if TYPE_CHECKING:
     from aerokit.mavlink.dialect import Dialect
     from aerokit.mavlink.signing import Signing
     from aerokit.transport import LinkAddress
-    from aerokit.transport.sockets import Peers
+    from aerokit.transport.sockets import PeerFilter
 
 CLOSE_TIMEOUT_S = 2.0
 
-ONLOOKER = 254
-"""Who comes and goes while a vehicle flies: ArduPilot (FS_GCS_ENABLE) misses the ground station 255, its MAV_GCS_SYSID,
-five seconds after it has gone."""
+OBSERVER_SYSTEM_ID = 254
+"""System id for tools that connect briefly while a vehicle flies. Not 255, the default of ArduPilot's MAV_GCS_SYSID:
+its failsafe (FS_GCS_ENABLE) acts five seconds after a ground station of that id has gone."""
 
 
 @checked
@@ -48,46 +47,44 @@ async def open_connection(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
-    peers: Peers | None = None,
+    peers: PeerFilter | None = None,
     may_move: bool = False,
     heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
 ) -> AsyncIterator[Connection]:
-    """Open a link and be a MAVLink node on it for the time of the ``async with`` block.
+    """Open a connection for an ``async with`` block: this program becomes a MAVLink node on the link.
 
-    Runs in the asyncio loop that is already running; nothing outlives the block, and what the block raises comes out
-    of it as it is. Our HEARTBEAT goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
+    Runs in the current asyncio loop. Everything ends with the block, and exceptions of the block pass unchanged. Our
+    HEARTBEAT is sent at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
 
     Args:
-        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
-            several of them, none twice, that lead to the same vehicles (docs/how-to/several-links.md): each frame is
-            taken once, orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind
-            an address marks one that is used when the others fail. A link that is lost is opened again, as long as
-            another one is there.
-        source_system: our own system id, 1–255; ground stations take 255.
-        source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
-            that (DroneKit).
-        baud: of a serial link whose address names none, bits per second, above 0.
-        dialect: the messages that are understood.
-        mavlink_version: of what we send, 1 or 2; both are understood.
-        signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: what we
-            send is not signed, and signatures are not checked.
-        record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
-            is replaced when the first frame is received. A disk that is full ends the recording, not the connection.
-        reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
-            instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
-            at the end of a recording. Of several links: whether the connection outlives that all are away.
-        peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or
-            those of :mod:`ipaddress`. For links to which anybody can send: udpin, udpbcast, tcpin. None: all.
-        may_move: whether a vehicle that was silent may come back from another IP address without going on where it
-            stopped, by sequence numbers and time since boot: rebooted, with a new address. Else it is not listened to
-            there (``MoveRefused``), for it might be anybody.
-        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
-            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
+        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or an unopened link; or a
+            list of them that lead to the same vehicles (docs/how-to/several-links.md). Then each frame is processed
+            once, and commands use the best link, or the next one when it fails. ``?costly=1`` in an address marks a
+            link that is used only when the others fail. A lost link is reopened while another one works.
+        source_system: own system id, 1–255; ground stations use 255.
+        source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
+        baud: bits per second of a serial link whose address has none, above 0.
+        dialect: the messages that are decoded.
+        mavlink_version: version of sent messages, 1 or 2; both are received.
+        signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
+            frames are neither signed nor verified.
+        record: ``.tlog`` file for all sent and received frames, unknown messages included. An existing file is replaced
+            when the first frame is received. A full disk ends the recording, not the connection.
+        reconnect: True to reopen a lost link (e.g. an unplugged device) until it is back, instead of ending the
+            connection; see ``LinkInterrupted`` and ``LinkRestored``. Does not apply to the first opening, or to the end
+            of a replay. With several links: True to keep the connection while all of them are lost.
+        peers: IP addresses and networks to accept, e.g. ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or objects of
+            :mod:`ipaddress`. For udpin, udpbcast and tcpin links. None: all.
+        may_move: True to accept a silent vehicle from another IP address even if its sequence numbers and time since
+            boot do not continue, e.g. after a reboot with a new address. Otherwise it is refused (see
+            ``RouteChangeRefused``), because it may be a different sender.
+        heartbeat: content of our HEARTBEAT and when it pauses. None sends none: PX4 then sends no STATUSTEXT, and a
+            ``udpout:`` link stays silent.
 
     Raises:
         InvalidArgument: an argument is wrong; nothing was opened.
-        LinkOpenError: the link or the file for the recording could not be opened.
-        ConnectionClosed, BusyError: the link given was used before.
+        LinkOpenError: the link or the recording could not be opened.
+        ConnectionClosed, BusyError: the given link was used before.
     """
     if not baud > 0:
         raise InvalidArgument(f"baud = {baud} is not allowed: above 0")
@@ -117,9 +114,7 @@ async def open_connection(
                 await connection._wait_until_link_is_closed()
 
 
-def _link(
-    address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: Peers | None
-) -> Link:
+def _link(address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
     if isinstance(address, str):
         make_link = partial(create_link, address, baud=baud, peers=peers)
         return ReconnectingLink(make_link) if reconnect else make_link()
@@ -127,94 +122,90 @@ def _link(
         return _several(address, baud, reconnect, peers)
     if reconnect:
         raise InvalidArgument(
-            "reconnect = True is not allowed with a link, which can be opened once only: pass an address,"
-            " or a ReconnectingLink of aerokit.transport"
+            "reconnect = True is not allowed with a link object, which can be opened only once: pass an address,"
+            " or an aerokit.transport.ReconnectingLink"
         )
     if peers is not None:
         raise InvalidArgument(
-            "peers = … is not allowed with a link: pass an address, or give them to the link (UdpListen, TcpListen)"
+            "peers = … is not allowed with a link object: pass an address, or pass them to UdpListen or TcpListen"
         )
     return address
 
 
-def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: Peers | None) -> Link:
-    if not isinstance(addresses, (list, tuple)) or not all(
-        isinstance(each, (str, Link)) for each in addresses
-    ):
+def _several(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
+    if not isinstance(addresses, (list, tuple)) or not all(isinstance(address, (str, Link)) for address in addresses):
         raise InvalidArgument(
-            f"address = {shown(addresses)} is not allowed: an address, a link, or a list of these"
+            f"address = {short_repr(addresses)} is not allowed: an address, a link, or a list of them"
         )
     if len(addresses) < 2:
         if not addresses:
             raise InvalidArgument("address = [] is not allowed: at least one")
         return _link(addresses[0], baud, reconnect, peers)
-    from aerokit.transport import SeveralLinks, parse_address  # few programs have several
+    from aerokit.transport import MultiLink, parse_address  # imported here because few programs need them
 
-    _refuse_twice(addresses, [each if isinstance(each, Link) else parse_address(each) for each in addresses])
-    makers: list[Callable[[], Link]] = []
+    _check_distinct(addresses, [each if isinstance(each, Link) else parse_address(each) for each in addresses])
+    factories: list[Callable[[], Link]] = []
     costly: set[int] = set()
     for index, address in enumerate(addresses):
         if isinstance(address, Link):
-            makers.append(partial(_itself, address))
+            factories.append(partial(_identity, address))
             continue
-        where = parse_address(address)
-        if where.option("costly") == "1":
+        parsed = parse_address(address)
+        if parsed.option("costly") == "1":
             costly.add(index)
-        if where.kind == "replay":
+        if parsed.kind == "replay":
             raise InvalidArgument(
-                f"{address} is not allowed among several links: a recording is no link to a vehicle"
+                f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
             )
-        listened_to = peers if where.kind in ("udpin", "udpbcast", "tcpin") else None
-        makers.append(partial(ReconnectingLink, partial(create_link, where, baud=baud, peers=listened_to)))
-    return SeveralLinks(makers, costly=costly, stays=reconnect)
+        accepted = peers if parsed.kind in ("udpin", "udpbcast", "tcpin") else None
+        factories.append(partial(ReconnectingLink, partial(create_link, parsed, baud=baud, peers=accepted)))
+    return MultiLink(factories, costly=costly, survives_loss=reconnect)
 
 
-def _refuse_twice(addresses: Sequence[str | Link], places: Sequence[Link | LinkAddress]) -> None:
-    """The same socket or port cannot be opened twice; that it cannot would be told as a link that is away."""
+def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
+    # Opening a socket or port a second time fails, which would look like a lost link.
     seen: set[object] = set()
-    for address, place in zip(addresses, places):  # noqa: B905 - as many
-        which = _which(place)
-        if which in seen:
+    for address, target in zip(addresses, targets):  # noqa: B905 - equal lengths
+        key = _target_key(target)
+        if key in seen:
             raise InvalidArgument(
-                f"address = {shown(addresses)} is not allowed: {shown(address)} is named twice; each link once"
+                f"address = {short_repr(addresses)} is not allowed: {short_repr(address)} is listed twice"
             )
-        if which is not None:
-            seen.add(which)
+        if key is not None:
+            seen.add(key)
 
 
-def _which(place: Link | LinkAddress) -> object:
-    """What is opened there, whatever its options; None: another one each time."""
-    if isinstance(place, Link):
-        return id(place)
-    is_new = (place.kind in ("udpin", "tcpin") and not place.port) or (place.kind == "pty" and not place.path)
+def _target_key(target: Link | LinkAddress) -> object:
+    """Identify what an address opens, regardless of its options; None if it opens something new each time."""
+    if isinstance(target, Link):
+        return id(target)
+    is_new = (target.kind in ("udpin", "tcpin") and not target.port) or (target.kind == "pty" and not target.path)
     if is_new:
         return None
-    ways = [each for each in place.options if each[0] in ("connect", "listen")]  # two ways to one name
-    return place.kind, place.host, place.port, place.device, place.path, tuple(ways)
+    endpoints = [option for option in target.options if option[0] in ("connect", "listen")]  # of zenoh
+    return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
 
 
-def _itself(link: Link) -> Link:
+def _identity(link: Link) -> Link:
     return link
 
 
+# Noise of this length contains about a tenth of a pattern that looks like a damaged frame.
 NOISE_BYTES = 500
-"""In so many bytes of noise there is about a tenth of a place that looks like a damaged frame."""
 
-SOME = 5
+MAX_LISTED_IDS = 5
 
 
-def no_vehicle_reason(connection: Connection, wanted_system: int | None) -> str:
-    """Say what was heard on a link on which no vehicle was found."""
+def explain_no_vehicle(connection: Connection, wanted_system: int | None) -> str:
+    """Explain, by what was received, why no vehicle was found on a link."""
     return _Diagnosis(connection, wanted_system).text()
 
 
 class _Diagnosis:
-    """Looks at the counters of a connection from the least that can be heard to the most."""
-
     def __init__(self, connection: Connection, wanted_system: int | None) -> None:
         self._wanted = wanted_system
-        self._heard = connection.heard
-        self._signatures = connection.describe_signatures()
+        self._heartbeats = connection.heartbeats
+        self._signature_problems = connection.describe_signature_problems()
         statistics = list(connection.statistics())
         self._bytes = sum(each.bytes for each in statistics)
         self._frames = sum(each.frames for each in statistics)
@@ -226,40 +217,40 @@ class _Diagnosis:
 
     def text(self) -> str:
         if not self._bytes:
-            return "not a single byte was heard: is the vehicle on, and is it sending to this address?"
+            return "no bytes were received: is the vehicle on, and is it sending to this address?"
         if not self._frames:
             return self._without_frames()
-        if not self._heard:
+        if not self._heartbeats:
             return self._without_heartbeats()
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        """Noise has a few places that look like frames: what is said rests on most of the bytes."""
-        heard = f"{self._bytes} bytes were heard"
+        # Noise contains a few patterns that look like frames, so each diagnosis needs most of the bytes.
+        received = f"{self._bytes} bytes were received"
         if self._unknown and 2 * self._bad_bytes < self._bytes:
-            numbers = ", ".join(map(str, sorted(self._unknown_messages)[:SOME]))
+            numbers = ", ".join(map(str, sorted(self._unknown_messages)[:MAX_LISTED_IDS]))
             return (
-                f"{heard} with {self._unknown} frames of an unknown dialect (messages {numbers}) and none of this one:"
-                " pass dialect=Dialect.from_xml(...)"
+                f"{received}, with {self._unknown} frames of an unknown dialect (messages {numbers}) and none of this"
+                " one: pass dialect=Dialect.from_xml(...)"
             )
         if self._bad_crcs * NOISE_BYTES > self._bytes:
-            return f"{heard} with {self._bad_crcs} damaged frames and no good one: a noisy link, or another dialect?"
-        return f"{heard}, but no MAVLink frame: wrong baud rate, or another protocol?"
+            return f"{received}, with {self._bad_crcs} damaged frames and no valid one: noisy link, or another dialect?"
+        return f"{received}, but no MAVLink frame: wrong baud rate, or another protocol?"
 
     def _without_heartbeats(self) -> str:
-        heard = f"{self._frames} frames were heard"
-        if self._signatures:
-            return f"{heard}; {self._signatures}"
+        received = f"{self._frames} frames were received"
+        if self._signature_problems:
+            return f"{received}; {self._signature_problems}"
         if not any(self._systems):
-            return f"{heard}, all of system id 0, which is nobody's: give the vehicle an id of 1 to 255"
-        return f"{heard}, but no HEARTBEAT among them"
+            return f"{received}, all with the invalid system id 0: set the vehicle's system id to 1–255"
+        return f"{received}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
-        autopilots = sorted({system for (system, _), beat in self._heard.items() if is_autopilot(beat)})
+        autopilots = sorted({system for (system, _), beat in self._heartbeats.items() if is_autopilot(beat)})
         if autopilots:
             names = ", ".join(map(str, autopilots))
-            return f"vehicles with other system ids were heard: {names} (wanted: {self._wanted})"
-        names = ", ".join(f"{system}/{component}" for system, component in sorted(self._heard))
-        if all(beat.type == MavType.GCS for beat in self._heard.values()):
-            return f"only ground stations were heard ({names})"
-        return f"only components that are no autopilot were heard ({names})"
+            return f"only vehicles with other system ids were received: {names} (wanted: {self._wanted})"
+        names = ", ".join(f"{system}/{component}" for system, component in sorted(self._heartbeats))
+        if all(beat.type == MavType.GCS for beat in self._heartbeats.values()):
+            return f"only ground stations were received ({names})"
+        return f"only components that are not autopilots were received ({names})"

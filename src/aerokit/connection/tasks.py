@@ -1,4 +1,4 @@
-"""``Background``: tasks that live beside a block of the program and end with it."""
+"""Background tasks of an ``async with`` block, shielded work, and deadlines."""
 
 from __future__ import annotations
 
@@ -16,39 +16,38 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-class Background:
-    """The tasks of one ``async with`` block. A mistake in one of them goes to ``on_mistake``, not to the block.
+class BackgroundTasks:
+    """Tasks that end with an ``async with`` block. Their exceptions go to ``on_error``, not to the block.
 
-    No task group: the program's block would run inside its cancel scope. What the program does there to its own task
-    (cancelling it, ``asyncio.timeout``, ``asyncio.TaskGroup``) meets a scope that is being cancelled when the block
-    ends, and what comes of the two depends on the versions of Python and anyio: exceptions were swallowed and
-    exchanged. And the other way round, a scope of the program that is cancelled does not reach these tasks before the
-    block has ended: the heartbeat goes on while the program, shielded, lands its vehicle.
+    This is not a task group, because the program's block would then run inside its cancel scope. Cancelling the
+    program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with such a scope differently in each version
+    of Python and anyio; some swallow or exchange exceptions. A cancelled scope of the program does not reach these
+    tasks either: heartbeats continue while a shielded program lands its vehicle.
     """
 
-    def __init__(self, on_mistake: Callable[[Exception], None]) -> None:
-        self._on_mistake = on_mistake
+    def __init__(self, on_error: Callable[[Exception], None]) -> None:
+        self._on_error = on_error
         self._tasks: set[asyncio.Task[None]] = set()
-        self._is_over = False
+        self._is_cancelled = False
 
     def __len__(self) -> int:
         return len(self._tasks)
 
     def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> None:
-        """Run it in a task of its own; nothing happens after :meth:`cancel`."""
-        if not self._is_over:
+        """Run ``function()`` in a new task. Does nothing after :meth:`cancel`."""
+        if not self._is_cancelled:
             task = asyncio.get_running_loop().create_task(self._guarded(function), name=name)
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
     def cancel(self) -> None:
-        """Have all of them end, and start no more. Never blocks; idempotent."""
-        self._is_over = True
+        """Cancel all tasks and start no more. Never blocks; idempotent."""
+        self._is_cancelled = True
         for task in tuple(self._tasks):
             task.cancel()
 
     async def aclose(self) -> None:
-        """Cancel them and wait until they are gone, also when the caller is being cancelled: it takes no time."""
+        """Cancel all tasks and wait for their end, even if the caller is being cancelled."""
         self.cancel()
         cancelled: asyncio.CancelledError | None = None
         with anyio.CancelScope(shield=True):
@@ -64,14 +63,14 @@ class Background:
         try:
             await function()
         except Exception as error:
-            self._on_mistake(error)
+            self._on_error(error)
 
 
-async def to_its_end(work: Coroutine[Any, Any, None]) -> None:
-    """Await what must not be cut short, also when the caller is being cancelled, in whatever way and however often.
+async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
+    """Await ``work`` to its end, even if the caller is cancelled, by any means and repeatedly.
 
-    anyio's shield holds off the scopes of anyio, not ``task.cancel()`` or ``asyncio.timeout``. The work must be bounded
-    in time. A cancellation that came meanwhile is raised afterwards; what the work raised is its cause then.
+    anyio's shield stops anyio's cancel scopes, but not ``task.cancel()`` or ``asyncio.timeout``. The work must be
+    bounded in time. A cancellation is raised afterwards, with an exception of the work as its cause.
     """
     task = asyncio.get_running_loop().create_task(work)
     cancelled: asyncio.CancelledError | None = None
@@ -87,10 +86,10 @@ async def to_its_end(work: Coroutine[Any, Any, None]) -> None:
 
 
 class Cancellation:
-    """Entered once, by a task; cancelled at any time, before as well, from callbacks too.
+    """Cancel scope that can be cancelled before it is entered, and from callbacks of the loop. Enter it once.
 
-    Where sniffio is installed (trio, openai and others bring it), anyio knows which library is running in tasks
-    only: an ``anyio.CancelScope`` made in a callback of the loop raises.
+    If sniffio is installed (a dependency of trio, openai and others), anyio detects the running library in tasks only:
+    creating an ``anyio.CancelScope`` in a callback raises.
     """
 
     def __init__(self) -> None:
@@ -98,7 +97,7 @@ class Cancellation:
         self._is_cancelled = False
 
     def cancel(self) -> None:
-        """Cancel what it is around, but for what is shielded; idempotent."""
+        """Cancel the code inside the scope, except for shielded parts. Idempotent."""
         self._is_cancelled = True
         if self._scope is not None:
             self._scope.cancel()
@@ -124,46 +123,44 @@ Alarm = Callable[[], None]
 
 
 class Deadlines:
-    """Calls each of its alarms at its time, unless it is taken back before.
+    """Calls each alarm at its time, unless it is cancelled before.
 
-    A request sets a deadline and takes it back a moment later, when the answer comes. A timer of the loop for each
-    would cost more than sending the request; here the one timer stays where it is, and looks for later ones when it
-    has come.
+    Most deadlines of requests are cancelled soon, when the answer arrives. One timer serves all of them, because a loop
+    timer for each would cost more than sending the request. It is not moved when a deadline is cancelled.
     """
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
-        self._due: dict[Alarm, float] = {}
+        self._deadlines: dict[Alarm, float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # uvloop's handle of a time that is past does not tell it
+        self._timer_at = 0.0  # a uvloop handle does not give its time once it is past
 
     def set(self, alarm: Alarm, at: float) -> None:
-        """Have ``alarm`` called at ``at`` (seconds, the loop's clock), and not at the time it was set to before."""
-        self._due[alarm] = at
-        self._come_by(at)
+        """Call ``alarm`` at ``at`` (seconds, loop time); this replaces an earlier time of the same alarm."""
+        self._deadlines[alarm] = at
+        self._schedule(at)
 
-    def take_back(self, alarm: Alarm) -> None:
-        """Have it not called; nothing happens when it is not set."""
-        self._due.pop(alarm, None)
+    def cancel(self, alarm: Alarm) -> None:
+        """Remove the deadline of ``alarm``, if it has one."""
+        self._deadlines.pop(alarm, None)
 
     def close(self) -> None:
-        """Call none of them any more."""
-        self._due.clear()
+        self._deadlines.clear()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
-    def _ring(self, now: float) -> None:
+    def _fire(self, now: float) -> None:
         self._timer = None
-        for alarm in [alarm for alarm, at in self._due.items() if at <= now]:
-            if self._due.pop(alarm, None) is not None:
+        for alarm in [alarm for alarm, at in self._deadlines.items() if at <= now]:
+            if self._deadlines.pop(alarm, None) is not None:
                 alarm()
-        if self._due:
-            self._come_by(min(self._due.values()))
+        if self._deadlines:
+            self._schedule(min(self._deadlines.values()))
 
-    def _come_by(self, at: float) -> None:
+    def _schedule(self, at: float) -> None:
         if self._timer is not None and self._timer_at <= at:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer, self._timer_at = self._loop.call_at(at, self._ring, at), at
+        self._timer, self._timer_at = self._loop.call_at(at, self._fire, at), at

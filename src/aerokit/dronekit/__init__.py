@@ -9,12 +9,12 @@ vehicle.mode = VehicleMode("RTL")
 vehicle.close()
 ```
 
-A program that says ``import dronekit`` runs unchanged with ``python -m aerokit.dronekit program.py`` (or
-``aerokit run program.py``); ``import aerokit.dronekit as dronekit`` is the one-line port; :func:`install` makes
-``import dronekit`` work in a test runner. What differs from DroneKit, and why, is in docs/from-dronekit.md.
+A program with ``import dronekit`` runs unchanged with ``python -m aerokit.dronekit program.py`` (or ``aerokit run
+program.py``). ``import aerokit.dronekit as dronekit`` is the one-line port. :func:`install` makes ``import dronekit``
+work in a test runner. docs/from-dronekit.md lists the differences from DroneKit.
 
-From here a program can move on function by function: ``vehicle.sync`` is the blocking twin of the new API on the
-same connection, ``vehicle.aio`` the asynchronous vehicle underneath.
+Programs can move to the new API function by function: ``vehicle.sync`` is the blocking API on the same connection,
+``vehicle.aio`` the asynchronous vehicle.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.imports import lazy_exports
-from aerokit.dronekit import monotonic, util
+from aerokit.dronekit import util
 from aerokit.dronekit.exceptions import APIException, TimeoutError  # noqa: A004 - DroneKit has it
 from aerokit.dronekit.observers import HasObservers
 from aerokit.dronekit.util import ErrprinterHandler
@@ -62,8 +62,10 @@ if TYPE_CHECKING:
     from aerokit.dronekit.runner import install
     from aerokit.dronekit.vehicle import Vehicle, connect, default_still_waiting_callback
 
+monotonic = time  # DroneKit exports the package `monotonic`; its only function is `monotonic`
+
 basestring: tuple[type[str], type[bytes]] = (str, bytes)
-"""For ``isinstance``, in programs that Python 2 also ran."""
+"""For ``isinstance`` checks in programs that also ran on Python 2."""
 
 __all__ = [
     "APIException",

@@ -1,4 +1,4 @@
-"""``python -m aerokit.dronekit program.py arguments…`` runs a DroneKit program unchanged."""
+"""``python -m aerokit.dronekit program.py arguments…`` runs a DroneKit program without changes."""
 
 from __future__ import annotations
 

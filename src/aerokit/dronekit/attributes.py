@@ -1,4 +1,4 @@
-"""The attributes of a vehicle, its location among them: what each message does to them, and who is told when."""
+"""The attributes of a vehicle and its location: how messages update them and when listeners are notified."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.modes import is_armed
 from aerokit.autopilots.telemetry import PREARM_CHECK
-from aerokit.connection.components import is_autopilot
+from aerokit.connection.heartbeats import is_autopilot
 from aerokit.dronekit.core import VehicleCore, core_of
 from aerokit.dronekit.flight_orders import CurrentCommand, mode_name
 from aerokit.dronekit.observers import HasObservers
-from aerokit.dronekit.privates import LocationPrivates, Shadowable, read_of
+from aerokit.dronekit.privates import LocationPrivates, OverridableProperty, attribute_path
 from aerokit.dronekit.values import (
     Attitude,
     Battery,
@@ -38,18 +38,17 @@ POS_HORIZ_ABS, CONST_POS_MODE, PRED_POS_HORIZ_ABS = (
     EkfStatusFlags.CONST_POS_MODE.value,
     EkfStatusFlags.PRED_POS_HORIZ_ABS.value,
 )
-"""Flags of EKF_STATUS_REPORT and of ESTIMATOR_STATUS, which agree in these."""
-LOOKING_DOWN = 25
-NO_MODE = (None, "INITIALISING", "MAV")
-"""What is told while it boots."""
+# The flags agree with those of ESTIMATOR_STATUS.
+FACING_DOWN = 25
+NO_MODE = (None, "INITIALISING", "MAV")  # while booting
 GLOBAL_FRAMES = ("location.global_relative_frame", "location.global_frame")
 LOCAL_FRAME = "location.local_frame"
 
 
 class Locations(HasObservers, LocationPrivates):
-    """The vehicle's location in global, global relative and local frames; each of them can be listened to.
+    """The vehicle's location in global, global relative and local frames. Each frame can be listened to.
 
-    Listeners get this object as their first argument. The three numbers of a location belong to one message.
+    Listeners get this object as their first argument. The three numbers of a location are from the same message.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
@@ -64,7 +63,7 @@ class Locations(HasObservers, LocationPrivates):
     def global_frame(self) -> LocationGlobal:
         """Latitude, longitude in degrees and altitude above mean sea level in metres (GLOBAL_POSITION_INT).
 
-        A new object each time. Latitude and longitude are None without a fix, the altitude is None until one is known.
+        A new object each time. Latitude and longitude are None without a fix; the altitude is None until it is known.
         """
         message = self._global.message
         if message is None:
@@ -97,30 +96,33 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """To those who listen here, then to those who listen to the vehicle, which has another name for it."""
+        """Notify listeners of this object, then those of the vehicle, where the name has the prefix ``location.``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 
 
 def _place_of(message: m.GlobalPositionInt) -> tuple[float | None, float | None]:
-    """Latitude and longitude in degrees, None without a fix."""
+    """Return latitude and longitude in degrees, or None without a fix."""
     return place(message.lat, message.lon) or (None, None)
 
 
 class VehicleAttributes(VehicleCore):
-    """State as DroneKit's attributes. Reading takes what came last, on the caller's thread, and never waits.
+    """State as DroneKit's attributes. Reading returns the latest value without waiting, on any thread.
 
-    A message is kept by one assignment, so what is read together belongs to one message.
+    Each message is stored by a single assignment, so that values read together are from the same message.
     """
 
     _dk_heartbeat: m.Heartbeat | None = None
-    _autopilot_type, _vehicle_type = read_of("_dk_heartbeat.autopilot"), read_of("_dk_heartbeat.type")
+    _autopilot_type, _vehicle_type = (
+        attribute_path("_dk_heartbeat.autopilot"),
+        attribute_path("_dk_heartbeat.type"),
+    )
     _flightmode: str = "UNKNOWN"
     _dk_distance_down: float | None = None
     _dk_ekf_flags: int | None = None
     _dk_ekf_ok = False
     _home_location: LocationGlobal | None = None
-    _dk_told_home: LocationGlobal | None = None
+    _dk_reported_home: LocationGlobal | None = None
 
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
@@ -145,12 +147,12 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def location(self) -> Locations:
-        """Where it is: ``.global_frame``, ``.global_relative_frame``, ``.local_frame``."""
+        """The location: ``.global_frame``, ``.global_relative_frame``, ``.local_frame``."""
         return self._location
 
     @property
     def system_status(self) -> SystemStatus | Any:
-        """HEARTBEAT.system_status by name (``'STANDBY'``, ``'ACTIVE'`` …); None before the first, and if unknown."""
+        """HEARTBEAT.system_status by name (``'STANDBY'``, ``'ACTIVE'`` …); None before the first, or if unknown."""
         heartbeat = self._dk_heartbeat
         if heartbeat is None or heartbeat.system_status >= len(STATES):
             return None
@@ -169,7 +171,7 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def heading(self) -> int | Any:
-        """Where the nose points, 0 to 360 degrees clockwise from north (VFR_HUD)."""
+        """Heading in degrees, 0 to 360 clockwise from north (VFR_HUD)."""
         return self._dk_vfr_hud.values("heading")[0]
 
     @property
@@ -187,30 +189,30 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def rangefinder(self) -> Rangefinder:
-        """Distance in metres and voltage (RANGEFINDER; of others DISTANCE_SENSOR that looks down)."""
+        """Distance in metres and voltage (RANGEFINDER, or a downward DISTANCE_SENSOR)."""
         if self._dk_rangefinder.message is None:
             return Rangefinder(self._dk_distance_down, None)
         return Rangefinder(*self._dk_rangefinder.values("distance", "voltage"))
 
-    @Shadowable
+    @OverridableProperty
     def wind(self) -> Wind:
-        """Direction it comes from in degrees and speed in m/s (WIND of ArduPilot)."""
+        """Wind direction (from) in degrees and speed in m/s (WIND of ArduPilot)."""
         return Wind(*self._dk_wind.values("direction", "speed", "speed_z"))
 
     @property
     def ekf_ok(self) -> bool:
-        """Whether the estimator can fly: armed, it has an absolute position; disarmed, it has or will have one."""
+        """True if the estimator allows flight: absolute position when armed, existing or predicted when disarmed."""
         return self._dk_ekf_ok
 
     @property
     def is_armable(self) -> bool:
-        """Whether it has booted, has a GPS fix, and its estimator will have a position; on PX4: its checks pass.
+        """True if the vehicle has booted, has a GPS fix and a (predicted) position; on PX4: its checks pass.
 
-        The vehicle's own arming checks may still refuse: :meth:`Vehicle.arm` tells why.
+        Its own arming checks may still fail: :meth:`Vehicle.arm` reports the reasons.
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
-        if self._dk.found is not None and self._dk.found.autopilot.judges_by_mode:
+        if self._dk.aio_or_none is not None and self._dk.aio_or_none.autopilot.prearm_depends_on_mode:
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         gps = self._dk_gps.message
@@ -218,19 +220,19 @@ class VehicleAttributes(VehicleCore):
 
     @property
     def version(self) -> Version:
-        """The firmware: version and type (AUTOPILOT_VERSION, HEARTBEAT)."""
+        """Firmware version and type (AUTOPILOT_VERSION, HEARTBEAT)."""
         (raw,) = self._dk_version.values("flight_sw_version")
         return Version(raw, self._autopilot_type, self._vehicle_type)
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the autopilot understands (AUTOPILOT_VERSION)."""
+        """Capabilities of the autopilot (AUTOPILOT_VERSION)."""
         return Capabilities(*self._dk_version.values("capabilities"))
 
     @property
     def last_heartbeat(self) -> float | Any:
         """Seconds since the autopilot's last HEARTBEAT; None before the first."""
-        return None if self._dk.found is None else self._dk.found.heartbeat_age
+        return None if self._dk.aio_or_none is None else self._dk.aio_or_none.heartbeat_age
 
     @property
     def _armed(self) -> bool:
@@ -240,18 +242,18 @@ class VehicleAttributes(VehicleCore):
     # ----------------------------------------------------------------------------- receiving
 
     def _dk_on_heartbeat(self, message: m.Heartbeat) -> None:
-        if not is_autopilot(message):  # a ground station or a companion that took the autopilot's ids
+        if not is_autopilot(message):  # a ground station or companion that uses the autopilot's ids
             return
-        self._handler.follow_version(message)
+        self._handler.match_mavlink_version(message)
         self._dk_heartbeat = message
         self._flightmode = mode_name(self._dk.aio, message.custom_mode)
-        self._dk.listeners.tell("armed", self._armed, cache=True)
-        self._dk.listeners.tell("mode", VehicleMode(self._flightmode), cache=True)
-        self._dk.listeners.tell("system_status", self.system_status, cache=True)
+        self._dk.listeners.notify("armed", self._armed, cache=True)
+        self._dk.listeners.notify("mode", VehicleMode(self._flightmode), cache=True)
+        self._dk.listeners.notify("system_status", self.system_status, cache=True)
         self._dk.ready.mark("last_heartbeat")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        if message.orientation == LOOKING_DOWN and self._dk_rangefinder.message is None:
+        if message.orientation == FACING_DOWN and self._dk_rangefinder.message is None:
             self._dk_distance_down = message.current_distance / 100.0
             self._dk.listeners.announce("rangefinder")
 
@@ -261,18 +263,17 @@ class VehicleAttributes(VehicleCore):
             self._dk_ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
         else:
             self._dk_ekf_ok = bool(flags & (POS_HORIZ_ABS | PRED_POS_HORIZ_ABS))
-        self._dk.listeners.tell("ekf_ok", self._dk_ekf_ok, cache=True)
+        self._dk.listeners.notify("ekf_ok", self._dk_ekf_ok, cache=True)
 
     def _dk_on_home(self, message: m.HomePosition) -> None:
         self._dk_set_home(message.latitude / 1.0e7, message.longitude / 1.0e7, message.altitude / 1000.0)
-        self._dk.listeners.tell("home_location", self._home_location)
+        self._dk.listeners.notify("home_location", self._home_location)
 
     def _dk_on_version(self, message: m.AutopilotVersion) -> None:
-        self._handler.knows_mavlink_2 = bool(message.capabilities & MavProtocolCapability.MAVLINK2)
+        self._handler.supports_mavlink_2 = bool(message.capabilities & MavProtocolCapability.MAVLINK2)
         self._dk.ready.mark("version")
         self._dk.ready.mark("capabilities")
-        self._dk.listeners.tell("autopilot_version", message.flight_sw_version)
+        self._dk.listeners.notify("autopilot_version", message.flight_sw_version)
 
     def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:
-        """Where home is as the vehicle told it, in degrees and metres above the sea; from any thread."""
-        self._home_location = self._dk_told_home = LocationGlobal(lat, lon, alt)
+        self._home_location = self._dk_reported_home = LocationGlobal(lat, lon, alt)

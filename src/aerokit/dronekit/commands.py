@@ -1,7 +1,7 @@
-"""``vehicle.commands``: the mission of a vehicle, as DroneKit programs read and write it, and its ``Command``s.
+"""``vehicle.commands``: the mission of a vehicle in the classic API, and its ``Command`` items.
 
-Programs count commands as ArduPilot does, whatever the vehicle: item 0 is home, ``commands[0]`` has ``seq`` 1. Items of
-a :class:`aerokit.missions.Mission` are counted from 0 without home, so jumps are one apart.
+Indices are ArduPilot's for every vehicle: item 0 is home, and ``commands[0]`` has ``seq`` 1. Items of a
+:class:`aerokit.missions.Mission` count from 0 without home, so jump targets differ by one.
 """
 
 from __future__ import annotations
@@ -21,29 +21,28 @@ from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission
 from aerokit.missions.item import MissionItem, canonical_frame
-from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps, to_wire_float, written_out
-from aerokit.sync.reply import reply_of
+from aerokit.missions.wire import convert_from_ardupilot, from_degrees, in_degrees, shift_jumps, to_wire_float
+from aerokit.sync.thread_future import when_done
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from aerokit.dronekit.attributes import VehicleAttributes
-    from aerokit.dronekit.line import BackgroundCall
+    from aerokit.dronekit.classic_connection import BackgroundCall
     from aerokit.dronekit.values import LocationGlobal
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
+# Fields of MAVLink 1; the later `mission_type` is not part of a command's text.
 FIELDS: list[str] = MAVLink_mission_item_message.fieldnames[:14]
-"""Those of MAVLink 1: ``mission_type``, which came later, is no part of a command's text."""
 PARAMS: list[str] = FIELDS[7:11]
+# Fields that are compared to detect a changed mission.
 CONTENT: tuple[str, ...] = ("frame", "command", "autocontinue", *FIELDS[7:])
-"""The fields that make a mission another one when they are changed."""
-ABOVE_SEA = (0, 5)
-"""MAV_FRAME_GLOBAL and its _INT twin."""
-AT_HOME_DEG, AT_HOME_M = 1e-4, 2.0
-"""How near to home the home row of a file may be: about ten metres, two in height."""
+AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
+# How far the first row of a waypoint file may be from home to count as home: about ten metres, two in altitude.
+HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
 
 
-if TYPE_CHECKING:  # pymavlink's classes say little to a checker
+if TYPE_CHECKING:  # pymavlink's classes have no useful annotations
 
     class _MissionItem:
         target_system: int
@@ -68,22 +67,22 @@ else:
 
 
 class Command(_MissionItem):
-    """A waypoint, or another item of a mission, of ``vehicle.commands``: a MISSION_ITEM of pymavlink.
+    """A waypoint, or another mission item, of ``vehicle.commands``: a MISSION_ITEM of pymavlink.
 
     Args:
-        target_system: anything; it is filled in when it is added.
-        target_component: so is this.
-        seq: and this.
-        frame: MAV_FRAME: what ``z`` is above; 0: the sea, 3: home, 10: the terrain.
+        target_system: ignored; set when the command is added.
+        target_component: ignored.
+        seq: ignored; set when the command is added.
+        frame: MAV_FRAME: reference of ``z``; 0: sea level, 3: home, 10: terrain.
         command: MAV_CMD.
-        current: not used; 1 in the first row of a waypoint file, which is home.
-        autocontinue: 0 makes PX4 stay at the item; ArduPilot goes on in any case.
-        param1: the command's first parameter.
-        param2: its second.
-        param3: its third.
-        param4: its fourth.
-        x: latitude in degrees, or the command's parameter 5; metres in a local frame.
-        y: longitude, or its parameter 6.
+        current: ignored, except that 1 in the first row of a waypoint file marks home.
+        autocontinue: 0 makes PX4 stay at the item; ArduPilot always continues.
+        param1: first parameter of the command.
+        param2: second parameter.
+        param3: third parameter.
+        param4: fourth parameter.
+        x: latitude in degrees, or parameter 5; metres in a local frame.
+        y: longitude, or parameter 6.
         z: altitude in metres, or parameter 7.
     """
 
@@ -105,35 +104,32 @@ class Command(_MissionItem):
         z: float,
     ) -> None:
         numbers = (param1, param2, param3, param4, x, y, z)
-        super().__init__(
-            target_system, target_component, seq, frame, command, current, autocontinue, *numbers
-        )
+        super().__init__(target_system, target_component, seq, frame, command, current, autocontinue, *numbers)
         self._fieldnames = FIELDS
 
 
-class Held(Snapshot):
-    """What the sequence consists of, replaced as a whole."""
+class SequenceState(Snapshot):
+    """Content of a CommandSequence. Replaced as a whole."""
 
     items: tuple[Command, ...] = ()
     home: Command | None = None
     is_changed: bool = False
-    """Whether a program has cleared, added or replaced since it was the vehicle's."""
+    """True after clear, add or assignment, until uploaded or downloaded."""
 
 
 class CommandSequence:
     """The commands of a mission, without home: ``commands[0]`` is the first to be flown and has ``seq`` 1.
 
-    Nothing is known of the vehicle's mission before :meth:`download`, and nothing changes there before :meth:`upload`.
-    Between the two it is a list: it has a length, indices (negative ones count from the end), slices, iteration and
-    assignment; commands may be edited in place. Any thread may use it.
+    It is empty before :meth:`download`, and the vehicle's mission changes only with :meth:`upload`. In between it works
+    like a list: length, indices (also negative), slices, iteration and assignment; commands can be edited in place. Can
+    be used from any thread.
     """
 
     def __init__(self, vehicle: VehicleAttributes) -> None:
         self._vehicle, self._core = vehicle, core_of(vehicle)
         self._lock = threading.Lock()
-        self._held = Held()
-        self._uploaded: tuple[tuple[Any, ...], ...] = ()
-        """What the commands said when the vehicle had them last."""
+        self._held = SequenceState()
+        self._uploaded: tuple[tuple[Any, ...], ...] = ()  # content of the vehicle's mission, as last known
         self._downloads = 0
         self._download: BackgroundCall | None = None
         self._current = vehicle._dk_current_command
@@ -141,10 +137,10 @@ class CommandSequence:
     # ------------------------------------------------------------------- from and to the vehicle
 
     def download(self) -> None:
-        """Begin to read the vehicle's mission; :meth:`wait_ready` waits until it is there.
+        """Start reading the vehicle's mission; :meth:`wait_ready` waits for it.
 
-        Until then the sequence stays what it was. A download under way is begun anew. When it is there, listeners to
-        ``'commands'`` are told; ``vehicle.home_location`` is set if the mission has it. APIException: the link is down.
+        The sequence does not change until then. Restarts a running download. Afterwards listeners of ``'commands'`` are
+        called, and ``vehicle.home_location`` is set if the mission has it. APIException: the link is down.
         """
         self._core.check_link()
         with self._lock:
@@ -153,34 +149,34 @@ class CommandSequence:
             self._download = self._core.order("commands.download", self._read, self._downloads)
 
     def wait_ready(self, **kwargs: Any) -> bool:
-        """Wait for the end of the download; arguments, result and errors as of :meth:`Vehicle.wait_ready`.
+        """Wait for the download; arguments, result and errors are those of :meth:`Vehicle.wait_ready`.
 
-        When the download has failed the APIException says why; the next one may succeed.
+        Raises APIException with the reason if the download fails; it can be repeated.
         """
         return self._vehicle.wait_ready("commands", **kwargs)
 
     def upload(self, timeout: float | None = None) -> None:
-        """Have the vehicle hold exactly these commands, and return when it has confirmed that.
+        """Upload the commands, and return when the vehicle has confirmed them.
 
-        Nothing is sent when nothing was changed since the last download or upload. Afterwards, whether or not it
-        succeeded, the sequence is what it was, and can be uploaded again.
+        Sends nothing if nothing changed since the last download or upload. The sequence itself does not change, so that
+        a failed upload can be repeated.
 
         Args:
-            timeout: seconds for all of it; None: as long as it makes progress (ten seconds without any are the end).
+            timeout: seconds in total; None: no limit, but ten seconds without progress raise TimeoutError.
 
         Raises:
-            TimeoutError: the vehicle does not answer, or not in time.
-            APIException: it refused: the text names command and reason, commands counted as their indices here.
-            InvalidArgument: a ValueError; a command cannot be right. Nothing was sent.
+            TimeoutError: the vehicle did not answer in time.
+            APIException: the vehicle refused; the text has the index of the command here and the reason.
+            InvalidArgument: a ValueError; a command is invalid. Nothing was sent.
         """
-        self._settle()
+        self._require_downloaded()
         with self._lock:
             values = _values_of(self._held.items)
             if not self._held.is_changed and values == self._uploaded:
                 return
-            held = self._held = self._held.replace(is_changed=True)  # until it is known to be there
+            held = self._held = self._held.replace(is_changed=True)  # until the vehicle has confirmed it
         aio = self._core.check_link()
-        # DroneKit knows no such limit, and its programs run unchanged.
+        # DroneKit has no such limit, and its programs run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
         self._core.run(aio.mission.upload, _mission_of(held.items, aio), **options)
         with self._lock:
@@ -190,9 +186,9 @@ class CommandSequence:
 
     @property
     def next(self) -> int:
-        """``seq`` of the command that the vehicle flies: ``commands[commands.next - 1]``; 0 before it flies any.
+        """``seq`` of the current command: ``commands[commands.next - 1]``; 0 before the mission starts.
 
-        Setting it has the vehicle go for that command next (0: begin anew), and does not wait.
+        Setting it makes that command the next (0: restart) without waiting.
         """
         return self._current.seq
 
@@ -203,21 +199,20 @@ class CommandSequence:
     # ---------------------------------------------------------------------------------- a list
 
     def clear(self) -> None:
-        """Remove all commands; the vehicle is told by :meth:`upload`. Waits for the end of a download under way."""
+        """Remove all commands from the sequence; :meth:`upload` sends the change. Waits for a running download."""
         self._wait_for_download()
         with self._lock:
             if self._core.ready.failure_of({"commands"}) is not None:
                 self._core.ready.mark("commands")
-            self._held = Held((), self._held.home, is_changed=True)
+            self._held = SequenceState((), self._held.home, is_changed=True)
 
     def add(self, cmd: Any) -> None:
-        """Append a copy of a command; the vehicle is told by :meth:`upload`. Waits for the end of a download under way.
+        """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
 
-        ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` becomes the
-        vehicle's. The first row of a waypoint file, which is home, is kept apart: vehicles have a home of their own.
-        APIException: the download before has failed, so that there is nothing to append to.
+        ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. The
+        first row of a waypoint file, which is home, is stored separately. APIException: the last download has failed.
         """
-        self._settle()
+        self._require_downloaded()
         added = _command_from(cmd)
         cmd.target_system = added.target_system = self._core.target_system
         if self._append(added) == 0:
@@ -225,7 +220,6 @@ class CommandSequence:
 
     @property
     def count(self) -> int:
-        """The number of commands, as ``len()`` has it."""
         return len(self._held.items)
 
     def __len__(self) -> int:
@@ -245,7 +239,7 @@ class CommandSequence:
         return items[_checked(index, len(items))]
 
     def __setitem__(self, index: int, value: Any) -> None:
-        self._settle()
+        self._require_downloaded()
         command = value if isinstance(value, Command) else _command_from(value)
         with self._lock:
             items = list(self._held.items)
@@ -255,14 +249,14 @@ class CommandSequence:
             self._held = self._held.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:
-        """As a waypoint file has them: home first, all zeros if not known; empty as long as nothing is known."""
+        """Return the rows of a waypoint file: home (zeros if unknown) and the commands; empty if all is unknown."""
         held = self._held
         if not held.items and held.home is None:
             return ()
         return (*(_commands_of(Mission(), (0, 0)) if held.home is None else (held.home,)), *held.items)
 
     def _append(self, cmd: Command) -> int:
-        """Append it, as home if that is what it is; returns its number."""
+        """Append a command, or store it as home; return its number."""
         with self._lock:
             held = self._held
             if not held.items and _is_home_row(cmd, self._vehicle._home_location):
@@ -277,25 +271,25 @@ class CommandSequence:
         try:
             mission = await self._core.aio.mission.download()
         except AerokitError as error:
-            self._note_failure(number, error)
+            self._on_download_failed(number, error)
             raise
         self._take(number, mission)
 
     def _take(self, number: int, mission: Mission) -> None:
-        """On the loop thread: what was downloaded is the sequence from now on."""
+        """Store a downloaded mission (loop thread)."""
         home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
         at_home, *items = _commands_of(mission, own_ids)
         with self._lock:
             if number != self._downloads:
                 return
-            self._held = Held(tuple(items), at_home)
+            self._held = SequenceState(tuple(items), at_home)
             self._uploaded = _values_of(items)
         if home is not None and home.altitude_amsl_m is not None:
             self._vehicle._dk_set_home(home.latitude_deg, home.longitude_deg, home.altitude_amsl_m)
-        self._core.listeners.tell("commands", self)
+        self._core.listeners.notify("commands", self)
 
-    def _note_failure(self, number: int, error: AerokitError) -> None:
+    def _on_download_failed(self, number: int, error: AerokitError) -> None:
         kind = TimeoutError if isinstance(error, OperationTimeout) else APIException
         failure = kind(f"the mission could not be downloaded: {error}")
         failure.__cause__ = error
@@ -303,31 +297,29 @@ class CommandSequence:
             if number == self._downloads:
                 self._core.ready.fail("commands", failure)
 
-    def _settle(self) -> None:
-        """Wait until it is known what there is to change."""
+    def _require_downloaded(self) -> None:
+        """Wait for a running download; raise if it has failed."""
         self._wait_for_download()
         if (failure := self._core.ready.failure_of({"commands"})) is not None:
             raise type(failure)(f"{failure}; download() again, or clear()") from failure.__cause__
 
     def _wait_for_download(self) -> None:
-        """As DroneKit does: what is cleared or added after download() comes after it. Its end is bounded."""
+        # As in DroneKit, clear() and add() after download() apply to the downloaded mission.
         while (download := self._download) is not None and not download.done():
             with classic_errors():
-                self._core.handler.loop.wait_for(reply_of(download))
+                self._core.handler.loop.wait_for(when_done(download))
 
 
 class WaypointLoader:
-    """``vehicle._wploader``, as far as programs read it: commands with home as number 0."""
+    """``vehicle._wploader`` for reading: commands with home as number 0."""
 
     def __init__(self, commands: CommandSequence) -> None:
         self._commands = commands
 
     def count(self) -> int:
-        """How many there are, home included; 0 as long as nothing is known."""
         return len(self._commands.rows())
 
     def wp(self, i: int) -> Command:
-        """Command ``i``; 0 is home, all zeros when it is not known. IndexError if there is none."""
         return self._commands.rows()[i]
 
 
@@ -342,7 +334,7 @@ def _checked(index: Any, count: int) -> int:
 
 
 def _command_from(cmd: Any) -> Command:
-    """A copy of a command, or what a MISSION_ITEM or MISSION_ITEM_INT of pymavlink stands for; TypeError else."""
+    """Copy a command, or convert a MISSION_ITEM or MISSION_ITEM_INT of pymavlink; TypeError for anything else."""
     if isinstance(cmd, Command):
         return copy.copy(cmd)
     try:
@@ -355,7 +347,7 @@ def _command_from(cmd: Any) -> Command:
 
 
 def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
-    """What the commands say by now, to be compared; NaN is equal to NaN."""
+    """Return the content of commands for comparison; NaN equals NaN."""
     return tuple(
         tuple("NaN" if value != value else value for value in (getattr(each, name) for name in CONTENT))
         for each in commands
@@ -363,11 +355,12 @@ def _values_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
-    """Whether a command is not to be flown but is the first row of a waypoint file: where home was.
+    """Return True if a command is the home row of a waypoint file rather than a waypoint.
 
-    That is a waypoint above the sea without parameters which has ``current`` set, is all zeros, or is where home is.
+    The home row is a waypoint above sea level, without parameters, that has ``current`` set, is all zeros, or is at
+    home.
     """
-    if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in ABOVE_SEA:
+    if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):
         return False
@@ -379,22 +372,22 @@ def _is_at(cmd: Command, home: LocationGlobal | None) -> bool:
         return False
     try:
         away = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
-        return bool(away <= AT_HOME_DEG and abs(cmd.z - home.alt) <= AT_HOME_M)
-    except TypeError:  # no numbers: told when it is uploaded
+        return bool(away <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
+    except TypeError:  # not numbers: upload() reports it
         return False
 
 
 def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
-    """The mission of these commands for this vehicle; InvalidArgument names a field that is no number."""
+    """Convert commands to a mission for this vehicle; InvalidArgument names a field that is not a number."""
     items: Iterable[MissionItem] = [_item(each, index) for index, each in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
         here = vehicle.telemetry.position.latest or vehicle.telemetry.home.latest
-        items = written_out(items, None if here is None else (here.latitude_deg, here.longitude_deg))
+        items = convert_from_ardupilot(items, None if here is None else (here.latitude_deg, here.longitude_deg))
     return Mission(shift_jumps(items, -1))
 
 
 def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, ...]:
-    """Home, all zeros when it is not known, and the commands of a mission, sent to ``own_ids`` (system, component)."""
+    """Convert a mission to home (zeros if unknown) and commands; ``own_ids`` are the target system and component."""
     items = mission.to_items(home_is_item_0=True)
     return tuple(_command(item, seq, own_ids) for seq, item in enumerate(items))
 
@@ -411,13 +404,13 @@ def _item(cmd: Command, index: int) -> MissionItem:
 
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:
-    """What MISSION_ITEM_INT has for x or y. A fraction of what is no place is cut off, as ArduPilot does."""
+    """Return x or y for MISSION_ITEM_INT. Fractions of values that are not positions are cut off, as in ArduPilot."""
     number = from_degrees(float(value), command, frame)
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
 
 
 def _command(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
-    # The frames of MISSION_ITEM, which is what a command is.
+    # A command is a MISSION_ITEM, which has other frames than MISSION_ITEM_INT.
     item = item.replace(frame=int(canonical_frame(item.frame)))
     message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])
     return Command(*(getattr(message, name) for name in FIELDS))

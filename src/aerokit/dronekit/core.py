@@ -1,4 +1,4 @@
-"""``Core``: the connection underneath a classic vehicle, as all its parts use it, and what was received on it."""
+"""``Core``: the connection of a classic vehicle as its parts use it, and the messages received on it."""
 
 from __future__ import annotations
 
@@ -10,46 +10,44 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from aerokit.dronekit.classic_connection import weak_callback
 from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_errors  # noqa: A004 - DroneKit's name
-from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message
-from aerokit.protocols.command import attempts_of
+from aerokit.protocols.command import max_attempts
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from aerokit.connection.tasks import Background
-    from aerokit.dronekit.line import BackgroundCall, Work
+    from aerokit.connection.tasks import BackgroundTasks
+    from aerokit.dronekit.classic_connection import BackgroundCall, Work
     from aerokit.dronekit.mavlink import MAVConnection
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
+# Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
-"""What ``wait_ready(True)`` waits for."""
 
-LONGEST_WAIT_S = 0.2
-"""Waits are cut into slices: Ctrl-C and the end of the link are noticed between them."""
-SILENT_AFTER_S = 5
-TICK_S = 0.05
-IDLE_TICK_S = 1.0
+MAX_WAIT_S = 0.2  # of a single wait, so that Ctrl-C and a lost link are noticed
+SILENCE_WARNING_S = 5
+TICK_INTERVAL_S = 0.05
+IDLE_TICK_INTERVAL_S = 1.0
 
 MessageT = TypeVar("MessageT", bound=Message)
 
 
 class Readiness:
-    """What is ready is what was told at least once. Any thread may use it."""
+    """Names of attributes that have a value, and waiting for them. Can be used from any thread."""
 
     def __init__(self) -> None:
         self.names: set[str] = set()
-        """What has values."""
-        self.seekers: dict[str, Callable[[], None]] = {}
-        """What is called while somebody waits for a name that does not come by itself."""
+        self.fetchers: dict[str, Callable[[], None]] = {}
+        """Functions that request the value of an attribute; called repeatedly while a program waits for it."""
         self._failures: dict[str, APIException] = {}
         self._changed = threading.Condition()
 
     def mark(self, name: str) -> None:
-        """The attribute has a value, as it may have had before: whoever waits for it goes on."""
+        """Record that the attribute has a value."""
         if name in self.names and name not in self._failures:
             return
         with self._changed:
@@ -58,31 +56,31 @@ class Readiness:
             self._changed.notify_all()
 
     def unmark(self, name: str) -> None:
-        """The attribute will get a new value, and is to be waited for."""
+        """Record that the attribute is being read again, so that programs wait for the new value."""
         with self._changed:
             self._failures.pop(name, None)
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """The attribute will get no value: whoever waits for it is told why."""
+        """Record that the attribute gets no value; programs that wait for it raise this error."""
         with self._changed:
             self._failures[name] = error
             self._changed.notify_all()
 
     def failure_of(self, names: set[str]) -> APIException | None:
-        """Why one of these will get no value, if that is known."""
+        """Return why one of these attributes gets no value, or None."""
         return next(filter(None, map(self._failures.get, names)), None)
 
-    def wait_a_little(self, wanted: set[str], at_most_s: float) -> None:
-        """Wait until something may have happened to these, as long as one of them is missing."""
+    def wait_for_change(self, wanted: set[str], at_most_s: float) -> None:
+        """Wait for a change, at most ``at_most_s`` and 0.2 seconds, if one of these attributes is missing."""
         with self._changed:
             missing = wanted - self.names
             if missing and self.failure_of(missing) is None:
-                self._changed.wait(min(LONGEST_WAIT_S, at_most_s))
+                self._changed.wait(min(MAX_WAIT_S, at_most_s))
 
 
-class Latest(Generic[MessageT]):
-    """The latest message of a kind that the autopilot sent, and who is given each of them."""
+class LatestMessage(Generic[MessageT]):
+    """The latest message of a type from the autopilot, and its handlers. Decodes only when a value is read."""
 
     def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
         self._decode: Callable[[bytes, Frame], MessageT] = message_type.decode_body
@@ -91,31 +89,30 @@ class Latest(Generic[MessageT]):
         self._names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._held: Frame | MessageT | None = None
-        self._made: MessageT | None = None
+        self._decoded: MessageT | None = None
         self.component_id = 0
-        """Of the autopilot: nobody else counts."""
+        """Component id of the autopilot; messages of others are ignored."""
 
     @property
     def message(self) -> MessageT | None:
-        """The message, None before the first; made by the first who reads it, on any thread."""
+        """The message, or None before the first. Decoded on first access, on any thread."""
         held = self._held
         if not isinstance(held, Frame):
             return held
-        made = self._made
-        if made is None or made.received_frame is not held:
-            made = self._made = self._decode(held.body, held)
-        return made
+        decoded = self._decoded
+        if decoded is None or decoded.received_frame is not held:
+            decoded = self._decoded = self._decode(held.body, held)
+        return decoded
 
     def values(self, *fields: str) -> tuple[Any, ...]:
-        """Fields of one message, None before the first."""
         message = self.message
         return tuple([None if message is None else getattr(message, field) for field in fields])
 
-    def add(
-        self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None
-    ) -> None:
-        """Have a handler called, after those added before: with each message, or, with ``names``, only as long as not
-        all of them were told, or somebody listens to one of them, or has any of the other ``listeners``.
+    def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
+        """Add a handler, called with each message.
+
+        With ``names`` it is called only while one of these attributes has no value yet or has listeners, here or in
+        ``listeners``.
         """
         self._handlers.append(handler)
         self._names.update(names)
@@ -123,21 +120,21 @@ class Latest(Generic[MessageT]):
             self._listeners.append(listeners)
 
     def take(self, frame: Frame, message: MessageT | None = None) -> None:
-        """Take a frame of the vehicle's system (loop thread), and its message if that was made already."""
+        """Receive a frame of the vehicle's system, with its message if that is decoded already (loop thread)."""
         if frame.component_id != self.component_id:
             return
-        if self._is_wanted():
+        if self._needs_message():
             self.receive(self._decode(frame.body, frame) if message is None else message)
         else:
             self._held = frame
 
     def receive(self, message: MessageT) -> None:
-        """Keep it, and give it to the handlers."""
+        """Store a message and call the handlers."""
         self._held = message
         for handler in self._handlers:
             handler(message)
 
-    def _is_wanted(self) -> bool:
+    def _needs_message(self) -> bool:
         names = self._names
         if not names or not names <= self._ready:
             return True
@@ -149,43 +146,40 @@ class Latest(Generic[MessageT]):
 
 
 class Core:
-    """What is sent, waited for and heard by way of the asynchronous vehicle, once there is one, and what is told of it.
-
-    The parts of a vehicle know this, and not the vehicle.
-    """
+    """Shared by the parts of a classic vehicle: the asynchronous vehicle, messages, listeners and orders."""
 
     def __init__(self, handler: MAVConnection, owner: object) -> None:
         self.handler = handler
         self.logger: logging.Logger = logging.getLogger("dronekit")
         self.ready: Readiness = Readiness()
         self.listeners: Listeners = Listeners(owner, handler.listener_thread, self.ready.mark)
-        """Of the vehicle's attributes."""
+        """Listeners of the vehicle's attributes."""
         self.heartbeat_limit_s: float = 0.0
-        """Longer silences are errors; 0: none is."""
-        self.found: AsyncVehicle | None = None
-        """The asynchronous vehicle, once it was found."""
-        self._tasks: Background | None = None
-        self._latest: dict[type[Message], Latest[Any]] = {}
-        self.at_start: list[Callable[[], None]] = []
-        """What is called on the loop when the vehicle is found."""
+        """Silence after which orders raise, in seconds; 0: no limit."""
+        self.aio_or_none: AsyncVehicle | None = None
+        """The asynchronous vehicle, once it is connected."""
+        self._tasks: BackgroundTasks | None = None
+        self._latest: dict[type[Message], LatestMessage[Any]] = {}
+        self.on_connected: list[Callable[[], None]] = []
+        """Functions to call on the loop when the vehicle is connected."""
         self._is_silent = False
 
     # --------------------------------------------------------------------------------- state
 
     @property
     def target_system(self) -> int:
-        """System id of the vehicle, 0 before it was heard."""
+        """System id of the vehicle, 0 until it is found."""
         return self.handler.target_system
 
     @property
     def aio(self) -> AsyncVehicle:
-        """The asynchronous vehicle; APIException before it was found."""
-        if self.found is None:
+        """The asynchronous vehicle; raises APIException before it is connected."""
+        if self.aio_or_none is None:
             raise APIException("the vehicle is not connected yet: call initialize()")
-        return self.found
+        return self.aio_or_none
 
     def check_link(self) -> AsyncVehicle:
-        """The asynchronous vehicle; APIException unless it can be talked to."""
+        """Return the asynchronous vehicle; raise APIException unless commands can be sent to it."""
         aio = self.aio
         if self.handler.is_closed:
             raise APIException("the vehicle was closed")
@@ -193,10 +187,10 @@ class Core:
             aio.connection.raise_if_ended()
         age = aio.heartbeat_age
         if self.heartbeat_limit_s and age > self.heartbeat_limit_s:
-            raise APIException(f"no heartbeat of the vehicle for {age:.0f} s")
+            raise APIException(f"no heartbeat from the vehicle for {age:.0f} s")
         return aio
 
-    # ------------------------------------------------------------------------------- hearing
+    # ----------------------------------------------------------------------------- receiving
 
     def on(
         self,
@@ -204,20 +198,20 @@ class Core:
         handler: Callable[[MessageT], object],
         *names: str,
         listeners: Listeners | None = None,
-    ) -> Latest[MessageT]:
-        """Have a handler called with messages of the autopilot (loop thread, weakly); returns what has the latest one.
+    ) -> LatestMessage[MessageT]:
+        """Call a handler with messages of the autopilot (loop thread, by weak reference); return the latest message.
 
-        If it does nothing but tell ``names``, attributes of the vehicle, and to ``listeners`` of others, it is called
-        only where somebody may want to know.
+        If the handler only announces attributes, pass their ``names``: it is then called only while they have
+        listeners, here or in ``listeners``.
         """
         if message_type not in self._latest:
-            self._latest[message_type] = Latest(message_type, self.ready.names, self.listeners)
+            self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)
         latest = self._latest[message_type]
         latest.add(handler, names, listeners)
         return latest
 
-    def announce(self, message_type: type[MessageT], *names: str) -> Latest[MessageT]:
-        """Have messages of this kind told as these attributes; returns what has the latest one."""
+    def announce(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
+        """Announce these attributes with each message of this type; return the latest message."""
 
         def announce(_: MessageT) -> None:
             for name in names:
@@ -225,66 +219,66 @@ class Core:
 
         return self.on(message_type, announce, *names)
 
-    def begin(self, aio: AsyncVehicle, tasks: Background) -> None:
-        """The vehicle was found (loop thread): hear what the parts want to; the loop gets weak references only."""
-        self.found, self._tasks = aio, tasks
+    def begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
+        """Start receiving once the vehicle is connected (loop thread). The loop gets weak references only."""
+        self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # made first: its table takes a value before the parts here are told of it
+        _ = aio.parameters  # created first, so that its table has a value before handlers here are called
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
-            aio.connection.bus.attach_lazily(message_type, weakly(latest.take), system_id=aio.system_id)
+            aio.connection.bus.attach_lazily(message_type, weak_callback(latest.take), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Tell how old the last heartbeat is, 20 times a second if somebody listens; log a silence, and its end."""
+        """Report the age of the last heartbeat to listeners, 20 times a second; log the begin and end of silence."""
         aio = self.aio
         if not aio.connection.is_open:
             return
         age = aio.heartbeat_age
-        self.listeners.tell("last_heartbeat", age)
-        if (age > SILENT_AFTER_S) != self._is_silent:
+        self.listeners.notify("last_heartbeat", age)
+        if (age > SILENCE_WARNING_S) != self._is_silent:
             self._is_silent = not self._is_silent
-            post = self.handler.listener_thread.post  # the program's log handlers may take their time
+            post = self.handler.listener_thread.post  # log handlers of the program may block
             if self._is_silent:
-                post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENT_AFTER_S)
+                post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
                 post(self.logger.info, "...link restored.")
-        # Each tick wakes a sleeping process, which costs as much as a few messages.
-        is_told = self._is_silent or self.listeners.heed("last_heartbeat")
-        wait_s = TICK_S if is_told else max(TICK_S, min(IDLE_TICK_S, SILENT_AFTER_S - age))
-        asyncio.get_running_loop().call_later(wait_s, weakly(self.watch_link))
+        # Each tick wakes the process, which costs as much as a few messages.
+        is_urgent = self._is_silent or self.listeners.has_listener("last_heartbeat")
+        wait_s = (
+            TICK_INTERVAL_S if is_urgent else max(TICK_INTERVAL_S, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
+        )
+        asyncio.get_running_loop().call_later(wait_s, weak_callback(self.watch_link))
 
     def background(self, function: Callable[[], Awaitable[None]]) -> None:
-        """Run a coroutine function for as long as the vehicle is connected (loop thread)."""
         if self._tasks is not None:
             self._tasks.start(function, f"dronekit {getattr(function, '__name__', 'task')}")
 
     # ------------------------------------------------------------------------------- sending
 
     def run(self, function: Callable[..., Awaitable[Any]], *args: Any, **kwargs: Any) -> Any:
-        """Wait for a coroutine function on the loop; what it raises becomes DroneKit's errors."""
+        """Run a coroutine function on the loop and wait for it; its errors become those of DroneKit."""
         self.check_link()
         with classic_errors():
             return self.handler.loop.run(function, *args, **kwargs)
 
     def order(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
-        """Give an order without waiting; a newer one of its kind replaces it."""
+        """Start an order without waiting; a newer order of its kind replaces it."""
         self.check_link()
         with classic_errors():
-            return self.handler.calls.give(kind, function, *args, **kwargs)
+            return self.handler.calls.start(kind, function, *args, **kwargs)
 
     def command(self, kind: str, command: int, *params: float, **options: Any) -> BackgroundCall:
-        """Order that a command is sent to all components, of which the autopilot's answer counts."""
-        options.setdefault("retries", attempts_of(command, params) - 1)
+        """Send a command to all components without waiting; the answer of the autopilot counts."""
+        options.setdefault("retries", max_attempts(command, params) - 1)
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
     def send(self, message: Message) -> None:
-        """Send a message once, in the order of the calls."""
         self.check_link()
         self.handler.send(message)
 
 
 def _feeding(read: property) -> property:
-    """The same property, of which each reading shows that the program runs."""
+    """Return a property that also records that the program is alive."""
     getter = read.fget
     assert getter is not None
 
@@ -297,7 +291,7 @@ def _feeding(read: property) -> property:
 
 
 class VehicleCore(HasObservers):
-    """A vehicle and its core. ``_dk``: names that no subclass in the classic style takes for its own things."""
+    """A vehicle and its core. The prefix ``_dk`` avoids collisions with names of subclasses."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -323,52 +317,52 @@ class VehicleCore(HasObservers):
         still_waiting_interval: float = 1,
         **_: Any,
     ) -> bool:
-        """Wait until these attributes have values; without names, or with True, for those that most programs need.
+        """Wait until attributes have values; without names, or with True, for the usual five.
 
         Args:
             types: names of attributes, your own too; ``wait_ready(True)`` is ``'parameters'``, ``'gps_0'``,
                 ``'armed'``, ``'mode'`` and ``'attitude'``.
-            timeout: seconds; None waits as long as the link lives.
-            raise_exception: whether to raise when the time is over.
-            still_waiting_callback: called with the names that are missing.
-            still_waiting_interval: how often, in seconds.
+            timeout: seconds; None: no limit.
+            raise_exception: raise when the time is over.
+            still_waiting_callback: called with the missing names.
+            still_waiting_interval: seconds between these calls.
 
         Returns:
-            Whether all of them have values.
+            True if all of them have values.
 
         Raises:
-            TimeoutError: they have not in time, and ``raise_exception`` is true.
-            ValueError: a name is no text.
-            APIException: the link is down, or what is waited for has failed.
+            TimeoutError: a value is missing after ``timeout``, and ``raise_exception`` is true.
+            ValueError: a name is not a string.
+            APIException: the link is down, or reading an attribute has failed.
         """
         names = DEFAULT_ATTRIBUTES if not types or types == (True,) else types
         if not all(isinstance(name, str) for name in names):
             raise ValueError("wait_ready expects one or more string arguments.")
         wanted = {str(name) for name in names}
         ready = self._dk.ready
-        started = told_at = time.monotonic()
+        started = reported_at = time.monotonic()
         deadline = math.inf if timeout is None else started + timeout
         while missing := wanted - ready.names:
             now = time.monotonic()
             if now >= deadline:
                 if raise_exception:
                     error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
-                    raise error from LookupError(f"never told: {', '.join(sorted(missing))}")
+                    raise error from LookupError(f"not received: {', '.join(sorted(missing))}")
                 return False
             self._dk.check_link()
             if (failure := ready.failure_of(missing)) is not None:
                 if raise_exception:
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
-            for name in ready.seekers.keys() & missing:
-                ready.seekers[name]()
-            if still_waiting_callback is not None and now >= told_at + still_waiting_interval:
-                told_at = now
+            for name in ready.fetchers.keys() & missing:
+                ready.fetchers[name]()
+            if still_waiting_callback is not None and now >= reported_at + still_waiting_interval:
+                reported_at = now
                 still_waiting_callback(missing)
-            ready.wait_a_little(wanted, deadline - now)
+            ready.wait_for_change(wanted, deadline - now)
         return True
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """The core of a vehicle, for its parts: their constructors have DroneKit's argument."""
+    """Return the core of a vehicle. Its parts take a vehicle because their constructors are DroneKit's."""
     return vehicle._dk

@@ -1,4 +1,4 @@
-"""The two errors of the DroneKit API, and how errors of aerokit become such."""
+"""The exceptions of the DroneKit API, and their conversion from errors of aerokit."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from aerokit.errors import AerokitError, FileFormatError, InvalidArgument, Opera
 
 
 class APIException(Exception):
-    """Any failure of the vehicle or its link; an aerokit error behind it is its `__cause__` or `__context__`."""
+    """Failure of the vehicle or its link; the aerokit error is its ``__cause__`` or ``__context__``."""
 
 
 class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the name is DroneKit's
-    """The awaited answer or state did not come in time; the built-in `TimeoutError` catches it too."""
+    """An answer or state did not arrive in time. The built-in ``TimeoutError`` catches it, too."""
 
 
 @contextmanager
 def classic_errors() -> Iterator[None]:
-    """What aerokit raises in the block becomes one of these; an argument or a file that is wrong stays a ValueError."""
+    """Convert errors of aerokit to those of DroneKit; errors about arguments and files stay ValueErrors."""
     try:
         yield
     except (InvalidArgument, FileFormatError):

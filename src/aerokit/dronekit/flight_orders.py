@@ -1,6 +1,6 @@
-"""What is sent to make a vehicle move, and what is refused before anything is sent.
+"""Orders that move a vehicle, maintenance orders, and checks of their arguments.
 
-Flight modes have the names that DroneKit programs know: pymavlink's, which are the autopilots' own.
+Flight modes have the names that DroneKit programs use: pymavlink's, which are the autopilots' own.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.messages import PlayTune
 from aerokit.protocols.command import command_long
-from aerokit.vehicle.commanding.arbiter import KNOWN_S
+from aerokit.vehicle.commanding.arbiter import MODE_MAX_AGE_S
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot, Purpose
@@ -38,29 +38,27 @@ if TYPE_CHECKING:
 
 POSITION_ONLY = 0x0DF8
 
-ARMED_IS_TOLD_S = 10.0
+ARMED_TIMEOUT_S = 10.0
 
-CONFIRMED_S = 1.5
-"""So long MISSION_CURRENT is waited for before it is ordered by command."""
+CONFIRM_TIMEOUT_S = 1.5  # for MISSION_CURRENT after MISSION_SET_CURRENT
 
-MOST = 0xFFFF
+MAX_SEQ = 0xFFFF
 
 NO_MISSION = 0xFFFF
 
 
 def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
-    """The name of a mode in HEARTBEAT: pymavlink's and the autopilot's are the same."""
     return _as_known(vehicle).mode(custom_mode, CUSTOM_MODE_ENABLED, vehicle.telemetry.mode_names).name
 
 
-def mode_named(vehicle: AsyncVehicle, mode: str | int) -> Mode:
-    """The mode of a name in capitals or as the vehicle told it, or on ArduPilot of a number; KeyError: none such."""
+def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
+    """Return a mode by its name (in capitals, or as reported) or, on ArduPilot, its number; KeyError if unknown."""
     autopilot = _as_known(vehicle)
     if isinstance(mode, int) and autopilot.modes_are_numbered:
         return Mode(mode_name(vehicle, mode), mode)
     try:
         found = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
-    except (InvalidArgument, AttributeError, TypeError) as error:  # the first lists the modes there are
+    except (InvalidArgument, AttributeError, TypeError) as error:  # InvalidArgument lists the available modes
         raise KeyError(mode) from (error if isinstance(error, InvalidArgument) else None)
     if not isinstance(mode, str) or not (mode.isupper() or mode == found.name):
         raise KeyError(mode)
@@ -68,52 +66,50 @@ def mode_named(vehicle: AsyncVehicle, mode: str | int) -> Mode:
 
 
 def _px4_flags(name: str) -> int:
-    """MAV_MODE_FLAG as pymavlink sends them; PX4 looks at the one for custom modes only."""
+    # MAV_MODE_FLAG as pymavlink sends them; PX4 evaluates only the flag for custom modes.
     from pymavlink.mavutil import px4_map
 
     return int(px4_map.get(name, (CUSTOM_MODE_ENABLED,))[0])
 
 
 def _as_known(vehicle: AsyncVehicle) -> Autopilot:
-    """An autopilot of which nothing is known (iNav is one) has ArduPilot's numbers, as with pymavlink."""
+    # Like pymavlink, use ArduPilot's mode numbers for unknown autopilots such as iNav.
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
     return autopilot_for(m.Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
 
 
 async def change_mode(vehicle: AsyncVehicle, wanted: Mode) -> None:
-    """Order a mode, and wait until HEARTBEAT tells it."""
     with vehicle.posted("mode", "motion", modes=(wanted,)) as order:
         await order.set_mode(wanted, component_id=0)
 
 
 async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
-    """Arm or disarm, and wait until HEARTBEAT says so. To disarm ends what was ordered about motion."""
+    """Arm or disarm, and wait until HEARTBEAT reports it. Disarming ends orders about motion."""
     subjects: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
     try:
         with vehicle.posted(*subjects, armed=value) as order:
             await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
-            await order.until_told(ARMED_IS_TOLD_S)
+            await order.wait_confirmed(ARMED_TIMEOUT_S)
     except CommandRejected:
         raise
     except (OperationRejected, OperationTimeout) as error:
-        error.args = (f"{error}; it may still be carried out, and nobody watches for that",)
+        error.args = (f"{error}; it may still be carried out",)
         raise
 
 
 async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int, *params: float) -> None:
-    """Send the command to take off, which brings about these modes."""
     with vehicle.posted("motion", modes=modes) as order:
         await order.command(command, *params, component_id=0)
 
 
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
-    """DO_REPOSITION, which is answered; and the message for a vehicle that does not know it.
+    """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
 
-    The altitude is above home, or above the sea where the autopilot repositions so (PX4).
+    The altitude is above home, or above sea level if the autopilot repositions with that (PX4).
     """
     is_amsl = vehicle.autopilot.repositions_amsl
-    with vehicle.posted("motion", modes=flies_to_places_in(vehicle)[:1]) as order:
+    with vehicle.posted("motion", modes=reposition_modes(vehicle)[:1]) as order:
         try:
             await order.command_int(
                 MavCmd.DO_REPOSITION,
@@ -125,20 +121,16 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
                 component_id=0,
             )
         except CommandRejected as error:
-            if (
-                is_amsl
-                or error.result != MavResult.UNSUPPORTED
-                or order.end
-                or vehicle.heartbeat_age > KNOWN_S
-            ):
+            if is_amsl or error.result != MavResult.UNSUPPORTED or order.end or vehicle.heartbeat_age > MODE_MAX_AGE_S:
                 raise
             target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
             vehicle.send(m.SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
 
 
-def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Where the order to fly to a place changes the mode itself: those in which the program meant it to; the first is
-    the one that the order brings about. Empty where the mode stays what it is, and the vehicle refuses in a wrong one.
+def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
+    """Return the modes in which a reposition command is allowed, if it changes the mode (PX4).
+
+    The first is the mode that the command sets. Empty if the mode stays, and the vehicle itself refuses in others.
     """
     if not aio.autopilot.repositions_amsl:
         return ()
@@ -147,13 +139,13 @@ def flies_to_places_in(aio: AsyncVehicle) -> tuple[Mode, ...]:
     return tuple(mode for mode in modes if mode is not None)
 
 
-async def refuse(reason: str) -> None:
-    """An order that is not sent: the reason is logged as a refusal of the vehicle would be."""
+async def reject(reason: str) -> None:
+    """Fail with a reason, which is logged like a rejection by the vehicle."""
     raise APIException(reason)
 
 
-def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Latitude and longitude in 1e-7 degrees, altitude in metres; InvalidArgument names what is missing or wrong."""
+def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
+    """Return latitude and longitude in 1e-7 degrees and altitude in metres; InvalidArgument names a bad attribute."""
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
         value = getattr(location, name)
         try:
@@ -167,7 +159,6 @@ def checked_place(location: LocationGlobal | LocationGlobalRelative) -> tuple[in
 
 
 def check_speed(name: str, speed: float | None) -> None:
-    """InvalidArgument, a ValueError, unless it is a number of m/s or None."""
     if speed is not None and not math.isfinite(speed):
         raise InvalidArgument(f"{name} = {speed!r} is not allowed: a number of m/s")
 
@@ -175,19 +166,18 @@ def check_speed(name: str, speed: float | None) -> None:
 class CurrentCommand:
     """MISSION_CURRENT and MISSION_SET_CURRENT of one vehicle.
 
-    ArduPilot counts home as 0, and is at 0 before it flies its mission. PX4 counts the first item as 0: that is 1
-    here, and 0 as long as it does not fly.
+    ArduPilot counts home as item 0, and is at 0 before it flies a mission. PX4 counts the first item as 0; this class
+    reports it as 1, and 0 while no mission is active.
     """
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._chosen: int | None = None
-        """What PX4 was told to fly next and has not gone past."""
+        self._chosen: int | None = None  # set on PX4 and not yet passed
         self._latest = core.on(m.MissionCurrent, self._on_current)
 
     @property
     def seq(self) -> int:
-        """The command that the vehicle flies or will fly next; 0 before its first MISSION_CURRENT."""
+        """The current or next command; 0 before the first MISSION_CURRENT."""
         message = self._latest.message
         if message is None:
             return 0
@@ -198,9 +188,9 @@ class CurrentCommand:
         return int(message.seq) + 1
 
     def choose(self, seq: int) -> None:
-        """Have the vehicle fly this one next; does not wait. InvalidArgument: it is not from 0 to 65,535."""
-        if not 0 <= operator.index(seq) <= MOST:
-            raise InvalidArgument(f"next = {seq!r} is not allowed, but 0 to {MOST}")
+        """Set the next command without waiting. InvalidArgument: it is not from 0 to 65,535."""
+        if not 0 <= operator.index(seq) <= MAX_SEQ:
+            raise InvalidArgument(f"next = {seq!r} is not allowed: 0 to {MAX_SEQ}")
         self._core.order("commands.next", self._choose, operator.index(seq))
 
     def _on_current(self, message: m.MissionCurrent) -> None:
@@ -208,40 +198,38 @@ class CurrentCommand:
             self._chosen = None
 
     def _is_over(self, message: m.MissionCurrent) -> bool:
-        is_at_an_end = message.seq == 0 or message.mission_state == MissionState.COMPLETE
-        return is_at_an_end and not self._core.aio.is_armed
+        has_ended = message.seq == 0 or message.mission_state == MissionState.COMPLETE
+        return has_ended and not self._core.aio.is_armed
 
     async def _choose(self, seq: int) -> None:
-        """By the message that DroneKit sends, once; what is not heard is ordered by the rules of all orders."""
+        """Send MISSION_SET_CURRENT once, as DroneKit does; if it is not confirmed, send a command with retries."""
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
             self._chosen = seq - 1
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
-        with anyio.move_on_after(CONFIRMED_S):
+        with anyio.move_on_after(CONFIRM_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
-        if aio.heartbeat_age > KNOWN_S:
-            raise APIException(
-                f"next = {seq} is not confirmed, and the vehicle is not heard: it may have been set"
-            )
+        if aio.heartbeat_age > MODE_MAX_AGE_S:
+            raise APIException(f"next = {seq} was not confirmed, and the vehicle is silent: it may have been set")
         if seq == 0:
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)
 
 
-CALIBRATION_S = 35.0
-"""ArduPilot answers when it is done, after half a minute if the vehicle is not held still."""
+# ArduPilot answers when it has finished, or after half a minute if the vehicle moves.
+CALIBRATION_TIMEOUT_S = 35.0
 
-REBOOT_S = 3.0
+REBOOT_TIMEOUT_S = 3.0
 
 TUNE_SIZES = (30, 200)
 
 
 class Maintenance(VehicleCore):
-    """Orders for a vehicle on the ground. They return at once; a refusal is a warning of the logger ``dronekit``."""
+    """Orders for a vehicle on the ground. They return immediately; a rejection is logged as a warning."""
 
     # -------------------------------------------------------------------------- calibrations
 
@@ -250,22 +238,22 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 1)
 
     def send_calibrate_magnetometer(self) -> None:
-        """Calibrate the compasses: turn the vehicle about all axes until it says that it is done."""
+        """Calibrate the compasses: turn the vehicle about all axes until it reports success."""
         if self._dk.check_link().autopilot.calibrates_compasses_by_command:
-            self._dk_calibrate(MavCmd.DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save by itself
+            self._dk_calibrate(MavCmd.DO_START_MAG_CAL, 0, 1, 1)  # all compasses; retry; save automatically
         else:
             self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 1)
 
     def send_calibrate_vehicle_level(self) -> None:
-        """Take the attitude of this moment for level."""
+        """Set the current attitude as level."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 2)
 
     def send_calibrate_barometer(self) -> None:
-        """Take the pressure of this moment for altitude 0."""
+        """Set the current pressure as altitude 0."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
-        """Calibrate the accelerometers: in the six attitudes it asks for by texts, or, ``simple``, standing level."""
+        """Calibrate the accelerometers in six attitudes, which the vehicle requests by text, or, ``simple``, level."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:
@@ -273,39 +261,39 @@ class Maintenance(VehicleCore):
             "calibration",
             command,
             *params,
-            attempt_timeout=CALIBRATION_S,
-            progress_timeout=CALIBRATION_S,
+            attempt_timeout=CALIBRATION_TIMEOUT_S,
+            progress_timeout=CALIBRATION_TIMEOUT_S,
         )
 
     # --------------------------------------------------------------------------------- rest
 
     def play_tune(self, tune: str | bytes) -> None:
-        """Play a tune on the vehicle's buzzer: notes as ``"AAAA"``, in the format of the autopilot (PLAY_TUNE).
+        """Play a tune on the vehicle's buzzer, such as ``"AAAA"``, in the format of the autopilot (PLAY_TUNE).
 
-        At most 230 characters of ASCII (else ValueError); ArduPilot plays the first 99. APIException: the link is down,
-        or the vehicle speaks MAVLink 1, which has no such message.
+        At most 230 ASCII characters (else ValueError); ArduPilot plays the first 99. APIException: the link is down, or
+        the vehicle uses MAVLink 1, which has no such message.
         """
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:
-            raise APIException("play_tune needs MAVLink 2, which this vehicle does not speak")
+            raise APIException("play_tune needs MAVLink 2, and this vehicle uses MAVLink 1")
         first = TUNE_SIZES[0]
         self._dk.send(PlayTune(self._dk.target_system, 0, text[:first], text[first:]))
 
     def reboot(self) -> None:
-        """Reboot the autopilot. It is away for some seconds, and then boots anew. Refused while it is armed.
+        """Reboot the autopilot, which is then away for some seconds. It refuses while armed.
 
-        Sent once: a lost answer is a warning, and the vehicle may have rebooted.
+        Sent once: without an answer a warning is logged, and the vehicle may have rebooted.
         """
         shutdown = MavCmd.PREFLIGHT_REBOOT_SHUTDOWN
-        self._dk.command("reboot", shutdown, 1, attempt_timeout=REBOOT_S)
+        self._dk.command("reboot", shutdown, 1, attempt_timeout=REBOOT_TIMEOUT_S)
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
-        """Ask for AUTOPILOT_VERSION once. Has the arguments of a message listener, and uses none of them."""
+        """Request AUTOPILOT_VERSION once. The arguments of a message listener are ignored."""
         self._dk.check_link()
         self._dk.send(command_long(self._dk.target_system, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
 
     def send_capabilties_request(self, vehicle: Any, name: str, m: Any) -> None:
-        """As :meth:`send_capabilities_request`; this spelling was the first."""
+        """Misspelled alias of :meth:`send_capabilities_request`, from early DroneKit versions."""
         self.send_capabilities_request(vehicle, name, m)
 
 
@@ -314,9 +302,7 @@ def _tune_text(tune: str | bytes) -> str:
         text = tune.encode() if isinstance(tune, str) else tune
         notes = text.rstrip(b"\0").decode("ascii")
     except (UnicodeError, AttributeError):
-        raise InvalidArgument(f"tune = {tune!r} is not allowed: a text of ASCII characters") from None
+        raise InvalidArgument(f"tune = {tune!r} is not allowed: ASCII text") from None
     if "\0" in notes or len(notes) > sum(TUNE_SIZES):
-        raise InvalidArgument(
-            f"tune of {len(notes)} characters is not allowed: at most {sum(TUNE_SIZES)}, none of them NUL"
-        )
+        raise InvalidArgument(f"tune of {len(notes)} characters is not allowed: at most {sum(TUNE_SIZES)}, without NUL")
     return notes

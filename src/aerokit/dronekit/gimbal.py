@@ -1,13 +1,13 @@
-"""``Gimbal``: where the camera points, and orders to it, as ``vehicle.aio.gimbal`` has them."""
+"""``Gimbal``: the classic API of the first gimbal, on top of ``vehicle.aio.gimbal``."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
+from aerokit.dronekit.classic_connection import weak_callback
 from aerokit.dronekit.core import core_of
-from aerokit.dronekit.flight_orders import checked_place
-from aerokit.dronekit.line import weakly
+from aerokit.dronekit.flight_orders import checked_location
 from aerokit.dronekit.privates import GimbalPrivates
 from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative
 from aerokit.errors import InvalidArgument
@@ -19,23 +19,22 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 HOME_TIMEOUT_S = 10.0
-MOST_DEG = 360.0
-"""What ``vehicle.aio.gimbal`` takes: programs add angles, and mean the same direction."""
-NOT_TOLD = GimbalAttitude(None, None, None)
+MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles, from sums, are reduced
+UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None)
 
 
 class Gimbal(GimbalPrivates):
-    """The first gimbal: where it points, and orders to it.
+    """The first gimbal: its attitude, and orders to it.
 
-    :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle has told of a gimbal. Orders return at once;
-    a newer one replaces one that is not answered yet, and a refusal becomes a warning of the logger ``dronekit``.
-    ValueError, and nothing sent: a number or a place is none; APIException: the link is down.
+    :attr:`pitch`, :attr:`roll` and :attr:`yaw` are None until the vehicle reports a gimbal. Orders return immediately;
+    a newer one replaces an unanswered one, and a rejection is logged as a warning of the logger ``dronekit``. Raises
+    ValueError for invalid numbers and locations, and APIException while the link is down.
     """
 
     def __init__(self, vehicle: VehicleCore) -> None:
         self._core = core_of(vehicle)
-        self._attitude = NOT_TOLD
-        self._core.at_start.append(self._begin)
+        self._attitude = UNKNOWN_ATTITUDE
+        self._core.on_connected.append(self._begin)
 
     @property
     def pitch(self) -> float | None:
@@ -51,7 +50,7 @@ class Gimbal(GimbalPrivates):
     def yaw(self) -> float | None:
         """Degrees clockwise from north, 0 to 360.
 
-        Of firmware that tells MOUNT_STATUS (ArduPilot before 4.3) it is that number, whatever it counts from.
+        With MOUNT_STATUS (ArduPilot before 4.3) the reference of the angle depends on the firmware.
         """
         return self._attitude.yaw_deg
 
@@ -68,12 +67,12 @@ class Gimbal(GimbalPrivates):
     __repr__ = __str__
 
     def rotate(self, pitch: float, roll: float, yaw: float) -> None:
-        """Turn the gimbal and keep it there, however the vehicle moves.
+        """Turn the gimbal and keep this direction while the vehicle moves.
 
         Args:
             pitch: degrees from the horizon: 0 is level, -90 straight down.
-            roll: degrees from the horizon. If it is not 0, the order can only be given by a command that turns the
-                camera with the vehicle: ``yaw`` is right at the moment of the order.
+            roll: degrees from the horizon. If not 0, a command is used that stabilises yaw relative to the vehicle:
+                ``yaw`` is correct when the command is sent, and follows the vehicle afterwards.
             yaw: degrees clockwise from north.
         """
         angles = [_checked(name, value) for name, value in (("pitch", pitch), ("yaw", yaw), ("roll", roll))]
@@ -81,38 +80,38 @@ class Gimbal(GimbalPrivates):
         self._core.order("gimbal", gimbal.point, *angles[:2], roll_deg=angles[2], wait=False)
 
     def target_location(self, roi: LocationGlobalRelative | LocationGlobal) -> None:
-        """Keep the camera on a place; a copter without a gimbal that turns does so itself. All zeros give it up."""
+        """Point the camera at a location; a copter without a gimbal turns itself. A location of zeros ends this."""
         if not isinstance(roi, (LocationGlobal, LocationGlobalRelative)):
             raise InvalidArgument("Expecting roi to be LocationGlobal or LocationGlobalRelative.")
-        is_a_place = any(checked_place(roi))
+        is_location = any(checked_location(roi))
         aio = self._core.check_link()
-        if not is_a_place:
+        if not is_location:
             self._core.order("gimbal", aio.stop_looking)
         elif isinstance(roi, LocationGlobal):
             self._core.order("gimbal", aio.look_at, Position(roi.lat, roi.lon, altitude_amsl_m=roi.alt))
         else:
             place = Position(roi.lat, roi.lon, altitude_relative_m=roi.alt)
-            self._core.order("gimbal", _look_above_home, aio, place)
+            self._core.order("gimbal", _point_above_home, aio, place)
 
     def release(self) -> None:
-        """Give the gimbal back to the pilot's sticks."""
+        """Return control of the gimbal to the pilot's sticks."""
         self._core.order("gimbal", self._core.check_link().gimbal.release)
 
     def _begin(self) -> None:
-        self._core.aio.gimbal.attitude.observe(weakly(self._on_attitude), every_arrival=True)
+        self._core.aio.gimbal.attitude.observe(weak_callback(self._on_attitude), every_arrival=True)
 
     def _on_attitude(self, _: GimbalAttitude | None, attitude: GimbalAttitude) -> None:
         self._attitude = attitude
         core = self._core
         source = core.aio.gimbal.attitude.source
-        # DroneKit does not tell MOUNT_ORIENTATION as ``mount``
+        # DroneKit does not report MOUNT_ORIENTATION as ``mount``.
         if source is not None and source.message != "MOUNT_ORIENTATION":
-            core.listeners.tell("mount", self.mount_status)
-        core.listeners.tell("gimbal", self)
+            core.listeners.notify("mount", self.mount_status)
+        core.listeners.notify("gimbal", self)
 
 
-async def _look_above_home(aio: AsyncVehicle, place: Position) -> None:
-    """Programs order it as soon as they are connected, and have not heard of home then."""
+async def _point_above_home(aio: AsyncVehicle, place: Position) -> None:
+    # Programs call this right after connecting, before home is known.
     if aio.autopilot.repositions_amsl:
         await aio.home.wait_until(lambda _: True, timeout=HOME_TIMEOUT_S, description="home")
     await aio.look_at(place)
@@ -125,4 +124,4 @@ def _checked(name: str, value: float) -> float:
         number = math.nan
     if not math.isfinite(number):
         raise InvalidArgument(f"{name} = {value!r} is not allowed: a finite number of degrees")
-    return number if abs(number) <= MOST_DEG else math.remainder(number, 360.0)
+    return number if abs(number) <= MAX_ANGLE_DEG else math.remainder(number, 360.0)

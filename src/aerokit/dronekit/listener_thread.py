@@ -1,4 +1,4 @@
-"""The thread on which a program's callbacks run, one after the other, apart from reception and heartbeat."""
+"""The thread that runs a program's callbacks in order, separate from reception and heartbeat."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from aerokit.sync.reply import Reply
+from aerokit.sync.thread_future import ThreadFuture
 
 logger: logging.Logger = logging.getLogger("dronekit")
 
-MOST_WAITING = 10_000
-"""What a listener that does not come back lets wait at most; values that come again and again are dropped then."""
-JOIN_S = CALL_S = 2.0
+MAX_QUEUED_CALLS = 10_000  # beyond this, calls that `offer` adds are dropped
+JOIN_TIMEOUT_S = CALL_TIMEOUT_S = 2.0
 
 
 class ListenerThread:
-    """Calls functions in the order in which they were posted. The thread starts with the first of them.
+    """Calls functions in the order in which they were posted. Starts with the first of them; a daemon thread.
 
-    What a function raises is logged. The thread does not keep the interpreter alive.
+    Exceptions of the functions are logged.
     """
 
     dropped: int
@@ -34,34 +33,33 @@ class ListenerThread:
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
         self.is_stopped: bool = False
-        """Whether nothing is called any more."""
         self.on_called: Callable[[], object] = _nothing
-        """What is called when a callback has come back."""
+        """Called after each callback."""
         self.dropped = 0
-        """How many calls were dropped because a listener did not come back."""
+        """Number of calls that were dropped because a callback blocked."""
         self._kept: dict[int, object] = {}
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Have ``function(*args)`` called; from any thread, never blocks. Nothing happens once it is stopped."""
+        """Queue a call, from any thread, without blocking. Ignored once stopped."""
         if self._thread is None:
             self._start()
         if not self.is_stopped:
             self._calls.put((function, args))
 
     def offer(self, function: Callable[..., object], *args: Any) -> None:
-        """As :meth:`post`, for what comes again anyway: dropped while 10,000 others wait."""
-        if self._calls.qsize() < MOST_WAITING:
+        """Like :meth:`post`, for values that repeat: dropped while 10,000 calls are queued."""
+        if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
             return
         if not self.dropped:
-            logger.warning("a listener does not come back; values are dropped that it would be told of")
+            logger.warning("a listener blocks the callback thread; further values are dropped")
         self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Have it called, and wait until it was: at once on this thread itself and when the thread has ended.
+        """Queue a call and wait until it was made; call directly on this thread, or if the thread has ended.
 
-        Not waited for on the threads of event loops and of other listeners, which callbacks may be waiting for, and for
-        two seconds at most elsewhere: the caller may hold what a callback wants.
+        Does not wait on threads of event loops and of other listeners, to avoid deadlocks. Waits at most two seconds
+        elsewhere, because the caller may hold a lock that a callback needs.
         """
         if self.is_current or self.is_stopped:
             function(*args)
@@ -69,21 +67,21 @@ class ListenerThread:
         if _must_not_wait():
             self.post(function, *args)
             return
-        called: Reply[None] = Reply()
+        called: ThreadFuture[None] = ThreadFuture()
 
-        def call_and_tell() -> None:
+        def call_and_finish() -> None:
             try:
                 function(*args)
             finally:
-                called.end()
+                called.finish()
 
-        self.post(call_and_tell)
-        end = time.monotonic() + CALL_S  # waited for in slices, for Ctrl-C on every system
+        self.post(call_and_finish)
+        end = time.monotonic() + CALL_TIMEOUT_S  # short waits, for Ctrl-C on every system
         while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= end:
             pass
 
     def keep(self, owner: object, *, has_listeners: bool) -> None:
-        """Keep an object for as long as it has listeners: a program may have nothing else of it any more."""
+        """Keep an object alive while it has listeners, even if the program has dropped the vehicle."""
         if has_listeners and not self.is_stopped:
             self._kept[id(owner)] = owner
         else:
@@ -91,20 +89,19 @@ class ListenerThread:
 
     @property
     def is_current(self) -> bool:
-        """Whether the caller is on this thread."""
         return threading.current_thread() is self._thread
 
     def stop(self) -> None:
-        """Call nothing more. Idempotent; never blocks."""
+        """Make no further calls. Idempotent; does not block."""
         with self._lock:
             self.is_stopped = True
         self._kept.clear()
         self._calls.put((_nothing, ()))
 
     def join(self) -> None:
-        """Wait until the thread has ended, at most two seconds: a callback may be stuck in the program's own code."""
+        """Wait at most two seconds until the thread has ended; a callback may block."""
         if self._thread is not None and not self.is_current:
-            self._thread.join(JOIN_S)
+            self._thread.join(JOIN_TIMEOUT_S)
 
     def _start(self) -> None:
         with self._lock:
@@ -112,7 +109,7 @@ class ListenerThread:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)
                 try:
                     thread.start()
-                except RuntimeError:  # the interpreter is ending: there is nobody left to be called
+                except RuntimeError:  # the interpreter is shutting down
                     self.is_stopped = True
                 else:
                     self._thread = thread
@@ -124,14 +121,14 @@ class ListenerThread:
                 return
             try:
                 function(*args)
-            except BaseException:  # sys.exit() in a callback would end the callbacks, and nothing else
+            except BaseException:  # including SystemExit, which would end this thread only
                 logger.exception("Exception in a callback")
             self.on_called()
-            del function, args  # they would be kept until the next call
+            del function, args  # not kept alive until the next call
 
 
 class _Thread(threading.Thread):
-    """One on which callbacks run."""
+    """Marks threads that run callbacks."""
 
 
 def _must_not_wait() -> bool:

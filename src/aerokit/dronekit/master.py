@@ -1,19 +1,19 @@
-"""``vehicle._master``: what programs use of pymavlink's connection object, which DroneKit keeps there."""
+"""``vehicle._master``: the part of pymavlink's connection object that DroneKit programs use."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from pymavlink import mavutil
 
 from aerokit.autopilots.modes import is_armed
-from aerokit.connection.components import is_autopilot
+from aerokit.connection.heartbeats import is_autopilot
+from aerokit.dronekit.classic_connection import weak_callback
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.line import weakly
 from aerokit.dronekit.observers import message_of
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
@@ -22,86 +22,79 @@ from aerokit.mavlink.message_factory import MessageFactory
 from aerokit.mavlink.pymavlink import from_pymavlink
 
 if TYPE_CHECKING:
-    from aerokit.dronekit.line import Line
+    from aerokit.dronekit.classic_connection import ClassicConnection
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.messages import Heartbeat
     from aerokit.transport.link import Peer
 
-MOST_KEPT = 1000
-OLDEST_S = 5.0
-"""A program that asks rarely gets what came lately, not what came when it asked last."""
-FIRST_S = 1.0
-"""How long the first look-ups wait for a message: nothing was kept before."""
-SLICE_S = 0.2
-"""Ctrl-C and the end of the connection are noticed between waits of this length."""
+MAX_MESSAGES = 1000
+MESSAGE_MAX_AGE_S = 5.0  # a program that rarely reads gets recent messages
+FIRST_LOOKUP_TIMEOUT_S = 1.0  # nothing was stored before the first access
+SIGNAL_CHECK_INTERVAL_S = 0.2  # of a single wait, so that Ctrl-C and a closed connection are noticed
 
 
 class Master:
-    """A part of pymavlink's ``mavfile``, for old programs; new ones find all of it on the vehicle.
+    """The part of pymavlink's ``mavfile`` that old programs use. New programs find all of it on the vehicle.
 
-    Everything that sends returns at once, and says nothing of what becomes of it.
+    Methods that send return immediately and do not report the result.
     """
 
-    def __init__(self, connection: Line) -> None:
+    def __init__(self, connection: ClassicConnection) -> None:
         self._connection = connection
         ours = connection.connection
         self.source_system: int = ours.source_system
         self.source_component: int = ours.source_component
-        """Our own ids."""
+        """Own ids."""
         self.mav: MessageFactory = MessageFactory(self._send, ours.source_system, ours.source_component)
-        """Makes and sends messages."""
+        """Creates and sends messages."""
         self.messages: Inbox = Inbox(connection)
-        """The last message of every type, by its name; begins when it is first asked."""
+        """The last message of every type by name, from the first access on."""
 
     @property
     def target_system(self) -> int:
-        """System id of the vehicle, 0 before it was heard."""
+        """System id of the vehicle, 0 until it is found."""
         return self._connection.target_system
 
     @property
     def target_component(self) -> int:
-        """Component id of its autopilot, 0 before it was heard."""
-        return self._heard()[0]
+        """Component id of its autopilot, 0 until it is found."""
+        return self._autopilot()[0]
 
     @property
     def address(self) -> str:
-        """The connection string."""
         return self._connection.connection.link.address
 
     @property
     def port(self) -> Master:
-        """What programs close: :meth:`close`. It is no socket and no serial port."""
+        """Returns this object: programs call ``port.close()``. Not a socket or serial port."""
         return self
 
     @property
     def flightmode(self) -> str:
-        """Name of the flight mode, ``UNKNOWN`` before it was heard."""
-        heartbeat = self._heard()[1]
+        """Name of the flight mode, ``UNKNOWN`` before the first HEARTBEAT."""
+        heartbeat = self._autopilot()[1]
         if heartbeat is None or heartbeat.received_frame is None:
             return "UNKNOWN"
         return str(mavutil.mode_string_v10(message_of(heartbeat.received_frame)))
 
     def close(self) -> None:
-        """Close the connection."""
         self._connection.close()
 
     # --------------------------------------------------------------------------------- modes
 
     def mode_mapping(self) -> dict[str, Any] | None:
-        """Mode names and their numbers (PX4: three numbers each); None for a vehicle without known modes."""
-        heartbeat = self._heard()[1]
+        """Return mode names and numbers (PX4: three numbers each), or None if the modes are unknown."""
+        heartbeat = self._autopilot()[1]
         if heartbeat is None:
             return None
         modes = (
-            mavutil.px4_map
-            if heartbeat.autopilot == MavAutopilot.PX4
-            else mavutil.mode_mapping_byname(heartbeat.type)
+            mavutil.px4_map if heartbeat.autopilot == MavAutopilot.PX4 else mavutil.mode_mapping_byname(heartbeat.type)
         )
         return dict(modes) if modes is not None else None
 
     def set_mode(self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0) -> None:
-        """Set a mode by its name (KeyError: none such) or number, or PX4's by the three of :meth:`mode_mapping`."""
-        heartbeat = self._heard()[1]
+        """Set a mode by name (KeyError if unknown), by number, or on PX4 by the numbers of :meth:`mode_mapping`."""
+        heartbeat = self._autopilot()[1]
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle
         if vehicle is not None and (isinstance(mode, str) or not is_px4):
@@ -113,80 +106,64 @@ class Master:
         numbers = order if isinstance(order, tuple) else (MavModeFlag.CUSTOM_MODE_ENABLED.value, order, 0)
         self._command(MavCmd.DO_SET_MODE, *numbers)
 
-    def set_mode_apm(
-        self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0
-    ) -> None:
-        """The same."""
-        self.set_mode(mode, custom_mode, custom_sub_mode)
-
-    def set_mode_px4(
-        self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0
-    ) -> None:
-        """The same."""
-        self.set_mode(mode, custom_mode, custom_sub_mode)
+    set_mode_apm: Callable[..., None] = set_mode
+    set_mode_px4: Callable[..., None] = set_mode
 
     # -------------------------------------------------------------------------------- orders
 
     def arducopter_arm(self) -> None:
-        """Ask for armed motors: **propellers may start to turn**."""
+        """Send the command to arm: **propellers may start to turn**."""
         self._command(MavCmd.COMPONENT_ARM_DISARM, 1)
 
     def arducopter_disarm(self) -> None:
-        """Ask for disarmed motors."""
         self._command(MavCmd.COMPONENT_ARM_DISARM, 0)
 
     def motors_armed(self) -> bool:
-        """Whether the last HEARTBEAT says armed."""
-        heartbeat = self._heard()[1]
+        heartbeat = self._autopilot()[1]
         return heartbeat is not None and is_armed(heartbeat.base_mode)
 
     def motors_armed_wait(self) -> None:
-        """Wait until HEARTBEAT says armed, however long that takes."""
+        """Wait, without limit, until HEARTBEAT reports armed motors."""
         while not self.motors_armed():
             self.wait_heartbeat()
 
     def motors_disarmed_wait(self) -> None:
-        """Wait until HEARTBEAT says disarmed, however long that takes."""
+        """Wait, without limit, until HEARTBEAT reports disarmed motors."""
         while self.motors_armed():
             self.wait_heartbeat()
 
     def set_servo(self, channel: int, pwm: int) -> None:
-        """Set an output (MAV_CMD_DO_SET_SERVO) to so many microseconds."""
         self._command(MavCmd.DO_SET_SERVO, channel, pwm)
 
     def _command(self, command: int, *params: float) -> None:
         filled = (*params, *(0,) * (7 - len(params)))
         self.mav.command_long_send(self.target_system, self.target_component, command, 0, *filled)
 
-    # -------------------------------------------------------------- parameters and missions, bare
+    # ------------------------------------------------------------ raw parameter and mission messages
 
     def param_fetch_all(self) -> None:
-        """Ask for all parameters."""
         self.mav.param_request_list_send(self.target_system, self.target_component)
 
     def param_set_send(self, parm_name: str | bytes, parm_value: float, parm_type: int | None = None) -> None:
-        """Set a parameter, without a look at the answer; ``vehicle.parameters`` looks."""
+        """Send PARAM_SET without checking the answer; ``vehicle.parameters`` checks it."""
         kind = MavParamType.REAL32 if parm_type is None else parm_type
         self.mav.param_set_send(self.target_system, self.target_component, parm_name, parm_value, kind)
 
     def waypoint_clear_all_send(self) -> None:
-        """Empty the vehicle's mission."""
         self.mav.mission_clear_all_send(self.target_system, self.target_component)
 
     def waypoint_count_send(self, seq: int) -> None:
-        """Announce a mission of so many items."""
+        """Announce a mission of ``seq`` items."""
         self.mav.mission_count_send(self.target_system, self.target_component, seq)
 
     def waypoint_request_list_send(self) -> None:
-        """Ask how long the vehicle's mission is."""
         self.mav.mission_request_list_send(self.target_system, self.target_component)
 
     def waypoint_request_send(self, seq: int) -> None:
-        """Ask for one item of the vehicle's mission."""
         self.mav.mission_request_send(self.target_system, self.target_component, seq)
 
     def waypoint_set_current_send(self, seq: int) -> None:
-        """Have the mission go on at an item."""
+        """Continue the mission at an item."""
         self.mav.mission_set_current_send(self.target_system, self.target_component, seq)
 
     # ----------------------------------------------------------------------------- receiving
@@ -198,34 +175,34 @@ class Master:
         blocking: bool = False,
         timeout: float | None = None,
     ) -> Any:
-        """The next message of a type (or of several, or any), which meets a ``condition`` as pymavlink writes them.
+        """Return the next message of a type, of several or of any, that satisfies pymavlink's ``condition``.
 
-        Nothing is lost between calls, up to the last five seconds and 1,000 messages; it begins with the first call.
-        Without ``blocking``, None when there is none yet; with it, None after ``timeout`` seconds (None: never).
-        APIException: the connection was closed.
+        Messages are kept from the first call on: the last 1,000 of at most five seconds. Returns None if there is none
+        and ``blocking`` is false, or after ``timeout`` seconds (None: no limit). APIException: the connection was
+        closed.
         """
         names = {type} if isinstance(type, str) else None if type is None else set(type)
 
-        def meets(message: Any) -> bool:
+        def matches(message: Any) -> bool:
             return bool(mavutil.evaluate_condition(condition, {message.get_type(): message}))
 
         may_wait = blocking and not self._connection.loop.is_current
-        return self.messages.next_match(names, meets, timeout if may_wait else 0.0)
+        return self.messages.next_match(names, matches, timeout if may_wait else 0.0)
 
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
-        """The next HEARTBEAT; None when there is none in ``timeout`` seconds."""
+        """Return the next HEARTBEAT, or None after ``timeout`` seconds."""
         return self.recv_match(type="HEARTBEAT", blocking=blocking, timeout=timeout)
 
     def field(self, type: str, field: str, default: Any = None) -> Any:  # noqa: A002 - pymavlink's word
-        """A field of the last message of a type; ``default`` when there is none."""
+        """Return a field of the last message of a type, or ``default``."""
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Seconds since the last message of a type, or, while there is none, since messages were first asked for."""
+        """Return the age of the last message of a type, or the time since the first access, in seconds."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:
-        """A parameter as far as it is known; ``default`` while it is not."""
+        """Return a parameter if it is known, otherwise ``default``."""
         vehicle = self._connection.vehicle
         if vehicle is None:
             return default
@@ -233,9 +210,9 @@ class Master:
         return value
 
     def location(self, relative_alt: bool = False) -> Any:
-        """``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees), of messages that come from now on.
+        """Return ``lat``, ``lon`` (degrees), ``alt`` (metres) and ``heading`` (degrees) from messages received now.
 
-        Waits for a GPS fix in three dimensions. The altitude is above home (``relative_alt``) or the sea.
+        Waits for a 3D GPS fix. The altitude is above home (``relative_alt``) or above sea level.
         """
         gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
         hud = self.recv_match(type="VFR_HUD", blocking=True)
@@ -245,37 +222,37 @@ class Master:
 
     @staticmethod
     def probably_vehicle_heartbeat(msg: Any) -> bool:
-        """Whether a HEARTBEAT is an autopilot's: not a gimbal's, a camera's or a ground station's."""
+        """Return True if a HEARTBEAT is from an autopilot, not from a gimbal, camera or ground station."""
         return is_autopilot(msg)
 
     def _send(self, message: Any) -> None:
         target = self._connection.target_system
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
-    def _heard(self) -> tuple[int, Heartbeat | None]:
-        """Component id and last heartbeat of the vehicle's autopilot."""
-        for source, heartbeat in self._connection.connection.heard.copy().items():
+    def _autopilot(self) -> tuple[int, Heartbeat | None]:
+        """Return component id and last heartbeat of the vehicle's autopilot."""
+        for source, heartbeat in self._connection.connection.heartbeats.copy().items():
             if source[0] == self.target_system and is_autopilot(heartbeat):
                 return source[1], heartbeat
         return 0, None
 
 
 class Inbox(Mapping[str, Any]):
-    """The last message of every type by its name, and what came since it was asked before, as pymavlink's objects.
+    """The last message of every type by name, and a queue of unread messages, as pymavlink objects.
 
-    It begins with the first question; the first look-ups of a second wait for their message. It hears the vehicle,
-    radios and ground stations; not other vehicles.
+    Receives from the first access on; look-ups in the first second wait for a message. Contains messages of the
+    vehicle, of radios and of ground stations, but not of other vehicles.
     """
 
-    def __init__(self, connection: Line) -> None:
+    def __init__(self, connection: ClassicConnection) -> None:
         self._connection = connection
         self._latest: dict[int, Frame] = {}
-        self._frames: deque[Frame] = deque(maxlen=MOST_KEPT)
+        self._frames: deque[Frame] = deque(maxlen=MAX_MESSAGES)
         self._came = threading.Condition()
         self._started: float | None = None
 
     def next_match(self, names: Collection[str] | None, condition: Any, timeout: float | None) -> Any:
-        """The next message of one of these types that meets ``condition(message)``; the rest as :meth:`recv_match`."""
+        """Return the next message of these types that satisfies ``condition``; see :meth:`Master.recv_match`."""
         self._start()
         end = None if timeout is None else time.monotonic() + timeout
         while (frame := self._pop(end)) is not None:
@@ -285,7 +262,7 @@ class Inbox(Mapping[str, Any]):
         return None
 
     def age_s(self, name: str) -> float:
-        """Seconds since a message of this type came, or since the first question."""
+        """Return the age of the last message of this type, or the time since the first access."""
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:
@@ -297,7 +274,7 @@ class Inbox(Mapping[str, Any]):
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._waits():
             with self._came:
-                self._came.wait(SLICE_S / 10)
+                self._came.wait(SIGNAL_CHECK_INTERVAL_S / 10)
         if frame is None:
             raise KeyError(name)
         return message_of(frame)
@@ -314,18 +291,18 @@ class Inbox(Mapping[str, Any]):
         with self._came:
             is_first, self._started = self._started is None, self._started or time.monotonic()
         if is_first:
-            loop, tap = self._connection.loop, self._connection.connection.tap
+            loop, tap = self._connection.loop, self._connection.connection.observe_frames
             if loop.is_current:
-                tap(weakly(self._take))
+                tap(weak_callback(self._take))
             else:
-                loop.call(tap, weakly(self._take))  # which waits: what comes after the first question is kept
+                loop.call(tap, weak_callback(self._take))  # blocks: later messages are not lost
 
     def _waits(self) -> bool:
-        is_young = self._started is not None and time.monotonic() < self._started + FIRST_S
+        is_young = self._started is not None and time.monotonic() < self._started + FIRST_LOOKUP_TIMEOUT_S
         return is_young and self._connection.connection.is_open and not self._connection.loop.is_current
 
     def _take(self, frame: Frame, peer: Peer) -> None:
-        """On the loop's thread."""
+        # On the loop's thread.
         if self._connection.is_of_another_vehicle(frame.system_id):
             return
         with self._came:
@@ -334,15 +311,15 @@ class Inbox(Mapping[str, Any]):
             self._came.notify_all()
 
     def _pop(self, end: float | None) -> Frame | None:
-        """The oldest frame that is not too old; None when the time is over."""
+        """Return the oldest frame that is not too old; None when the time is over."""
         now = self._connection.connection.now
         while True:
             with self._came:
                 while self._frames:
                     frame = self._frames.popleft()
-                    if now() - frame.received_at < OLDEST_S:
+                    if now() - frame.received_at < MESSAGE_MAX_AGE_S:
                         return frame
-                left = SLICE_S if end is None else min(end - time.monotonic(), SLICE_S)
+                left = SIGNAL_CHECK_INTERVAL_S if end is None else min(end - time.monotonic(), SIGNAL_CHECK_INTERVAL_S)
                 if left > 0:
                     self._check()
                     self._came.wait(left)

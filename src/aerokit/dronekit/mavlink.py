@@ -1,4 +1,4 @@
-"""``dronekit.mavlink``: the connection underneath a vehicle, as far as DroneKit programs touch it."""
+"""``dronekit.mavlink``: the connection of a vehicle, as DroneKit programs use it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from contextvars import ContextVar
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
+from aerokit.connection.heartbeats import OwnHeartbeat
 from aerokit.connection.opening import open_connection
-from aerokit.connection.own_heartbeat import OwnHeartbeat
+from aerokit.dronekit.classic_connection import ClassicConnection, OverrideRelease
 from aerokit.dronekit.exceptions import APIException
-from aerokit.dronekit.line import Line, OverrideRelease
 from aerokit.dronekit.observers import message_of
 from aerokit.errors import AerokitError, ConnectionClosed, InvalidArgument, LinkOpenError
 from aerokit.sync.loop_thread import LoopThread
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.dronekit.master import Master
     from aerokit.mavlink.frame import Frame
-    from aerokit.sync.loop_thread import Held
+    from aerokit.sync.loop_thread import OpenContext
     from aerokit.transport.link import Peer
 
 __all__ = ["APIException", "MAVConnection", "MAVWriter", "mavudpin_multi"]
@@ -38,19 +38,18 @@ logger: logging.Logger = logging.getLogger("dronekit.mavlink")
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
-TICK_S = 0.05
-ATTEMPTS, BETWEEN_ATTEMPTS_S = 3, 1.0
+TICK_INTERVAL_S = 0.05
+ATTEMPTS, RETRY_INTERVAL_S = 3, 1.0
 
 
-class MAVConnection(Line):
-    """A link, open until it is closed, with an event loop on a thread of its own.
+class MAVConnection(ClassicConnection):
+    """A link that is open until it is closed, with an event loop on a thread of its own.
 
-    ``ip`` is any connection string of DroneKit and pymavlink (a bare ``host:port`` and ``udp:`` listen), or of aerokit.
-    A link that is lost is opened again. ``use_native`` is accepted and means nothing.
+    ``ip`` is a connection string of DroneKit, pymavlink (a bare ``host:port`` and ``udp:`` listen) or aerokit. A lost
+    link is reopened. ``use_native`` is ignored.
 
     Raises:
-        OSError: the link cannot be opened; ConnectionRefusedError, socket.gaierror, serial.SerialException as the
-            system says.
+        OSError: the link cannot be opened: ConnectionRefusedError, socket.gaierror, serial.SerialException …
         ValueError: the connection string or another argument is wrong.
     """
 
@@ -68,21 +67,21 @@ class MAVConnection(Line):
         held = _open(loop, ip, baud, source_system, source_component, overrides, heartbeat)
         super().__init__(ip, loop, held, target_system, overrides)
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []
-        """Functions that are called about 20 times a second; see :meth:`forward_loop`."""
+        """Functions called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
-        """Functions that get every message; see :meth:`forward_message`."""
-        made = _made.get()
-        if made is not None:
-            made.add(self)
+        """Functions called with every message; see :meth:`forward_message`."""
+        created = _created.get()
+        if created is not None:
+            created.add(self)
 
     def fix_targets(self, message: Any) -> None:
-        """Write the vehicle's system id into ``message.target_system``, if the message has such a field."""
+        """Set ``message.target_system`` to the vehicle's system id, if the message has this field."""
         if hasattr(message, "target_system"):
             message.target_system = self.target_system
 
     @cached_property
     def master(self) -> Master:
-        """What DroneKit programs use of pymavlink's connection object."""
+        """The part of pymavlink's connection object that DroneKit programs use."""
         from aerokit.dronekit.master import Master
 
         return Master(self)
@@ -90,30 +89,30 @@ class MAVConnection(Line):
     # ----------------------------------------------------------------------------- receiving
 
     def forward_message(self, fn: FunctionT) -> FunctionT:
-        """Have ``fn(connection, message)`` called on the listener thread for every message, pymavlink's. Decorator."""
+        """Decorator: call ``fn(connection, message)`` on the listener thread with every message (of pymavlink)."""
         self.message_listeners.append(fn)
         if len(self.message_listeners) == 1:
-            self.loop.call_soon(self.connection.tap, self._forward)
+            self.loop.call_soon(self.connection.observe_frames, self._forward)
         return fn
 
     def forward_loop(self, fn: FunctionT) -> FunctionT:
-        """Have ``fn(connection)`` called on the listener thread about 20 times a second. Decorator."""
+        """Decorator: call ``fn(connection)`` on the listener thread about 20 times a second."""
         self.loop_listeners.append(fn)
         if len(self.loop_listeners) == 1:
             self.loop.call_soon(self._tick)
         return fn
 
     def pipe(self, target: MAVConnection) -> MAVConnection:
-        """Pass everything on that comes here to ``target``, and the other way round; returns ``target``."""
+        """Forward everything received here to ``target``, and vice versa; return ``target``."""
         target.target_system = self.target_system
-        self.loop.call_soon(self.connection.tap, lambda frame, peer: target.pass_on(frame))
-        target.loop.call_soon(target.connection.tap, lambda frame, peer: self.pass_on(frame))
+        self.loop.call_soon(self.connection.observe_frames, lambda frame, peer: target.write_frame(frame))
+        target.loop.call_soon(target.connection.observe_frames, lambda frame, peer: self.write_frame(frame))
         return target
 
     # ---------------------------------------------------------------------------- life cycle
 
     def start(self) -> None:
-        """Nothing is left to do: reception and heartbeat run since the connection was made."""
+        """Does nothing else than raise if the connection has ended: it receives since it was created."""
         self.connection.raise_if_ended()
 
     def reset(self) -> None:
@@ -123,7 +122,6 @@ class MAVConnection(Line):
             self.loop.call_soon(link.reopen)
 
     def stop_threads(self) -> None:
-        """As :meth:`close`."""
         self.close()
 
     @property
@@ -136,7 +134,7 @@ class MAVConnection(Line):
 
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
-        """False: as if nothing came, which is how programs try what they do then. What comes meanwhile is lost."""
+        """False discards received bytes, so that programs can test a silent link."""
         if value:
             vars(self.connection).pop("bytes_received", None)
         else:
@@ -152,7 +150,7 @@ class MAVConnection(Line):
 
     @property
     def out_queue(self) -> queue.Queue[bytes]:
-        """Always empty: what is sent does not wait."""
+        """Always empty: messages are sent immediately."""
         return queue.Queue()
 
     def _forward(self, frame: Frame, peer: Peer) -> None:
@@ -164,7 +162,7 @@ class MAVConnection(Line):
     def _tick(self) -> None:
         if self.connection.is_open:
             self.listener_thread.offer(self._call, self.loop_listeners)
-            asyncio.get_running_loop().call_later(TICK_S, self._tick)
+            asyncio.get_running_loop().call_later(TICK_INTERVAL_S, self._tick)
 
     def _call(self, listeners: list[Callable[..., object]], *args: Any) -> None:
         for listener in tuple(listeners):
@@ -173,8 +171,8 @@ class MAVConnection(Line):
             except BaseException:
                 logger.exception("Exception in a listener of the connection")
 
-    def pass_on(self, frame: Frame) -> None:
-        """Write a frame as it is; from any thread, silent when the connection is closed."""
+    def write_frame(self, frame: Frame) -> None:
+        """Write a frame unchanged, from any thread; ignored once the connection is closed."""
         with contextlib.suppress(ConnectionClosed):
             self.loop.call_soon(self._write_raw, frame)
 
@@ -183,18 +181,18 @@ class MAVConnection(Line):
             self.connection.write_raw(frame.raw)
 
 
-_made: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar("connections_made", default=None)
+_created: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar("created_connections", default=None)
 
 
 @contextlib.contextmanager
-def connections_made() -> Iterator[weakref.WeakSet[MAVConnection]]:
-    """Collect the connections that this thread makes in the block, without keeping those that are dropped."""
+def created_connections() -> Iterator[weakref.WeakSet[MAVConnection]]:
+    """Collect the connections that this thread creates in the block, by weak reference."""
     connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
-    token = _made.set(connections)
+    token = _created.set(connections)
     try:
         yield connections
     finally:
-        _made.reset(token)
+        _created.reset(token)
 
 
 def _open(
@@ -205,21 +203,21 @@ def _open(
     source_component: int,
     overrides: OverrideRelease,
     heartbeat: OwnHeartbeat | None,
-) -> Held[Connection]:
-    """Open it; what refuses at first may be a simulator that the program has just started."""
+) -> OpenContext[Connection]:
+    """Open the link. Retried if refused, because a program may have just started a simulator."""
     ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
     try:
         _check_address(ip)
         for attempt in range(ATTEMPTS):
             try:
                 opened = open_connection(ip, baud=baud, reconnect=True, heartbeat=heartbeat, **ids)
-                held = loop.hold_open(_releasing(opened, overrides))
-                held.value._prove_life_by(loop.proof)
+                held = loop.open_context(_with_override_release(opened, overrides))
+                held.value._use_activity_monitor(loop.activity)
                 return held
             except LinkOpenError as error:
                 if attempt == ATTEMPTS - 1 or not isinstance(error.__context__, ConnectionRefusedError):
                     _raise_classic(error)
-                time.sleep(BETWEEN_ATTEMPTS_S)
+                time.sleep(RETRY_INTERVAL_S)
         raise AssertionError
     except BaseException:
         loop.close()
@@ -227,10 +225,10 @@ def _open(
 
 
 @contextlib.asynccontextmanager
-async def _releasing(
+async def _with_override_release(
     opened: contextlib.AbstractAsyncContextManager[Connection], overrides: OverrideRelease
 ) -> AsyncIterator[Connection]:
-    """However the connection ends, the last that is sent gives the RC channels back."""
+    """Release overridden RC channels as the last message, however the connection ends."""
     async with opened as connection:
         try:
             yield connection
@@ -240,42 +238,41 @@ async def _releasing(
 
 def _check_address(ip: object) -> None:
     if not isinstance(ip, str):
-        raise InvalidArgument(f"ip = {ip!r} is no connection string; accepted are\n{ACCEPTED_FORMS}")
+        raise InvalidArgument(f"ip = {ip!r} is not a connection string; accepted are\n{ACCEPTED_FORMS}")
     try:
         parse_address(ip)
     except InvalidArgument as error:
-        from aerokit.transport.address_error import AddressError
+        from aerokit.transport.serial import AddressError
 
         raise AddressError(str(error)) from None
 
 
 def _raise_classic(error: LinkOpenError) -> NoReturn:
-    """As what the system called it: programs catch ConnectionRefusedError, socket.gaierror, SerialException."""
+    """Raise the operating system's exception type, which programs catch."""
     cause = error.__context__
     if isinstance(cause, OSError):
         if cause.errno is not None:
             raise type(cause)(cause.errno, str(error)) from error
         raise type(cause)(str(error)) from error
-    if isinstance(cause, ValueError):  # pyserial: no such baud rate
+    if isinstance(cause, ValueError):  # pyserial: unsupported baud rate
         raise ValueError(str(error)) from error
     raise error
 
 
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:
-    """Listen for UDP and answer everybody heard: any connection that listens does."""
+    """Listen for UDP. Like any listening connection it answers all senders."""
     return MAVConnection(f"udpin:{device}")
 
 
 class MAVWriter:
-    """A file-like object whose ``write`` puts bytes into a queue, as programs that build their own MAVLink use it."""
+    """A file-like object whose ``write`` puts bytes into a queue, for programs that build MAVLink themselves."""
 
     def __init__(self, queue: queue.Queue[bytes]) -> None:
         self.queue = queue
 
     def write(self, pkt: bytes) -> None:
-        """Put them there."""
         self.queue.put(pkt)
 
     def read(self) -> NoReturn:
-        """Nothing can be read: always RuntimeError."""
-        raise RuntimeError("a MAVWriter is for writing")
+        """Raise RuntimeError: it is write only."""
+        raise RuntimeError("a MAVWriter is write only")

@@ -1,4 +1,4 @@
-"""Attributes and messages that a program can listen to: ``Listeners``, and ``HasObservers``, who has some."""
+"""Listeners to attributes and messages: ``Listeners`` and ``HasObservers``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aerokit.errors import AerokitError
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
-    from aerokit.dronekit.line import Line
+    from aerokit.dronekit.classic_connection import ClassicConnection
     from aerokit.dronekit.listener_thread import ListenerThread
     from aerokit.mavlink.frame import Frame
     from aerokit.transport.link import Peer
@@ -23,47 +23,45 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("dronekit")
 
 AttributeListener = Callable[[Any, str, Any], object]
-"""``listener(object, name, value)``: of an attribute; or of a message, which is pymavlink's."""
+"""``listener(object, name, value)``, for an attribute or for a message of pymavlink."""
 
 ListenerT = TypeVar("ListenerT", bound=AttributeListener)
 
+# Name under which listeners get all attributes or messages.
 EVERY_NAME = "*"
-"""Who listens to it listens to all of them."""
 
-_changing = threading.Lock()
-"""Held while listeners are added and removed."""
+_changing = threading.Lock()  # acquired while listeners are added and removed
 
 
 class Listeners:
-    """Who listens to which attribute, or message, of an object. Any thread may use it.
+    """Listeners by attribute or message name. Can be used from any thread.
 
-    Listeners run on the listener thread, in the order in which values came, those of a name before those of ``'*'``;
-    they may block, raise, remove themselves and call whatever blocks. Without a listener thread they run on the thread
-    that tells. ``on_value(name)`` is called for every value, whoever listens.
+    Listeners run on the listener thread, in the order of the values, those of a name before those of ``'*'``. They may
+    block, raise and remove themselves. Without a listener thread they run on the notifying thread. ``on_value(name)``
+    is called for every value, with or without listeners.
     """
 
-    kind = "attribute"
-    """What the log calls it."""
+    kind = "attribute"  # in log messages
 
     def __init__(
         self, owner: object, thread: ListenerThread | None, on_value: Callable[[str], None] | None = None
     ) -> None:
         self._owner, self._thread, self._on_value = owner, thread, on_value
         self.by_name: dict[str, tuple[AttributeListener, ...]] = {}
-        self.told: dict[str, Any] = {}
-        """The last values of attributes that are told when they change."""
+        self.last_values: dict[str, Any] = {}
+        """Values of attributes whose listeners are notified of changes only."""
 
     def add(self, name: str, listener: AttributeListener) -> None:
-        """Have it called; not twice."""
+        """Add a listener, unless it is already registered."""
         with _changing:
             present = self.by_name.get(name, ())
             if listener in present:
                 return
             self.by_name[name] = (*present, listener)
-            self._stay()
+            self._keep_owner()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Call it no more; ValueError when others listen to the name, but this one does not."""
+        """Remove a listener; ValueError if the name has other listeners only."""
         with _changing:
             present = self.by_name.get(name)
             if present is None:
@@ -75,59 +73,57 @@ class Listeners:
                 self.by_name[name] = left
             else:
                 del self.by_name[name]
-                self._stay()
+                self._keep_owner()
 
-    def heed(self, name: str) -> bool:
-        """Whether somebody listens to this attribute."""
+    def has_listener(self, name: str) -> bool:
         return name in self.by_name or EVERY_NAME in self.by_name
 
-    def tell(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Tell a value; with ``cache`` only when it is not the one told before, else it may be dropped: it comes again.
+    def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
+        """Notify listeners of a value: with ``cache`` only of a change, otherwise it may be dropped under load.
 
-        Waits for nobody, or, with ``waits``, until the listeners have run.
+        Returns immediately or, with ``waits``, after the listeners have run.
         """
         if cache:
-            if name in self.told and self.told[name] == value:
+            if name in self.last_values and self.last_values[name] == value:
                 return
-            self.told[name] = value
+            self.last_values[name] = value
         if self._on_value is not None:
             self._on_value(name)
-        if not self.heed(name):
+        if not self.has_listener(name):
             return
         thread = self._thread
         if thread is None:
             self.deliver(name, value)
         else:
-            hand_over = thread.call if waits else thread.post if cache else thread.offer
-            hand_over(self.deliver, name, value)
+            enqueue = thread.call if waits else thread.post if cache else thread.offer
+            enqueue(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """As :meth:`tell`; the value is the owner's attribute, which is read only when somebody listens."""
-        if self.heed(name):
-            self.tell(name, attrgetter(name)(self._owner))
+        """Like :meth:`notify` with the owner's attribute, which is read only if there are listeners."""
+        if self.has_listener(name):
+            self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
             self._on_value(name)
 
     def deliver(self, attr_name: str, value: Any) -> None:
-        """Call the listeners, those that are there by now, where the caller is."""
         for name in (attr_name, EVERY_NAME):
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
                 except BaseException:
-                    # sys.exit() too: it would end the callbacks of everybody, and nothing else
+                    # Including SystemExit, which would end the listener thread only.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
-    def _stay(self) -> None:
-        """With listeners the owner stays, even when the program has dropped it."""
+    def _keep_owner(self) -> None:
+        # The owner stays alive while it has listeners, even if the program has dropped it.
         if self._thread is not None:
             self._thread.keep(self, has_listeners=bool(self.by_name))
 
 
-def decorator_of(
+def listener_decorator(
     add: Callable[[str, AttributeListener], object], name: str | list[str] | tuple[str, ...]
 ) -> Callable[[ListenerT], ListenerT]:
-    """What adds the function it decorates under a name, or several."""
+    """Return a decorator that adds a listener for one or several names."""
 
     def decorate(listener: ListenerT) -> ListenerT:
         for each in (name,) if isinstance(name, str) else name:
@@ -138,89 +134,88 @@ def decorator_of(
 
 
 class HasObservers:
-    """An object with attributes that can be listened to; see :class:`Listeners`."""
+    """An object with attributes that have listeners; see :class:`Listeners`."""
 
     def __init__(self, listener_thread: ListenerThread | None = None) -> None:
         self._dk_observe(Listeners(self, listener_thread))
 
     def _dk_observe(self, listeners: Listeners) -> None:
         self._dk_listeners = listeners
-        self._attribute_listeners, self._attribute_cache = listeners.by_name, listeners.told
+        self._attribute_listeners, self._attribute_cache = listeners.by_name, listeners.last_values
 
     @staticmethod
-    def _dk_spelled(attr_name: str) -> str:
-        """The name as it is listened to."""
+    def _dk_normalized(attr_name: str) -> str:
         return attr_name
 
     def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Have ``observer(self, attr_name, value)`` called when the attribute is updated, or the parameter has changed.
+        """Call ``observer(self, attr_name, value)`` when the attribute is updated, or the parameter changed.
 
-        Sensor values are told with every message, states (``mode``, ``armed``, ``system_status``, ``ekf_ok``) when
-        they change. ``'*'`` is every name. A listener that is there already is not added again; names are not checked,
-        since programs tell of attributes of their own.
+        Listeners of sensor values are called with every message, those of states (``mode``, ``armed``,
+        ``system_status``, ``ekf_ok``) on changes. ``'*'`` is every name. A registered listener is not added again.
+        Names are not checked, because programs may have attributes of their own.
         """
-        self._dk_listeners.add(self._dk_spelled(attr_name), observer)
+        self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Call it no more; ValueError when others listen to the name, but this one does not."""
-        self._dk_listeners.remove(self._dk_spelled(attr_name), observer)
+        """Remove a listener; ValueError if the name has other listeners only."""
+        self._dk_listeners.remove(self._dk_normalized(attr_name), observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:
-        """Decorate a listener with the name, or the list of names, it listens to. It cannot be removed by name then."""
-        return decorator_of(self.add_attribute_listener, name)
+        """Decorator: add a listener for one name or a list of names."""
+        return listener_decorator(self.add_attribute_listener, name)
 
     def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
-        """Tell the listeners of an attribute its value; with ``cache`` only when it is not the one told before.
+        """Call the listeners of an attribute and wait for them; with ``cache`` only if the value has changed.
 
-        Call it from message listeners for attributes of your own. Returns when the listeners have run.
+        Call it from message listeners for attributes of your own.
         """
-        self._dk_listeners.tell(self._dk_spelled(attr_name), value, cache, waits=True)
+        self._dk_listeners.notify(self._dk_normalized(attr_name), value, cache, waits=True)
 
 
 class MessageListeners(Listeners):
-    """The message listeners of one vehicle, called on its listener thread. pymavlink is imported for the first of them.
+    """Message listeners of a vehicle, called on the listener thread. Imports pymavlink for the first listener.
 
-    They hear what the vehicle's system says, every component of it, and what comes from radios, ground stations and
-    the like; not what other vehicles on the link say.
+    They get messages of all components of the vehicle, and of radios, ground stations and so on, but not of other
+    vehicles on the link.
     """
 
     kind = "message"
 
-    def __init__(self, owner: object, handler: Line) -> None:
+    def __init__(self, owner: object, handler: ClassicConnection) -> None:
         super().__init__(owner, handler.listener_thread)
         self._handler = handler
         self._detach: dict[str, Detach] = {}
         self._is_started = False
 
     def add(self, name: str, listener: AttributeListener) -> None:
-        """Have it called for every message of this name, or for every message (``'*'``); not twice."""
-        _pymavlink()  # at its first message it would hold up all that comes for 60 ms
+        """Add a listener for every message of this name, or for every message (``'*'``)."""
+        _pymavlink()  # takes 60 ms, which would block reception at the first message
         super().add(str(name), listener)
         self._attach_now()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Call it no more; silent when it does not listen."""
+        """Remove a listener; ignored if it is not registered."""
         with contextlib.suppress(ValueError):
             super().remove(name, listener)
         self._attach_now()
 
     def start(self) -> None:
-        """The vehicle was found: hear what comes from now on (loop thread)."""
+        """Start receiving, once the vehicle is connected (loop thread)."""
         self._is_started = True
         self._attach()
 
     def _attach_now(self) -> None:
-        """Wait for it, so that whatever comes once a listener was added is heard."""
+        # Blocks, so that no message is missed after add() has returned.
         if not self._is_started:
             return
         if self._handler.loop.is_current:
             self._attach()
         else:
-            with contextlib.suppress(AerokitError):  # the connection is closed: nothing will come
+            with contextlib.suppress(AerokitError):  # the connection is closed
                 self._handler.loop.call(self._attach)
 
     def _attach(self) -> None:
-        """Hear what is listened to: everything, or the messages of these names."""
+        """Subscribe to all messages, or to those that have listeners."""
         names = self.by_name.copy()
         wanted = [EVERY_NAME] if EVERY_NAME in names else list(names)
         for name in set(self._detach).difference(wanted):
@@ -232,11 +227,11 @@ class MessageListeners(Listeners):
     def _listen(self, name: str) -> Detach:
         connection = self._handler.connection
         if name == EVERY_NAME:
-            return connection.tap(self._take)
+            return connection.observe_frames(self._take)
         try:
             message_type = connection.bus.dialect.by_name(name)
         except AerokitError:
-            logger.warning("there is no message %s: its listener will never be called", name)
+            logger.warning("unknown message %s: its listener will never be called", name)
             return lambda: None
         return connection.bus.attach_frames(message_type, self._take)
 
@@ -250,9 +245,10 @@ class MessageListeners(Listeners):
 
 
 def message_of(frame: Frame) -> Any:
-    """The frame's message in the program's dialect, ``mavutil.mavlink``, if that is one of MAVLink 2; never raises.
+    """Convert a frame to a pymavlink message. Never raises.
 
-    ``_timestamp`` is the time of this call.
+    Uses the program's dialect, ``mavutil.mavlink``, if that is one of MAVLink 2. ``_timestamp`` is the time of this
+    call.
     """
     mavutil, to_pymavlink = _pymavlink()
     return to_pymavlink(frame, dialect=mavutil.mavlink, timestamp=time.time())
@@ -260,7 +256,7 @@ def message_of(frame: Frame) -> Any:
 
 @cache
 def _pymavlink() -> tuple[Any, Callable[..., Any]]:
-    """Imported for the first listener to messages."""
+    # Imported for the first message listener.
     from pymavlink import mavutil
 
     from aerokit.mavlink.pymavlink import to_pymavlink

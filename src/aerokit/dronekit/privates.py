@@ -1,4 +1,4 @@
-"""What old programs use beside DroneKit's public names: its private ones, and what mappings had in Python 2."""
+"""Private names of DroneKit that programs use, and mapping methods of Python 2."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SILENCE_S = 5.0
-"""After so many seconds without a heartbeat DroneKit warns."""
+SILENCE_S = 5.0  # DroneKit's limit
 
 
-class Shadowable(Generic[T]):
-    """Read as a property is, until an object gets an attribute of this name.
+class OverridableProperty(Generic[T]):
+    """A property that an instance attribute of the same name overrides.
 
-    For names that DroneKit 2.9 does not have: subclasses of its Vehicle may use them for their own things.
+    For names that DroneKit 2.9 does not have: subclasses of its Vehicle may use them.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:
@@ -33,8 +32,8 @@ class Shadowable(Generic[T]):
         return self if instance is None else self._getter(instance)
 
 
-def read_of(path: str) -> Shadowable[Any]:
-    """What is found there (``gimbal.pitch``); None where something is None on the way."""
+def attribute_path(path: str) -> OverridableProperty[Any]:
+    """Return a property that reads a path such as ``gimbal.pitch``; None if any part of it is None."""
     names = path.split(".")
 
     def read(instance: Any) -> Any:
@@ -43,114 +42,102 @@ def read_of(path: str) -> Shadowable[Any]:
             value = None if value is None else getattr(value, name)
         return value
 
-    return Shadowable(read)
+    return OverridableProperty(read)
 
 
-def _velocity(index: int) -> Shadowable[Any]:
-    return Shadowable(lambda vehicle: vehicle.velocity[index])
+def _velocity(index: int) -> OverridableProperty[Any]:
+    return OverridableProperty(lambda vehicle: vehicle.velocity[index])
 
 
-def _message_of(latest: str, *fields: str) -> tuple[Shadowable[Any], ...]:
-    """Fields of the message that the vehicle has there."""
-    return tuple(read_of(f"{latest}.message.{field}") for field in fields)
+def _message_of(latest: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
+    """Return properties for fields of a message."""
+    return tuple(attribute_path(f"{latest}.message.{field}") for field in fields)
 
 
-def _heard_at(vehicle: Any) -> float:
+def _last_heartbeat_at(vehicle: Any) -> float:
     age = vehicle.last_heartbeat
     return 0.0 if age is None else time.monotonic() - age
 
 
 class VehiclePrivates:
-    """What DroneKit's vehicle keeps, to read. A program that assigns one has its own value from there on."""
+    """Private attributes of DroneKit's Vehicle. Reading works; assigning sets an instance attribute."""
 
     _pitch, _yaw, _roll, _pitchspeed, _yawspeed, _rollspeed = _message_of(
         "_dk_attitude", "pitch", "yaw", "roll", "pitchspeed", "yawspeed", "rollspeed"
     )
     _vx, _vy, _vz = map(_velocity, range(3))
     _heading, _airspeed, _groundspeed = _message_of("_dk_vfr_hud", "heading", "airspeed", "groundspeed")
-    _eph, _epv, _fix_type, _satellites_visible = _message_of(
-        "_dk_gps", "eph", "epv", "fix_type", "satellites_visible"
-    )
+    _eph, _epv, _fix_type, _satellites_visible = _message_of("_dk_gps", "eph", "epv", "fix_type", "satellites_visible")
     _voltage, _current, _level = _message_of(
         "_dk_sys_status", "voltage_battery", "current_battery", "battery_remaining"
     )
-    _system_status = read_of("_dk_heartbeat.system_status")
+    _system_status = attribute_path("_dk_heartbeat.system_status")
     _raw_version, _capabilities = _message_of("_dk_version", "flight_sw_version", "capabilities")
-    _rngfnd_distance, _rngfnd_voltage = read_of("rangefinder.distance"), read_of("rangefinder.voltage")
+    _rngfnd_distance, _rngfnd_voltage = (
+        attribute_path("rangefinder.distance"),
+        attribute_path("rangefinder.voltage"),
+    )
     _mount_pitch, _mount_yaw, _mount_roll = (
-        read_of("gimbal.pitch"),
-        read_of("gimbal.yaw"),
-        read_of("gimbal.roll"),
+        attribute_path("gimbal.pitch"),
+        attribute_path("gimbal.yaw"),
+        attribute_path("gimbal.roll"),
     )
 
-    _last_heartbeat = read_of("last_heartbeat")
-    _heartbeat_started = Shadowable(lambda vehicle: vehicle.last_heartbeat is not None)
-    _heartbeat_system = read_of("_handler.target_system")
-    _heartbeat_timeout = Shadowable(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= SILENCE_S)
-    """Whether the link is silent: a flag, not a number of seconds."""
-
-    _heartbeat_lastreceived = Shadowable(_heard_at)
-    _params_loaded = Shadowable(lambda vehicle: "parameters" in vehicle._ready_attrs)
-    _params_count = Shadowable(
+    _last_heartbeat = attribute_path("last_heartbeat")
+    _heartbeat_started = OverridableProperty(lambda vehicle: vehicle.last_heartbeat is not None)
+    _heartbeat_system = attribute_path("_handler.target_system")
+    # True while the link is silent: a flag, not seconds.
+    _heartbeat_timeout = OverridableProperty(lambda vehicle: (vehicle.last_heartbeat or 0.0) >= SILENCE_S)
+    _heartbeat_lastreceived = OverridableProperty(_last_heartbeat_at)
+    _params_loaded = OverridableProperty(lambda vehicle: "parameters" in vehicle._ready_attrs)
+    _params_count = OverridableProperty(
         lambda vehicle: len(vehicle.parameters) if "parameters" in vehicle._ready_attrs else -1
     )
-    """How many there are, -1 while that is not known."""
-    _current_waypoint = read_of("commands.next")
-    _wp_loaded = Shadowable(lambda vehicle: "commands" in vehicle._ready_attrs)
+    _current_waypoint = attribute_path("commands.next")
+    _wp_loaded = OverridableProperty(lambda vehicle: "commands" in vehicle._ready_attrs)
     _wp_uploaded = None
     _wpts_dirty = False
 
-    _mode_mapping = Shadowable(lambda vehicle: vehicle._master.mode_mapping())
-    _mode_mapping_bynumber = Shadowable(
+    _mode_mapping = OverridableProperty(lambda vehicle: vehicle._master.mode_mapping())
+    _mode_mapping_bynumber = OverridableProperty(
         lambda vehicle: {number: name for name, number in (vehicle._master.mode_mapping() or {}).items()}
     )
 
 
 class LocationPrivates:
-    """What DroneKit's locations keep, to read."""
-
-    _lat, _lon = read_of("global_relative_frame.lat"), read_of("global_relative_frame.lon")
-    _alt, _relative_alt = read_of("global_frame.alt"), read_of("global_relative_frame.alt")
+    _lat, _lon = attribute_path("global_relative_frame.lat"), attribute_path("global_relative_frame.lon")
+    _alt, _relative_alt = attribute_path("global_frame.alt"), attribute_path("global_relative_frame.alt")
     _north, _east, _down = (
-        read_of("local_frame.north"),
-        read_of("local_frame.east"),
-        read_of("local_frame.down"),
+        attribute_path("local_frame.north"),
+        attribute_path("local_frame.east"),
+        attribute_path("local_frame.down"),
     )
 
 
 class GimbalPrivates:
-    """What DroneKit's gimbal keeps, to read."""
-
-    _pitch, _roll, _yaw = read_of("pitch"), read_of("roll"), read_of("yaw")
+    _pitch, _roll, _yaw = attribute_path("pitch"), attribute_path("roll"), attribute_path("yaw")
 
 
 class Python2Mapping(Mapping[str, T]):
-    """Adds those methods to what a mapping has in Python 3."""
+    """A mapping with the methods that Python 3 removed."""
 
     def has_key(self, name: object) -> bool:
-        """As ``name in mapping``."""
         return name in self
 
     def iteritems(self) -> Iterator[tuple[str, T]]:
-        """As ``iter(items())``."""
         return iter(self.items())
 
     def iterkeys(self) -> Iterator[str]:
-        """As ``iter(keys())``."""
         return iter(self.keys())
 
     def itervalues(self) -> Iterator[T]:
-        """As ``iter(values())``."""
         return iter(self.values())
 
     def viewitems(self) -> ItemsView[str, T]:
-        """As ``items()``."""
         return self.items()
 
     def viewkeys(self) -> KeysView[str]:
-        """As ``keys()``."""
         return self.keys()
 
     def viewvalues(self) -> ValuesView[T]:
-        """As ``values()``."""
         return self.values()

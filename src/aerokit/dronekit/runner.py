@@ -1,4 +1,4 @@
-"""Running DroneKit programs unchanged, as ``python program.py`` would if DroneKit could still be imported."""
+"""Runs DroneKit programs unchanged, as ``python program.py`` does with DroneKit."""
 
 from __future__ import annotations
 
@@ -17,22 +17,18 @@ import zipfile
 from importlib.machinery import ModuleSpec
 from typing import TYPE_CHECKING, NoReturn
 
-from aerokit._internal.wording import did_you_mean
+from aerokit._internal.formatting import did_you_mean
 from aerokit.dronekit.util import errprinter
 from aerokit.errors import AerokitError, InvalidArgument
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from types import TracebackType
+    from importlib.abc import Loader, MetaPathFinder
+    from types import ModuleType, TracebackType
 
     from aerokit.dronekit.sitl import ServedVehicle
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from importlib.abc import Loader, MetaPathFinder
-    from types import ModuleType
 else:
-    Loader = MetaPathFinder = object  # importing them would take longer than all the rest of this package
+    Loader = MetaPathFinder = object  # importing them takes longer than the rest of this package
 
 ALIAS, PACKAGE = "dronekit", "aerokit.dronekit"
 
@@ -40,24 +36,22 @@ SITL_ALIAS, SITL_MODULE = "dronekit_sitl", "aerokit.dronekit.sitl"
 
 
 def install() -> None:
-    """Have ``import dronekit`` and ``from dronekit.lib import …`` mean :mod:`aerokit.dronekit` from now on.
+    """Make ``import dronekit`` and ``from dronekit.lib import …`` import :mod:`aerokit.dronekit`.
 
-    ``import dronekit_sitl`` means :mod:`aerokit.dronekit.sitl`, unless another one was imported before.
-
-    For test runners (in ``conftest.py``) and embedding programs. A DroneKit that is installed, but was not imported
-    yet, is not looked for any more. Calling it again changes nothing.
+    ``import dronekit_sitl`` imports :mod:`aerokit.dronekit.sitl`, unless another one was imported before. Takes
+    precedence over an installed DroneKit. Idempotent. For test runners (in ``conftest.py``) and embedding programs.
 
     Raises:
-        ImportError: another ``dronekit`` was imported already.
+        ImportError: another ``dronekit`` was imported before.
     """
     package = importlib.import_module(PACKAGE)
     present = sys.modules.get(ALIAS)
     if present is package:
         return
     if present is not None:
-        where = getattr(present, "__file__", None) or "somewhere"
+        where = getattr(present, "__file__", None) or "an unknown file"
         raise ImportError(
-            f"another dronekit was imported already, from {where}: call aerokit.dronekit.install() before anything"
+            f"another dronekit was imported before, from {where}: call aerokit.dronekit.install() before anything"
             " imports it",
             name=ALIAS,
         )
@@ -66,7 +60,7 @@ def install() -> None:
 
 
 def uninstall() -> None:
-    """Undo :func:`install`; what was imported meanwhile stays as it is. Nothing happens without it."""
+    """Undo :func:`install`. Modules that were imported in between stay usable. Does nothing without ``install``."""
     if sys.modules.get(ALIAS) is not sys.modules.get(PACKAGE):
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
@@ -76,14 +70,14 @@ def uninstall() -> None:
 
 
 def _own_name(name: str) -> str | None:
-    """What a module is called here; None: it is none of ours."""
+    """Return the name of an alias's module in aerokit, or None for other modules."""
     if name == SITL_ALIAS:
         return SITL_MODULE
     return PACKAGE + name.removeprefix(ALIAS) if name.startswith(f"{ALIAS}.") else None
 
 
 class _SubmoduleFinder(MetaPathFinder):
-    """``dronekit.mavlink`` is the module ``aerokit.dronekit.mavlink``, not a second one made of the same file."""
+    """Makes ``dronekit.mavlink`` the same module object as ``aerokit.dronekit.mavlink``."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -102,39 +96,36 @@ class _SubmoduleLoader(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = (
-            self._own_spec
-        )  # it was executed under its own name; the import system has changed this
+        module.__spec__ = self._own_spec  # the import system has replaced it
 
 
 FAILED, CANNOT_OPEN = 1, 2
 
 WITH_VALUE = ("--vehicle", "--speedup", "--home")
 
-OF_RUNPY = (runpy.__file__, "<frozen runpy>")
+RUNPY_FILES = (runpy.__file__, "<frozen runpy>")
 
 
 def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> None:
-    """Run a DroneKit program in this process, and come back when its main program has ended.
+    """Run a DroneKit program in this process, and return when its main program has ended.
 
-    It finds everything as with ``python program.py arguments…``: ``sys.argv``, its own folder first in ``sys.path``,
-    ``__name__ == '__main__'``. ``import dronekit`` means :mod:`aerokit.dronekit`, and goes on doing so afterwards. A
-    folder or zip file with a ``__main__.py`` is a program, too. ``sys`` is put back afterwards, and vehicles that the
-    program left open are closed.
+    Its environment is that of ``python program.py arguments…``: ``sys.argv``, its folder first in ``sys.path``,
+    ``__name__ == '__main__'``. ``import dronekit`` imports :mod:`aerokit.dronekit`, also afterwards. A folder or zip
+    file with a ``__main__.py`` is a program, too. Afterwards ``sys`` is restored, and open vehicles are closed.
 
     Args:
         path: the program.
-        arguments: what it finds behind its name in ``sys.argv``.
+        arguments: its arguments in ``sys.argv``.
 
     Raises:
         OSError: the file cannot be read.
-        ImportError: the real ``dronekit`` was imported before, by somebody else.
-        SystemExit: the program called ``sys.exit``. Whatever else it raises comes out as well.
+        ImportError: another ``dronekit`` was imported before.
+        SystemExit: the program called ``sys.exit``. Other exceptions of the program propagate, too.
     """
-    from aerokit.dronekit.mavlink import connections_made
+    from aerokit.dronekit.mavlink import created_connections
 
     install()
-    with _sys_as_it_was(), connections_made() as connections:
+    with _restored_sys(), created_connections() as connections:
         try:
             _run_file(os.fspath(path), arguments)
         finally:
@@ -143,18 +134,18 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
 
 
 def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> int:
-    """Run the program that a command line names, in the place of this one; what it raises comes out.
+    """Run the program of a command line in place of this one. Its exceptions propagate.
 
     Args:
         arguments: ``program.py arguments…`` or ``-m module arguments…``.
-        prog: how this command is called.
+        prog: name of this command.
 
     Returns:
-        Exit code: 0, 1 if its own vehicle cannot be served, or 2 if the program cannot be opened.
+        Exit code: 0, 1 if the simulated vehicle cannot be served, or 2 if the program cannot be opened.
     """
     own, rest = _split(arguments)
     options = parser(prog).parse_args(own)
-    if not options.module and (error := _unreadable(options.program)):
+    if not options.module and (error := _file_error(options.program)):
         errprinter(f"{prog}: can't open file {options.program!r}: {error}")
         return CANNOT_OPEN
     try:
@@ -163,13 +154,13 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
     except (AerokitError, ImportError) as error:
         errprinter(f"{prog}: {error}")
         return FAILED
-    error_text = _unfindable(options.program) if options.module else _without_main(options.program)
+    error_text = _module_error(options.program) if options.module else _missing_main_error(options.program)
     if error_text:
         errprinter(f"{prog}: {error_text}")
         return FAILED
-    sys.excepthook = _print_without_us
+    sys.excepthook = _print_program_traceback
     if not getattr(sys.flags, "safe_path", False):
-        del sys.path[:1]  # ours: the folder of this command
+        del sys.path[:1]  # the folder of this command
     run = _run_module if options.module else _run_file
     try:
         run(options.program, rest)
@@ -180,32 +171,27 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """The arguments in front of the program's own."""
     parser = _Parser(
         prog=prog,
         usage=f"{prog} [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
         description="Run a DroneKit program unchanged: its 'import dronekit' means aerokit.dronekit.",
     )
     parser.add_argument("-m", dest="module", action="store_true", help="the program is a module, not a file")
-    parser.add_argument(
-        "program", metavar="PROGRAM", help="a file, or a folder or zip file with a __main__.py"
-    )
+    parser.add_argument("program", metavar="PROGRAM", help="a file, or a folder or zip file with a __main__.py")
     sim = parser.add_argument_group("a vehicle for the program")
     sim.add_argument(
-        "--sim", action="store_true", help="serve a simulated one on tcp:127.0.0.1:5760 and to UDP port 14550"
+        "--sim",
+        action="store_true",
+        help="serve a simulated vehicle on tcp:127.0.0.1:5760 and UDP port 14550",
     )
-    sim.add_argument(
-        "--vehicle", default="copter", metavar="KIND", help="copter, plane, rover, sub, px4 … (copter)"
-    )
+    sim.add_argument("--vehicle", default="copter", metavar="KIND", help="copter, plane, rover, sub, px4 … (copter)")
     sim.add_argument("--speedup", type=float, default=1.0, metavar="X", help="times real time (1)")
-    sim.add_argument("--home", metavar="LAT,LON,ALT", help="degrees, metres above the sea (near Canberra)")
-    parser.epilog = "Everything behind the program is the program's, options too."
+    sim.add_argument("--home", metavar="LAT,LON,ALT", help="degrees, metres above sea level (near Canberra)")
+    parser.epilog = "Arguments after PROGRAM are passed to the program."
     return parser
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what was perhaps meant when an option is not known."""
-
     def error(self, message: str) -> NoReturn:
         label, _, rest = message.partition("unrecognized arguments: ")
         if rest and not label:
@@ -214,7 +200,6 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """What is for us, the program included, and what is for the program."""
     is_value = False
     for place, argument in enumerate(arguments, 1):
         if not is_value and not argument.startswith("-"):
@@ -225,7 +210,7 @@ def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
 
 def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
     from aerokit.dronekit.sitl import parse_home, serve_for_program
-    from aerokit.sim.local_frame import HOME
+    from aerokit.sim.motion import HOME
 
     if not 0.1 <= options.speedup <= 100:
         raise InvalidArgument(f"speedup = {options.speedup:g} is not allowed: 0.1 to 100")
@@ -236,15 +221,15 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
     return served
 
 
-def _unfindable(module: str) -> str | None:
-    """As Python says it of ``-m``; the folder of the program is the working directory."""
+def _module_error(module: str) -> str | None:
+    """Return Python's error text for ``-m``, or None. The program's folder is the working directory."""
     sys.path.insert(0, os.getcwd())
     try:
         spec = importlib.util.find_spec(module)
         if spec is None:
             return f"No module named {module}"
         folders = spec.submodule_search_locations
-        if folders is None or not all(map(_is_without_main, folders)):
+        if folders is None or not all(map(_lacks_main, folders)):
             return None
         return f"No module named {module}.__main__; {module!r} is a package and cannot be directly executed"
     except ModuleNotFoundError as error:
@@ -253,18 +238,18 @@ def _unfindable(module: str) -> str | None:
         del sys.path[0]
 
 
-def _without_main(path: str) -> str | None:
-    """As Python says it of a folder that is no program."""
-    return f"can't find '__main__' module in {path!r}" if _is_without_main(path) else None
+def _missing_main_error(path: str) -> str | None:
+    """Return Python's error text for a folder without ``__main__``, or None."""
+    return f"can't find '__main__' module in {path!r}" if _lacks_main(path) else None
 
 
-def _is_without_main(path: str) -> bool:
+def _lacks_main(path: str) -> bool:
     return os.path.isdir(path) and not any(
         os.path.exists(os.path.join(path, name)) for name in ("__main__.py", "__main__.pyc")
     )
 
 
-def _unreadable(path: str) -> str | None:
+def _file_error(path: str) -> str | None:
     try:
         io.open_code(os.path.abspath(path)).close()
     except IsADirectoryError:
@@ -302,7 +287,7 @@ def _prepend_path(folder: str) -> None:
 
 
 @contextlib.contextmanager
-def _sys_as_it_was() -> Iterator[None]:
+def _restored_sys() -> Iterator[None]:
     argv, path, main = sys.argv[:], sys.path[:], sys.modules["__main__"]
     try:
         yield
@@ -310,21 +295,19 @@ def _sys_as_it_was() -> Iterator[None]:
         sys.argv[:], sys.path[:], sys.modules["__main__"] = argv, path, main
 
 
-def _print_without_us(
-    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
-) -> None:
-    """Print a traceback that begins in the program, as Python does for one that it runs itself."""
-    error.__traceback__ = _from_the_program_on(traceback)
+def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+    """Print a traceback without the frames of this module, as Python does for its own."""
+    error.__traceback__ = _without_our_frames(traceback)
     sys.__excepthook__(kind, error, error.__traceback__)
 
 
-def _from_the_program_on(traceback: TracebackType | None) -> TracebackType | None:
+def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
     rest = traceback
     while rest is not None and rest.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
         rest = rest.tb_next
     if rest is None:
         return traceback
     rest = rest.tb_next
-    while rest is not None and rest.tb_frame.f_code.co_filename in OF_RUNPY:
+    while rest is not None and rest.tb_frame.f_code.co_filename in RUNPY_FILES:
         rest = rest.tb_next
     return rest

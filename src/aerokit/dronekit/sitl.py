@@ -1,7 +1,6 @@
-"""What ``import dronekit_sitl`` means in programs that :mod:`aerokit.dronekit` runs: simulated vehicles of aerokit.
+"""Replacement of the package dronekit-sitl 3.3 for programs that :mod:`aerokit.dronekit` runs: simulated vehicles.
 
-Nothing is downloaded; the vehicle flies in a thread of this process, and ends with it. What is answered is what the
-package dronekit-sitl 3.3 has: ``start_default``, ``SITL``, ``version_list``.
+Provides ``start_default``, ``SITL`` and ``version_list``. Downloads nothing; vehicles run in threads of this process.
 """
 
 from __future__ import annotations
@@ -15,24 +14,24 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.dronekit.util import errprinter
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.sim.kinds import simulated, wait_longer
-from aerokit.sim.local_frame import HOME
+from aerokit.sim.kinds import scale_timeouts, simulated
+from aerokit.sim.motion import HOME
 from aerokit.sim.server import open_simulator
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+# Vehicles of dronekit-sitl, and kinds of the simulator.
 KINDS = {"copter": "copter", "solo": "copter", "plane": "plane", "rover": "rover", "sub": "sub"}
-"""What dronekit-sitl calls its vehicles, and what they are here."""
 START_TIMEOUT_S = 30.0
 USUAL_ADDRESSES = ("tcpin:127.0.0.1:5760", "udpout:127.0.0.1:14550")
 
 _instances = 0
-_given: ServedVehicle | None = None
+_for_program: ServedVehicle | None = None
 
 
 class ServedVehicle:
-    """A simulated vehicle on addresses, in a thread of its own, until :meth:`stop` or the end of the process."""
+    """A simulated vehicle on addresses, in a thread of its own, until :meth:`stop` or process exit."""
 
     def __init__(
         self,
@@ -45,9 +44,9 @@ class ServedVehicle:
         self.kind: str = kind
         self.speedup: float = speedup
         self.addresses: tuple[str, ...] = ()
-        """Where it is, as the simulator spells it."""
+        """Addresses in the simulator's spelling."""
         self._vehicle = simulated(kind, home=home)
-        self._asked = tuple(addresses)
+        self._requested = tuple(addresses)
         self._error: Exception | None = None
         self._is_up = threading.Event()
         self._loop = asyncio.new_event_loop()
@@ -56,27 +55,24 @@ class ServedVehicle:
         self._thread.start()
         if not self._is_up.wait(START_TIMEOUT_S):
             raise LinkOpenError(f"the simulated vehicle has not started within {START_TIMEOUT_S:g} s")
-        self._raise_what_failed()
+        self._raise_error()
 
-    def _raise_what_failed(self) -> None:
+    def _raise_error(self) -> None:
         if self._error is not None:
             self._thread.join()
             raise self._error
 
     @property
     def is_up(self) -> bool:
-        """Whether it flies."""
         return self._thread.is_alive()
 
     def stop(self) -> None:
-        """Switch it off; nothing happens the second time."""
         if self._thread.is_alive():
-            with suppress(RuntimeError):  # it ends at this very moment
+            with suppress(RuntimeError):  # the loop ends at this moment
                 self._loop.call_soon_threadsafe(self._over.set)
             self._thread.join()
 
     def wait(self) -> None:
-        """Until it is switched off."""
         self._thread.join()
 
     def _run(self) -> None:
@@ -84,39 +80,39 @@ class ServedVehicle:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
             if self._is_up.is_set():
-                errprinter(f"the simulated vehicle has failed: {error!r}")
+                errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:
             self._loop.close()
             self._is_up.set()
 
     async def _serve(self) -> None:
-        wait_longer([self._vehicle], self.speedup)
-        async with open_simulator([self._vehicle], *self._asked, speedup=self.speedup) as simulator:
+        scale_timeouts([self._vehicle], self.speedup)
+        async with open_simulator([self._vehicle], *self._requested, speedup=self.speedup) as simulator:
             self.addresses = tuple(simulator.addresses)
             self._is_up.set()
             await self._over.wait()
 
 
 def serve_for_program(kind: str, home: tuple[float, float, float], speedup: float) -> ServedVehicle:
-    """Serve a vehicle where DroneKit programs look for one; a program that starts one itself puts it in its place.
+    """Serve a vehicle on the usual addresses. A vehicle that the program starts itself replaces it.
 
     Raises:
-        InvalidArgument: there is no such kind.
+        InvalidArgument: the kind is unknown.
         LinkOpenError: no address could be opened.
     """
-    global _given
+    global _for_program
     try:
-        _given = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
+        _for_program = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
     except LinkOpenError as error:
-        errprinter(f"{error}; another port is taken")
+        errprinter(f"{error}; using another port")
         free = ("tcpin:127.0.0.1:0", *USUAL_ADDRESSES[1:])
-        _given = ServedVehicle(kind, free, home=home, speedup=speedup)
-    return _given
+        _for_program = ServedVehicle(kind, free, home=home, speedup=speedup)
+    return _for_program
 
 
 class SITL:
-    """A simulated ArduPilot vehicle as dronekit-sitl starts one; ``path``, gdb and valgrind say nothing here."""
+    """A simulated ArduPilot vehicle with the interface of dronekit-sitl. Ignores ``path`` and options for debuggers."""
 
     def __init__(self, path: str | None = None, instance: int | None = None, *_: Any, **__: Any) -> None:
         global _instances
@@ -128,7 +124,7 @@ class SITL:
         self._served: ServedVehicle | None = None
 
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:
-        """Note which vehicle it is; there is nothing to be fetched, and ``version`` is the simulator's own."""
+        """Select the vehicle. Downloads nothing; ``version`` is ignored."""
         if system not in KINDS:
             raise InvalidArgument(f"dronekit_sitl: system = {system!r} is not one of: {', '.join(KINDS)}")
         self._kind = KINDS[system]
@@ -143,52 +139,48 @@ class SITL:
         use_saved_data: bool = False,
         speedup: float | None = None,
     ) -> None:
-        """Start it. Of SITL's arguments ``--home``, ``--speedup``, ``--model`` and ``-I`` are understood.
+        """Start it. Supports SITL's arguments ``--home``, ``--speedup``, ``--model`` and ``-I``.
 
         Raises:
-            ChildProcessError: it runs already, and ``restart`` is not set.
-            LinkOpenError: its port is taken.
+            ChildProcessError: it is running, and ``restart`` is not set.
+            LinkOpenError: its port is in use.
         """
-        global _given
+        global _for_program
         if self._served is not None and self._served.is_up:
             if not restart:
-                raise ChildProcessError(
-                    "SITL is already running in this process, please use .stop() to kill it"
-                )
+                raise ChildProcessError("SITL is already running in this process, please use .stop() to kill it")
             self.stop()
         options = _arguments().parse_known_args(list(initial_args))[0]
         if options.instance is not None:
             self.instance = options.instance
         kind, addresses = self._kind or KINDS.get(options.model or "", "copter"), [self._port()]
-        if _given is not None:
-            kind = (self._kind and kind) or _given.kind
-            speedup = speedup or options.speedup or _given.speedup
+        if _for_program is not None:
+            kind = (self._kind and kind) or _for_program.kind
+            speedup = speedup or options.speedup or _for_program.speedup
             addresses += USUAL_ADDRESSES[1:]
-            _given.stop()
-            _given = None
+            _for_program.stop()
+            _for_program = None
         home = parse_home(options.home) if options.home else HOME
         self._served = ServedVehicle(kind, addresses, home=home, speedup=speedup or options.speedup or 1.0)
 
     def poll(self) -> int | None:
-        """None while it runs."""
+        """Return None while it runs, 0 otherwise."""
         return None if self._served is not None and self._served.is_up else 0
 
     def stop(self) -> None:
-        """Switch it off."""
         if self._served is not None:
             self._served.stop()
 
     def block_until_ready(self, verbose: bool = False) -> int | None:
-        """It is ready for a connection once :meth:`launch` has returned."""
+        """Return the result of :meth:`poll`: it is ready once :meth:`launch` has returned."""
         return self.poll()
 
     def complete(self, verbose: bool = False) -> None:
-        """Wait until somebody stops it."""
         while self.poll() is None:
             time.sleep(0.1)
 
     def connection_string(self) -> str:
-        """What ``dronekit.connect`` takes."""
+        """Return the address for ``dronekit.connect``."""
         return self._port().replace("tcpin:", "tcp:")
 
     def _port(self) -> str:
@@ -196,7 +188,7 @@ class SITL:
 
 
 def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
-    """Start a copter, at home near Canberra or at this place; InvalidArgument for one of the two alone."""
+    """Start a copter near Canberra or at this position; InvalidArgument if only one coordinate is given."""
     if (lat is None) != (lon is None):
         raise InvalidArgument("dronekit_sitl.start_default: give both lat and lon, or neither")
     sitl = SITL()
@@ -205,12 +197,11 @@ def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
 
 
 def version_list() -> dict[str, dict[str, str]]:
-    """Systems, each with the one version that there is."""
     return {system: {"stable": "aerokit"} for system in KINDS}
 
 
 def parse_home(text: str) -> tuple[float, float, float]:
-    """``LAT,LON,ALT`` or SITL's ``LAT,LON,ALT,HEADING``; InvalidArgument for anything else."""
+    """Parse ``LAT,LON,ALT`` or SITL's ``LAT,LON,ALT,HEADING``; InvalidArgument for anything else."""
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(",")[:3])
     except ValueError:

@@ -1,8 +1,7 @@
-"""The values that attributes of a vehicle have, with the names and texts that DroneKit programs know.
+"""Values of vehicle attributes, with DroneKit's names and texts.
 
-They are plain objects whose attributes may be set. What is not known is None: numbers of what a vehicle may not have
-said yet are therefore typed ``float | Any``, so that type checkers offer a number's methods without asking for a check.
-Places are equal only if they are the same object.
+They are plain objects with writable attributes. Unknown values are None; numbers that a vehicle may not report are
+typed ``float | Any``, so that type checkers do not require a check for None. Locations compare by identity.
 """
 
 from __future__ import annotations
@@ -12,16 +11,13 @@ from typing import Any
 
 STABLE = 255
 RELEASE_TYPES = ("dev", "alpha", "beta", "rc")
+# MAV_AUTOPILOT and MAV_TYPE with a name in DroneKit; for others the text has the number.
 AUTOPILOTS = {3: "APM:", 12: "PX4"}
 VEHICLES = {1: "Plane", 2: "Copter", 10: "Rover"}
-"""MAV_AUTOPILOT and MAV_TYPE as DroneKit's programs know them: others have their number in the text."""
 
 
 class _Value:
-    """Shown in a debugger or a list as it is printed."""
-
-    _text: str
-    """With the names of its attributes."""
+    _text: str  # format string
 
     def __str__(self) -> str:
         return self._text.format(self)
@@ -31,7 +27,7 @@ class _Value:
 
 
 class Attitude(_Value):
-    """How the vehicle is turned: ``pitch``, ``yaw`` and ``roll`` in radians."""
+    """Attitude: ``pitch``, ``yaw`` and ``roll`` in radians."""
 
     _text = "Attitude:pitch={0.pitch},yaw={0.yaw},roll={0.roll}"
 
@@ -52,19 +48,19 @@ class _Place(_Value):
 
 
 class LocationGlobal(_Place):
-    """A place on earth: ``lat`` and ``lon`` in degrees (WGS 84), ``alt`` in metres above mean sea level."""
+    """Global location: ``lat`` and ``lon`` in degrees (WGS 84), ``alt`` in metres above mean sea level."""
 
     _text = "LocationGlobal:lat={0.lat},lon={0.lon},alt={0.alt}"
 
 
 class LocationGlobalRelative(_Place):
-    """A place on earth: ``lat`` and ``lon`` in degrees (WGS 84), ``alt`` in metres above home."""
+    """Global location: ``lat`` and ``lon`` in degrees (WGS 84), ``alt`` in metres above home."""
 
     _text = "LocationGlobalRelative:lat={0.lat},lon={0.lon},alt={0.alt}"
 
 
 class LocationLocal(_Value):
-    """A place near the origin of the vehicle's estimator: metres ``north``, ``east`` and ``down`` of it."""
+    """Location relative to the origin of the estimator: metres ``north``, ``east`` and ``down``."""
 
     _text = "LocationLocal:north={0.north},east={0.east},down={0.down}"
 
@@ -74,9 +70,9 @@ class LocationLocal(_Value):
         self.down = down
 
     def distance_home(self) -> float | None:
-        """Metres to the origin, along the ground if ``down`` is None; None if ``north`` or ``east`` is.
+        """Distance to the origin in metres, horizontal if ``down`` is None; None if ``north`` or ``east`` is.
 
-        The origin is the estimator's: home only while nobody has moved either of them.
+        The origin is home unless one of them was moved.
         """
         if self.north is None or self.east is None:
             return None
@@ -86,7 +82,7 @@ class LocationLocal(_Value):
 
 
 class GPSInfo(_Value):
-    """A satellite receiver: fields of GPS_RAW_INT as they are.
+    """GPS receiver: fields of GPS_RAW_INT.
 
     ``eph`` and ``epv`` are dilutions of precision times 100 (65535: unknown), ``fix_type`` is 0 or 1 without a fix,
     2 for 2D, 3 for 3D and more for better ones, ``satellites_visible`` a number (255: unknown).
@@ -94,9 +90,7 @@ class GPSInfo(_Value):
 
     _text = "GPSInfo:fix={0.fix_type},num_sat={0.satellites_visible}"
 
-    def __init__(
-        self, eph: int | Any, epv: int | Any, fix_type: int | Any, satellites_visible: int | Any
-    ) -> None:
+    def __init__(self, eph: int | Any, epv: int | Any, fix_type: int | Any, satellites_visible: int | Any) -> None:
         self.eph = eph
         self.epv = epv
         self.fix_type = fix_type
@@ -106,8 +100,8 @@ class GPSInfo(_Value):
 class Battery(_Value):
     """The main battery: ``voltage`` in volts, ``current`` in amperes or None, ``level`` in percent or None.
 
-    The constructor takes what SYS_STATUS has: millivolts (65535: unknown, and stays 65.535 V here), hundredths of an
-    ampere and percent, both -1 when unknown.
+    The constructor takes the fields of SYS_STATUS: millivolts (65535, unknown, becomes 65.535 V), hundredths of an
+    ampere, and percent; -1 for the latter two is unknown.
     """
 
     _text = "Battery:voltage={0.voltage},current={0.current},level={0.level}"
@@ -123,7 +117,7 @@ class Battery(_Value):
 
 
 class Rangefinder(_Value):
-    """``distance`` in metres and ``voltage`` in volts, None when it has not been told."""
+    """Rangefinder: ``distance`` in metres and ``voltage`` in volts, or None."""
 
     _text = "Rangefinder: distance={0.distance}, voltage={0.voltage}"
 
@@ -133,22 +127,18 @@ class Rangefinder(_Value):
 
 
 class Wind(_Value):
-    """``wind_direction`` in degrees that it comes from, ``wind_speed`` and, upwards, ``wind_speed_z`` in m/s."""
+    """Wind: ``wind_direction`` (from) in degrees, ``wind_speed`` and ``wind_speed_z`` (up) in m/s."""
 
-    _text = (
-        "Wind: wind direction: {0.wind_direction}, wind speed: {0.wind_speed}, wind speed z: {0.wind_speed_z}"
-    )
+    _text = "Wind: wind direction: {0.wind_direction}, wind speed: {0.wind_speed}, wind speed z: {0.wind_speed_z}"
 
-    def __init__(
-        self, wind_direction: float | Any, wind_speed: float | Any, wind_speed_z: float | Any
-    ) -> None:
+    def __init__(self, wind_direction: float | Any, wind_speed: float | Any, wind_speed_z: float | Any) -> None:
         self.wind_direction = wind_direction
         self.wind_speed = wind_speed
         self.wind_speed_z = wind_speed_z
 
 
 class _Named(_Value):
-    """One that equals its name, and can be a key of a dict."""
+    """A value that equals its name and is hashable."""
 
     _named_by: str
 
@@ -161,7 +151,7 @@ class _Named(_Value):
 
 
 class VehicleMode(_Named):
-    """A flight mode by its ``name``: ``VehicleMode("GUIDED")``. It equals its name and can be a key of a dict."""
+    """A flight mode by its ``name``: ``VehicleMode("GUIDED")``. It equals its name, and can be a dict key."""
 
     _text, _named_by = "VehicleMode:{0.name}", "name"
 
@@ -170,9 +160,9 @@ class VehicleMode(_Named):
 
 
 class SystemStatus(_Named):
-    """What the vehicle is at: ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY, POWEROFF.
+    """MAV_STATE by name: ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
 
-    It equals its state as a text, and can be a key of a dict.
+    It equals its state as a string, and can be a dict key.
     """
 
     _text, _named_by = "SystemStatus:{0.state}", "state"
@@ -182,11 +172,11 @@ class SystemStatus(_Named):
 
 
 class Version(_Value):
-    """A firmware version: printed, it is for example ``APM:Copter-4.6.1`` or ``PX4Copter-1.15.0-beta2``.
+    """Firmware version; its text is for example ``APM:Copter-4.6.1`` or ``PX4Copter-1.15.0-beta2``.
 
     Args:
-        raw_version: flight_sw_version of AUTOPILOT_VERSION, one byte each for ``major``, ``minor``, ``patch`` and
-            ``release``; None when it is not known, then all four are None.
+        raw_version: flight_sw_version of AUTOPILOT_VERSION, with one byte each for ``major``, ``minor``, ``patch`` and
+            ``release``; None if unknown, then all four are None.
         autopilot_type: MAV_AUTOPILOT of the heartbeat, or None.
         vehicle_type: MAV_TYPE of the heartbeat, or None.
     """
@@ -205,17 +195,17 @@ class Version(_Value):
             self.major, self.minor, self.patch, self.release = (raw_version & 0xFFFFFFFF).to_bytes(4, "big")
 
     def is_stable(self) -> bool:
-        """Whether it is a release, not one of the versions before."""
+        """True for a release, False for a development, alpha, beta or candidate version."""
         return bool(self.release == STABLE)
 
     def release_version(self) -> int | None:
-        """23 for rc23; 0 for a release, None when the version is not known."""
+        """Return 23 for rc23; 0 for a release, None if the version is unknown."""
         if self.release is None:
             return None
         return 0 if self.is_stable() else int(self.release % 64)
 
     def release_type(self) -> str | None:
-        """``'dev'``, ``'alpha'``, ``'beta'`` or ``'rc'``, which releases say, too; None when it is not known."""
+        """Return ``'dev'``, ``'alpha'``, ``'beta'`` or ``'rc'`` (also for releases); None if the version is unknown."""
         return None if self.release is None else RELEASE_TYPES[self.release >> 6]
 
     def __str__(self) -> str:
@@ -230,7 +220,7 @@ class Version(_Value):
 
 
 class Capabilities:
-    """What the autopilot understands, a bool each (MAV_PROTOCOL_CAPABILITY); all False while it is not known."""
+    """Capabilities of the autopilot as bools (MAV_PROTOCOL_CAPABILITY); all False while unknown."""
 
     def __init__(self, capabilities: int | None) -> None:
         bits = capabilities or 0

@@ -1,4 +1,4 @@
-"""``CommonAction``: one action of many vehicles: each with its own end, and a policy for failures."""
+"""``FleetAction``: one action executed by several members at once, with a policy for failures."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.connection.bus import Bus
-from aerokit.connection.tasks import Background
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
     AerokitError,
     HeartbeatTimeout,
@@ -20,9 +20,9 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.fleets.events import PolicyCarriedOut, PolicyOrdered
+from aerokit.fleets.events import PolicyApplied, PolicyCompleted
 from aerokit.fleets.members import MemberState
-from aerokit.fleets.policy import Failure, FleetResult
+from aerokit.fleets.policy import FleetResult, MemberFailure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -30,104 +30,114 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
     from aerokit.fleets.members import Member
-    from aerokit.fleets.policy import PolicyOrder, Rules
+    from aerokit.fleets.policy import PolicyOrder, PolicyRules
     from aerokit.missions.mission import Mission
     from aerokit.vehicle.vehicle import Vehicle
 
-Act = "Callable[[Member], Awaitable[Any]]"
 
+class FleetAction:
+    """One run of an action.
 
-class CommonAction:
-    """Done once. ``is_safe``: it ends a flight (hold, land, return), so that nobody is stopped for another's failure.
-
-    ``holds_if_cancelled``: whether those that have done it already are told to hold, too, when it is cancelled.
+    Args:
+        context: of the fleet.
+        name: appears in results, events and errors.
+        members: those that are unavailable are skipped.
+        execute: called with each available member.
+        timeout: seconds for each member; None: no limit.
+        stagger_s: delay in seconds between the starts of consecutive members.
+        is_safe: the action ends a flight (hold, land, return): a failure does not stop the others.
+        holds_if_cancelled: on cancellation, members that have already finished hold, too.
     """
-
-    what: str
 
     def __init__(
         self,
-        crew: Crew,
-        what: str,
+        context: FleetContext,
+        name: str,
         members: Iterable[Member],
-        act: Callable[[Member], Awaitable[Any]],
+        execute: Callable[[Member], Awaitable[Any]],
         *,
         timeout: float | None = None,
         stagger_s: float | None = None,
         is_safe: bool = False,
         holds_if_cancelled: bool = True,
     ) -> None:
-        self._crew, self.what, self._act = crew, what, act
+        self.name: str = name
+        self._context, self._execute = context, execute
         self._timeout, self._stagger_s = timeout, stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
-        everybody = list(members)
-        for each in everybody:
-            each.look()
-        self._members = [each for each in everybody if each.takes_orders]
-        self._left_out = {
-            each.name: f"{each.state.value}: {each.why}" for each in everybody if not each.takes_orders
-        }
+        requested = list(members)
+        for member in requested:
+            member.refresh()
+        self._members = [member for member in requested if member.is_available]
+        self._skipped = {member.name: member.status for member in requested if not member.is_available}
         self._outcomes: dict[str, Any] = {}
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._orders: dict[str, PolicyOrder] = {}
-        self._because: tuple[int, str] | None = None
-        self._errors_of_orders: dict[str, str] = {}
-        self._obeying = 0
+        # System id and name of the member that failed first.
+        self._cause: tuple[int, str] | None = None
+        self._order_errors: dict[str, str] = {}
+        self._pending_orders = 0
         self._is_deciding = False
-        self._is_over = asyncio.Event()
-        self.mistake: Exception | None = None
-        """One of the program's function, or of its policy: ``run`` raises it at the end."""
+        self._finished = asyncio.Event()
+        # Raised by the program's function or by its policy function; `run` raises it at the end.
+        self.program_error: Exception | None = None
 
     async def run(self) -> FleetResult:
-        """Do it with all of them at once, and return when each has done it, failed, or was stopped."""
+        """Execute the action with all members concurrently, and return when each has finished, failed or stopped."""
         if not self._members:
-            return self.so_far()
-        tasks = Background(self._on_mistake)
-        self._crew.under_way.append(self)
+            return self.result_so_far()
+        tasks = BackgroundTasks(self._on_program_error)
+        self._context.actions.append(self)
         try:
             for number, member in enumerate(self._members):
                 tasks.start(
-                    partial(self._one, member, number * self._stagger_s), f"aerokit {self.what} {member.name}"
+                    partial(self._run_member, member, number * self._stagger_s),
+                    f"aerokit {self.name} {member.name}",
                 )
-            await self._is_over.wait()
+            await self._finished.wait()
         except BaseException:
             if self._holds_if_cancelled:
-                self._hold_the_finished()
+                self._hold_finished_members()
             raise
         finally:
-            self._crew.under_way.remove(self)
+            self._context.actions.remove(self)
             await tasks.aclose()
-        if self.mistake is not None:
-            self._hold_the_finished()
-            raise self.mistake
-        return self.so_far()
+        if self.program_error is not None:
+            self._hold_finished_members()
+            raise self.program_error
+        return self.result_so_far()
 
     @property
     def orders(self) -> dict[str, str]:
-        """What the policy has ordered, by member's name; empty: nobody has failed, or all go on."""
+        """Orders of the policy by member name; empty if no member failed, or the others continue."""
         return dict(self._orders)
 
     @property
-    def under_way(self) -> tuple[str, ...]:
-        """The names of those that are doing it just now."""
+    def active(self) -> tuple[str, ...]:
+        """The names of the members that are executing the action."""
         return tuple(
-            each.name
-            for each in self._members
-            if each.name in self._tasks and each.name not in (*self._failed, *self._stopped)
+            member.name
+            for member in self._members
+            if member.name in self._tasks and member.name not in (*self._failed, *self._stopped)
         )
 
-    def note_fallen_out(self, member: Member) -> None:
-        """It is lost, or somebody else has it."""
+    def result_so_far(self) -> FleetResult:
+        """Return the result of the members that have finished."""
+        names = [member.name for member in self._members]
+        in_order = {name: self._outcomes[name] for name in names if name in self._outcomes}
+        return FleetResult(self.name, in_order, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
+
+    def on_member_unavailable(self, member: Member) -> None:
         if member not in self._members or member.name in (*self._failed, *self._stopped):
             return
         kind = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
-        self._fail(member, kind(f"{self.what}: {member.name} is {member.state.value}: {member.why}"))
+        self._fail(member, kind(f"{self.name}: {member.name} is {member.status}"))
 
-    # ------------------------------------------------------------------------------------ one of them
+    # --------------------------------------------------------------------------------- one member
 
-    async def _one(self, member: Member, delay_s: float) -> None:
+    async def _run_member(self, member: Member, delay_s: float) -> None:
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
@@ -136,9 +146,9 @@ class CommonAction:
                 return
             if delay_s:
                 await anyio.sleep(delay_s)
-            if not member.takes_orders:
-                raise OperationRejected(f"{self.what}: {member.name} is {member.state.value}: {member.why}")
-            value = await self._limited(member)
+            if not member.is_available:
+                raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
+            value = await self._execute_in_time(member)
         except AerokitError as error:
             if member.name not in self._stopped:
                 self._fail(member, error)
@@ -148,233 +158,214 @@ class CommonAction:
         else:
             if member.name not in self._stopped and member.name not in self._failed:
                 self._outcomes[member.name] = value
-                member.note_done()
+                member.record_success()
         finally:
             del self._tasks[member.name]
-            self._look_whether_over()
+            self._check_finished()
 
-    async def _limited(self, member: Member) -> Any:
+    async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
-            return await self._act(member)
+            return await self._execute(member)
         with anyio.move_on_after(self._timeout):
-            return await self._act(member)
-        raise OperationTimeout(f"{self.what}: {member.name} has not done it within {self._timeout:g} s")
+            return await self._execute(member)
+        raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _fail(self, member: Member, error: Exception) -> None:
         if member.name in self._failed:
             return
         self._failed[member.name] = self._outcomes[member.name] = error
-        member.note_failed(self.what, error)
-        if self._is_safe or self._because is not None or self._is_deciding or self._crew.is_over:
+        member.record_failure(self.name, error)
+        if self._is_safe or self._cause is not None or self._is_deciding or self._context.is_closed:
             return
-        self._is_deciding = True  # who else has failed is only found out by looking at them
+        # Refreshing the other members below may make them fail, too; only the first failure applies the policy.
+        self._is_deciding = True
         try:
             self._apply_policy(member, error)
         finally:
             self._is_deciding = False
 
-    # ---------------------------------------------------------------------------------- the others
+    # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
-        for each in self._members:
-            each.look()
-        others = [each for each in self._members if each.name not in self._failed]
-        able = [each for each in others if each.takes_orders]
-        failure = Failure(failed.name, failed.group, self.what, error, tuple(each.name for each in able))
+        for member in self._members:
+            member.refresh()
+        others = [member for member in self._members if member.name not in self._failed]
+        available = [member for member in others if member.is_available]
+        failure = MemberFailure(failed.name, failed.group, self.name, error, tuple(member.name for member in available))
         orders: dict[str, PolicyOrder]
         try:
-            orders = self._crew.rules.decide(failure)
-        except Exception as mistake:  # of the program's function: in doubt nobody flies on
-            self.mistake = self.mistake or mistake
+            orders = self._context.rules.decide(failure)
+        except Exception as program_error:  # of the policy function: hold as the safe default
+            self.program_error = self.program_error or program_error
             orders = dict.fromkeys(failure.others, "hold")
         if not orders:
             return
-        self._because = (failed.vehicle.system_id, failed.name)
-        self._stop(failed)
-        left_alone = {each.name: each.why for each in others if not each.takes_orders}
-        for each in able:
-            order = orders.get(each.name)
+        self._cause = (failed.vehicle.system_id, failed.name)
+        self._cancel([failed])
+        skipped = {member.name: member.reason for member in others if not member.is_available}
+        for member in available:
+            order = orders.get(member.name)
             if order is None:
                 continue
-            if not each.is_flown_by_program:
-                is_disarmed = each.vehicle.is_surely_disarmed
-                left_alone[each.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
+            if not member.is_flown_by_program:
+                is_disarmed = member.vehicle.is_confirmed_disarmed
+                skipped[member.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
             else:
-                self._orders[each.name] = order
-            if each.name in self._orders or each.name not in self._outcomes:
-                self._note_stopped(each, failed, self._orders.get(each.name))
-        self._crew.tell(
-            PolicyOrdered(self._crew.now(), *self._because, self.what, dict(self._orders), left_alone)
-        )
-        self._obeying = len(self._orders)
-        for each in able:
-            if each.name in self._orders:
-                self._crew.background.start(
-                    partial(self._obey, each, self._orders[each.name]), f"aerokit policy {each.name}"
+                self._orders[member.name] = order
+            if member.name in self._orders or member.name not in self._outcomes:
+                self._set_stopped(member, failed, self._orders.get(member.name))
+        self._context.publish(PolicyApplied(self._context.now(), *self._cause, self.name, dict(self._orders), skipped))
+        self._pending_orders = len(self._orders)
+        for member in available:
+            if member.name in self._orders:
+                self._context.background.start(
+                    partial(self._send_order, member, self._orders[member.name]),
+                    f"aerokit policy {member.name}",
                 )
-        # what is under way ends after the order that overrules it is given: so it is no order of its own to hold
-        asyncio.get_running_loop().call_soon(self._stop_all, [each for each in able if each.name in orders])
+        # Cancel running actions only after the policy's orders are given: the orders overrule them, so that the
+        # cancelled actions do not send a hold of their own.
+        asyncio.get_running_loop().call_soon(self._cancel, [member for member in available if member.name in orders])
         if not self._orders:
-            self._told_carried_out()
+            self._publish_completed()
 
-    def _note_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
-        told = f"; it was told to {order}" if order else ""
-        error = OperationRejected(f"{self.what}: stopped because {failed.name} has failed{told}")
+    def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
+        ordered = f"; the policy ordered it to {order}" if order else ""
+        error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{ordered}")
         self._stopped[member.name] = self._outcomes[member.name] = error
 
-    def _stop_all(self, members: Iterable[Member]) -> None:
-        for each in members:
-            self._stop(each)
+    def _cancel(self, members: Iterable[Member]) -> None:
+        for member in members:
+            task = self._tasks.get(member.name)
+            if task is not None and task is not asyncio.current_task():
+                task.cancel()
 
-    def _stop(self, member: Member) -> None:
-        task = self._tasks.get(member.name)
-        if task is not None and task is not asyncio.current_task():
-            task.cancel()
-
-    async def _obey(self, member: Member, order: PolicyOrder) -> None:
+    async def _send_order(self, member: Member, order: PolicyOrder) -> None:
         try:
-            await _give(member, order)
+            if order == "land":
+                await member.vehicle.land()
+            elif order == "return":
+                await member.vehicle.return_to_launch()
+            else:
+                await member.vehicle.hold()
         except AerokitError as error:
-            self._errors_of_orders[member.name] = str(error)
-            member.look()
+            self._order_errors[member.name] = str(error)
+            member.refresh()
         finally:
-            self._obeying -= 1
-            if not self._obeying:
-                self._told_carried_out()
-                self._look_whether_over()
+            self._pending_orders -= 1
+            if not self._pending_orders:
+                self._publish_completed()
+                self._check_finished()
 
-    def _told_carried_out(self) -> None:
-        assert self._because is not None
-        self._crew.tell(
-            PolicyCarriedOut(
-                self._crew.now(), *self._because, self.what, dict(self._orders), dict(self._errors_of_orders)
-            )
+    def _publish_completed(self) -> None:
+        assert self._cause is not None
+        self._context.publish(
+            PolicyCompleted(self._context.now(), *self._cause, self.name, dict(self._orders), dict(self._order_errors))
         )
 
-    def _hold_the_finished(self) -> None:
-        """Those that are under way hold by the cancellation of their own action."""
-        for each in self._members:
+    def _hold_finished_members(self) -> None:
+        # Members that are still executing the action hold because their own action is cancelled.
+        for member in self._members:
             if (
-                each.is_flown_by_program
-                and each.name in self._outcomes
-                and each.name not in (*self._failed, *self._stopped)
+                member.is_flown_by_program
+                and member.name in self._outcomes
+                and member.name not in (*self._failed, *self._stopped)
             ):
-                self._crew.background.start(partial(_give_quietly, each), f"aerokit hold {each.name}")
+                self._context.hold(member, f"aerokit hold {member.name}")
 
-    # ---------------------------------------------------------------------------------------- inside
+    def _check_finished(self) -> None:
+        if not self._tasks and not self._pending_orders and len(self._outcomes) == len(self._members):
+            self._finished.set()
 
-    def _look_whether_over(self) -> None:
-        if not self._tasks and not self._obeying and len(self._outcomes) == len(self._members):
-            self._is_over.set()
-
-    def _on_mistake(self, error: Exception) -> None:
-        """Something else than an error of ours: a mistake in the program's function."""
-        self.mistake = self.mistake or error
-        self._is_over.set()
-
-    def so_far(self) -> FleetResult:
-        """What became of those that have come to their ends."""
-        names = [each.name for each in self._members]
-        in_order = {name: self._outcomes[name] for name in names if name in self._outcomes}
-        return FleetResult(
-            self.what, in_order, failed=self._failed, stopped=self._stopped, left_out=self._left_out
-        )
+    def _on_program_error(self, error: Exception) -> None:
+        self.program_error = self.program_error or error
+        self._finished.set()
 
 
-async def _give(member: Member, order: PolicyOrder) -> None:
-    vehicle = member.vehicle
-    if order == "land":
-        await vehicle.land()
-    elif order == "return":
-        await vehicle.return_to_launch()
-    else:
-        await vehicle.hold()
-
-
-async def _give_quietly(member: Member) -> None:
-    try:
-        await _give(member, "hold")
-    except AerokitError as error:
-        member.note_failed("hold", error)
-
-
-class Crew:
-    """Made for one block of a fleet, and over with it."""
+class FleetContext:
+    """State shared by the parts of one fleet. Lives as long as the ``async with aerokit.fleet(...)`` block."""
 
     def __init__(
         self,
         members: Iterable[Member],
         networks: Mapping[str, Connection],
-        rules: Rules,
+        rules: PolicyRules,
         now: Callable[[], float],
-        on_mistake: Callable[[Exception], None],
+        on_error: Callable[[Exception], None],
         min_distance_m: float | None = None,
     ) -> None:
-        self.members: dict[str, Member] = {each.name: each for each in members}
+        self.members: dict[str, Member] = {member.name: member for member in members}
         self.networks: dict[str, Connection] = dict(networks)
-        self.rules: Rules = rules
+        self.rules: PolicyRules = rules
         self.now: Callable[[], float] = now
         self.min_distance_m: float | None = min_distance_m
         self.bus: Bus = Bus()
-        self.background: Background = Background(on_mistake)
-        self.under_way: list[CommonAction] = []
-        self.missions: dict[str, Mission] = {}
-        """Those that all who were given one have taken."""
-        self.is_over: bool = False
+        self.background: BackgroundTasks = BackgroundTasks(on_error)
+        self.actions: list[FleetAction] = []
+        self.missions: dict[str, Mission] = {}  # of the last upload, once every member has accepted its mission
+        self.is_closed: bool = False
 
     def start(self) -> None:
-        """Begin to watch all members."""
-        for each in self.members.values():
-            each.watch(self.tell, self._on_fallen_out)
+        for member in self.members.values():
+            member.start_monitoring(self.publish, self._on_member_unavailable)
 
     async def aclose(self) -> None:
-        """Watch and order nobody any more."""
-        self.is_over = True
-        for each in self.members.values():
-            each.stop_watching()
+        self.is_closed = True
+        for member in self.members.values():
+            member.stop_monitoring()
         await self.background.aclose()
 
-    def tell(self, event: FleetEvent) -> None:
-        """Tell who listens."""
+    def publish(self, event: FleetEvent) -> None:
         self.bus.publish(event)
 
+    def hold(self, member: Member, task_name: str) -> None:
+        """Order a member to hold, in the background; a failure is recorded on the member."""
+
+        async def hold() -> None:
+            try:
+                await member.vehicle.hold()
+            except AerokitError as error:
+                member.record_failure("hold", error)
+
+        self.background.start(hold, task_name)
+
     def matching(self, *patterns: str) -> list[str]:
-        """The names of members that one of these names or patterns (``"north/*"``) means, each once.
+        """Return the names of members that match any of these names or patterns (``"north/*"``).
 
         Raises:
-            InvalidArgument: one of them means nobody.
+            InvalidArgument: a pattern matches no member.
         """
         found: dict[str, None] = {}
         for pattern in patterns:
             names = [name for name in self.members if name == pattern or fnmatchcase(name, pattern)]
             if not names:
                 raise InvalidArgument(
-                    f"{shown(pattern)} is no member of this fleet: {', '.join(self.members) or 'it is empty'}"
+                    f"no fleet member matches {short_repr(pattern)}; members: {', '.join(self.members) or 'none'}"
                 )
             found.update(dict.fromkeys(names))
         return list(found)
 
-    def _on_fallen_out(self, member: Member) -> None:
-        for each in tuple(self.under_way):
-            each.note_fallen_out(member)
+    def _on_member_unavailable(self, member: Member) -> None:
+        for action in tuple(self.actions):
+            action.on_member_unavailable(member)
 
 
-ENDS_FLIGHTS = ("hold", "land", "return_to_launch", "disarm", "mission.pause")
-"""Actions that end a flight: nobody is stopped in them because another one has failed."""
+# Actions that a failure of one member does not stop for the others.
+FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.pause")
 
-FLIES_NOBODY = ("arm", "wait_ready", "upload")
+# Actions after whose cancellation no member has to hold.
+ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
-class FleetPart:
-    """Some or all members of a fleet."""
+class SelectionBase:
+    """Members of a selection, and how it runs actions."""
 
-    def __init__(self, crew: Crew, names: tuple[str, ...] | None) -> None:
-        self._crew, self._names = crew, names
+    def __init__(self, context: FleetContext, names: tuple[str, ...] | None) -> None:
+        self._context, self._names = context, names
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Name → member, in the order in which they were named or heard."""
-        members = self._crew.members
+        """Name → member, in the order in which they were given or found."""
+        members = self._context.members
         return dict(members) if self._names is None else {name: members[name] for name in self._names}
 
     @property
@@ -390,22 +381,22 @@ class FleetPart:
 
     async def _run(
         self,
-        what: str,
-        act: Callable[[Member], Awaitable[Any]],
+        name: str,
+        execute: Callable[[Member], Awaitable[Any]],
         *,
         timeout: float | None = None,
         stagger_s: float | None = None,
         names: tuple[str, ...] | None = None,
     ) -> FleetResult:
-        members = [each for each in self if names is None or each.name in names]
-        is_safe = what in ENDS_FLIGHTS
-        return await CommonAction(
-            self._crew,
-            what,
+        members = [member for member in self if names is None or member.name in names]
+        is_safe = name in FLIGHT_ENDING_ACTIONS
+        return await FleetAction(
+            self._context,
+            name,
             members,
-            act,
+            execute,
             timeout=timeout,
             stagger_s=stagger_s,
             is_safe=is_safe,
-            holds_if_cancelled=not is_safe and what not in FLIES_NOBODY,
+            holds_if_cancelled=not is_safe and name not in ACTIONS_ON_GROUND,
         ).run()

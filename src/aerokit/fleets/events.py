@@ -1,4 +1,4 @@
-"""What happens to a fleet and its members: events, each with the member's name."""
+"""Events of a fleet and its members. Each has the member's name."""
 
 from __future__ import annotations
 
@@ -13,83 +13,83 @@ __all__ = [
     "FleetEvent",
     "FollowingStopped",
     "MemberBack",
+    "MemberEvent",
     "MemberFailed",
     "MemberLost",
-    "MemberTakenBack",
+    "MemberReclaimed",
     "MemberTakenOver",
-    "PathsDecided",
-    "PolicyCarriedOut",
-    "PolicyOrdered",
-    "StateTold",
-    "Told",
+    "PathsCompared",
+    "PolicyApplied",
+    "PolicyCompleted",
+    "StateUpdate",
     "TooClose",
 ]
 
 
 class FleetEvent(Event):
-    """Something happened to ``member``; ``at`` is the loop's clock, ``system_id`` the member's."""
+    """Base class. ``at`` is the time on the event loop's clock, ``system_id`` the system id of ``member``."""
 
     member: str
 
 
-class Told(FleetEvent):
-    """An event of one vehicle, as :class:`aerokit.Vehicle` gives it; ``member`` is the network when it is the link's.
+class MemberEvent(FleetEvent):
+    """An event of one vehicle, such as ``ModeChanged``, ``StatusTextReceived`` or ``LinkReport``.
 
-    Such as ``ModeChanged``, ``StatusTextReceived``, ``LinkReport``.
+    For an event of a link ``member`` is the name of the network.
     """
 
     event: Event
 
 
-class StateTold(FleetEvent):
-    """A vehicle has told one of its states: ``state`` as in docs/states.md, and the ``value``."""
+class StateUpdate(FleetEvent):
+    """A new ``value`` of one state of a vehicle. docs/states.md lists the names of states."""
 
     state: str
     value: Any
 
 
 class MemberLost(FleetEvent):
-    """A member is not heard any more: its heartbeats have stopped, or its link has gone."""
+    """A member is lost: its heartbeats stopped, or its link closed."""
 
-    why: str
+    reason: str
 
 
 class MemberBack(FleetEvent):
-    """A member that was lost is heard again, and nobody else has taken it meanwhile."""
+    """A lost member is back after ``away_s`` seconds, and still under this program's control."""
 
     away_s: float
 
 
 class MemberTakenOver(FleetEvent):
-    """A pilot, a failsafe or another program has taken a member: nothing is ordered of it until ``take_back``."""
+    """A pilot, a failsafe or another program controls the member. The fleet sends it no orders until ``reclaim``."""
 
-    why: str
+    reason: str
 
 
-class MemberTakenBack(FleetEvent):
-    """The program has taken a member back into the fleet."""
+class MemberReclaimed(FleetEvent):
+    """The program called ``reclaim`` for the member."""
 
 
 class MemberFailed(FleetEvent):
-    """A member did not do its part in ``action``: a refusal, a time-out, a lost link, somebody else at the helm."""
+    """A member failed in ``action``: it refused, timed out, was lost or was taken over."""
 
     action: str
     error: str
 
 
-class PolicyOrdered(FleetEvent):
-    """``member`` has failed in ``action``, and these are ordered for it: name → ``"hold"``, ``"land"`` or ``"return"``.
+class PolicyApplied(FleetEvent):
+    """``member`` failed in ``action``, and the policy sends ``orders`` to others.
 
-    ``left_alone`` are the others, and why nothing is ordered of them.
+    ``orders`` maps names to ``"hold"``, ``"land"`` or ``"return"``; ``skipped`` maps the rest to the reason.
     """
 
     action: str
     orders: dict[str, str]
-    left_alone: dict[str, str]
+    skipped: dict[str, str]
 
 
-class PolicyCarriedOut(FleetEvent):
-    """What was ordered because ``member`` failed is done; ``errors`` has those who did not do it, and why."""
+class PolicyCompleted(FleetEvent):
+    """The orders that followed the failure of ``member`` are done; ``errors`` maps members to their errors."""
 
     action: str
     orders: dict[str, str]
@@ -97,25 +97,24 @@ class PolicyCarriedOut(FleetEvent):
 
 
 class FollowingStopped(FleetEvent):
-    """The leader, ``member``, is not followed any more: ``why``, and what is ordered of the followers.
+    """Following the leader, ``member``, ended before its block did.
 
-    ``orders``: name → ``"hold"``, ``"land"`` or ``"return"``. ``left_alone`` are the others, and why nothing is ordered
-    of them. Leaving the block is no such event.
+    ``orders`` and ``skipped`` are as in :class:`PolicyApplied`.
     """
 
-    why: str
+    reason: str
     orders: dict[str, str]
-    left_alone: dict[str, str]
+    skipped: dict[str, str]
 
 
-class PathsDecided(FleetEvent):
-    """Ways were compared before they are flown, of several members: ``member`` is empty; ``decided`` says how."""
+class PathsCompared(FleetEvent):
+    """The paths of several members were compared before flight. ``member`` is empty."""
 
-    decided: Deconfliction
+    deconfliction: Deconfliction
 
 
 class TooClose(FleetEvent):
-    """``member`` and ``other`` are nearer to each other than the fleet allows; ``ordered`` are those told to hold."""
+    """``member`` and ``other`` are closer than the fleet's minimum distance; ``ordered`` are those ordered to hold."""
 
     other: str
     distance_m: float

@@ -1,65 +1,64 @@
-"""``Fleet``: all vehicles of one or several networks as one."""
+"""``Fleet`` and ``Selection``: the API of all or some members."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.connection.bus import Overflow, Subscription
 from aerokit.errors import InvalidArgument
 from aerokit.events import Event
 from aerokit.fleets.actions import Actions, fragments, rtcm_messages
-from aerokit.fleets.events import FleetEvent, StateTold, Told
-from aerokit.fleets.formations import Formations
-from aerokit.fleets.missions import Missions
-from aerokit.fleets.shows.flying import Shows
+from aerokit.fleets.events import FleetEvent, MemberEvent, StateUpdate
+from aerokit.fleets.formation import Formations
+from aerokit.fleets.show_flight import Shows
+from aerokit.fleets.travel import Missions
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach, Sink
-    from aerokit.fleets.action import Crew
+    from aerokit.fleets.action import FleetContext
 
 __all__ = ["Fleet", "Selection"]
 
 
 @checks_arguments
 class Selection(Actions, Missions, Formations, Shows):
-    """Members that are ordered something in common: ``fleet``, ``fleet.group("alpha")``, ``fleet["north/*"]``.
+    """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action goes to all of them at once that take part at that moment (not lost, not taken over), and returns a
-    :class:`FleetResult` when each has come to its own end. When one fails, the others are told what the fleet's policy
-    says, and the action ends when they have done that. Cancelled, all of them hold at once.
+    Every action goes to all available members at once (not lost, taken over or released), and returns a
+    :class:`FleetResult` when each of them is done. If one fails, the fleet's policy decides what the others do, and the
+    action ends when they have done it. If the action is cancelled, all of them hold.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
-        found = self._crew.matching(pattern)
-        return Selection(self._crew, tuple(name for name in found if name in self.members))
+        found = self._context.matching(pattern)
+        return Selection(self._context, tuple(name for name in found if name in self.members))
 
     def group(self, name: str) -> Selection:
-        """Those of one group.
+        """Select the members of one group.
 
         Raises:
             InvalidArgument: there is no such group.
         """
-        return self._those("group", name)
+        return self._select("group", name)
 
     def role(self, name: str) -> Selection:
-        """Those with one role.
+        """Select the members with one role.
 
         Raises:
-            InvalidArgument: nobody has it.
+            InvalidArgument: no member has this role.
         """
-        return self._those("role", name)
+        return self._select("role", name)
 
-    def _those(self, what: str, name: str) -> Selection:
-        found = tuple(each.name for each in self if getattr(each, what) == name)
+    def _select(self, attribute: str, name: str) -> Selection:
+        found = tuple(member.name for member in self if getattr(member, attribute) == name)
         if not found:
-            there = dict.fromkeys(getattr(each, what) for each in self if getattr(each, what))
-            those = f"the {what}s are {', '.join(there)}" if there else f"there are no {what}s"
-            raise InvalidArgument(f"{what} = {shown(name)} is not allowed: {those}")
-        return Selection(self._crew, found)
+            values = dict.fromkeys(getattr(member, attribute) for member in self if getattr(member, attribute))
+            known = f"the {attribute}s are {', '.join(values)}" if values else f"there are no {attribute}s"
+            raise InvalidArgument(f"{attribute} = {short_repr(name)} is not allowed: {known}")
+        return Selection(self._context, found)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {len(self)}: {', '.join(self.members)}>"
@@ -67,47 +66,54 @@ class Selection(Actions, Missions, Formations, Shows):
 
 @checks_arguments
 class Fleet(Selection):
-    """Made by :func:`aerokit.fleet`, for the time of its block. A selection of all, and what only the whole has."""
+    """All members, as yielded by :func:`aerokit.fleet`. Usable inside its block only."""
 
-    def __init__(self, crew: Crew) -> None:
-        super().__init__(crew, None)
+    def __init__(self, context: FleetContext) -> None:
+        super().__init__(context, None)
         self._rtcm_sequence = 0
 
     def __contains__(self, name: object) -> bool:
-        return name in self._crew.members
+        return name in self._context.members
 
-    def take_back(self, name: str) -> None:
-        """Order a member again that a pilot, a failsafe or another program had taken over, or that was let go.
+    def reclaim(self, name: str) -> None:
+        """Make members available again that were taken over or released.
 
-        Nothing is sent: the next action goes to it, too. **Ask the pilot first.**
+        Sends nothing; the next action includes them. **Ask the pilot first.**
 
-        Raises:
-            InvalidArgument: there is no such member.
-        """
-        for each in self._crew.matching(name):
-            self._crew.members[each].take_back()
-
-    def let_go(self, name: str, why: str = "the program let it go") -> None:
-        """Order a member nothing any more, until :meth:`take_back`. Nothing is sent: it goes on with what it does.
+        Args:
+            name: a member's name or a pattern.
 
         Raises:
-            InvalidArgument: there is no such member.
+            InvalidArgument: no member matches.
         """
-        for each in self._crew.matching(name):
-            self._crew.members[each].leave(why)
+        for member in self._context.matching(name):
+            self._context.members[member].reclaim()
+
+    def release(self, name: str, reason: str = "released by the program") -> None:
+        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they do.
+
+        Args:
+            name: a member's name or a pattern.
+            reason: appears in ``Member.reason`` and in results.
+
+        Raises:
+            InvalidArgument: no member matches.
+        """
+        for member in self._context.matching(name):
+            self._context.members[member].release(reason)
 
     def send_corrections(self, rtcm: bytes) -> int:
-        """Send RTCM corrections (RTK, DGPS) to all of them: once for each link, whoever is on it (GPS_RTCM_DATA).
+        """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
             rtcm: one or more RTCM 3 messages, each of 720 bytes at most.
 
         Returns:
-            How many messages were sent on each link.
+            The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: one is longer, or there is none. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended; the others before it have got them.
+            InvalidArgument: a message is longer, or ``rtcm`` is empty. Nothing was sent.
+            ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         pieces = [
             piece
@@ -115,8 +121,8 @@ class Fleet(Selection):
             for piece in fragments(message, number)
         ]
         self._rtcm_sequence += len({piece.flags >> 3 for piece in pieces})
-        links = {id(each): each for each in self._crew.networks.values()}
-        for connection in links.values():
+        connections = {id(connection): connection for connection in self._context.networks.values()}
+        for connection in connections.values():
             for piece in pieces:
                 connection.send(piece)
         return len(pieces)
@@ -129,26 +135,26 @@ class Fleet(Selection):
         capacity: int = 1000,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[FleetEvent]:
-        """One stream of what happens to all of them, for use in a ``with`` block.
+        """Subscribe to events of the fleet and its vehicles; use it in a ``with`` block.
 
         Args:
-            *types: events of the fleet (``MemberLost``, ``PolicyCarriedOut`` …), and of vehicles (``ModeChanged`` …),
-                which come as :class:`Told` with the member's name. None: all of both.
-            capacity: how many may wait to be read.
-            overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
+            *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …). The
+                latter arrive as :class:`MemberEvent` with the member's name. None: all of both.
+            capacity: maximum number of unread events.
+            overflow: what happens to an event that exceeds the capacity; ``missed`` of the stream counts them.
 
         Raises:
-            InvalidArgument: a type is no event.
+            InvalidArgument: a type is not an event.
         """
         wanted: tuple[type[Event], ...] = types or (FleetEvent, Event)
 
         def attach(sink: Sink) -> list[Detach]:
             detach: list[Detach] = []
-            for each in wanted:
-                if issubclass(each, FleetEvent):
-                    detach.append(self._crew.bus.attach_event(each, sink))
-                if each is Told or not issubclass(each, FleetEvent):
-                    detach += self._attach_told(Event if each is Told else each, sink)
+            for kind in wanted:
+                if issubclass(kind, FleetEvent):
+                    detach.append(self._context.bus.attach_event(kind, sink))
+                if kind is MemberEvent or not issubclass(kind, FleetEvent):
+                    detach += self._attach_member_events(Event if kind is MemberEvent else kind, sink)
             return detach
 
         return Subscription(attach, capacity=capacity, overflow=overflow)
@@ -159,53 +165,46 @@ class Fleet(Selection):
         every_arrival: bool = False,
         capacity: int = 10_000,
         overflow: Overflow = "drop_oldest",
-    ) -> Subscription[StateTold]:
-        """One stream of states of all of them, for use in a ``with`` block.
+    ) -> Subscription[StateUpdate]:
+        """Subscribe to states of all members; use it in a ``with`` block.
 
         Args:
-            *names: of docs/states.md: ``"position"``, ``"batteries"`` …
-            every_arrival: also what is told again without having changed.
-            capacity: how many may wait to be read.
-            overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
+            *names: names of docs/states.md: ``"position"``, ``"batteries"`` …
+            every_arrival: also report values that arrive unchanged.
+            capacity: maximum number of unread updates.
+            overflow: what happens to an update that exceeds the capacity; ``missed`` of the stream counts them.
 
         Raises:
-            InvalidArgument: there is no such state, or none is named.
+            InvalidArgument: a name is unknown, or none is given.
         """
         for member in self:
             for name in names or ("",):
                 if name not in member.vehicle.telemetry.cells:
-                    raise InvalidArgument(f"names: {shown(name)} is no state; docs/states.md has them")
+                    raise InvalidArgument(f"names: {short_repr(name)} is not a state; docs/states.md lists them")
 
         def attach(sink: Sink) -> list[Detach]:
-            detach: list[Detach] = []
-            for member in self:
-                for name in names:
-                    tell = partial(
-                        _tell_state, sink, self._crew.now, member.name, member.vehicle.system_id, name
-                    )
-                    cell = member.vehicle.telemetry.cells[name]
-                    detach.append(cell.observe(tell, every_arrival=every_arrival))
-            return detach
+            def publish(member_name: str, system_id: int, state: str, _: object, value: object) -> None:
+                sink(StateUpdate(self._context.now(), system_id, member_name, state, value))
+
+            return [
+                member.vehicle.telemetry.cells[name].observe(
+                    partial(publish, member.name, member.vehicle.system_id, name), every_arrival=every_arrival
+                )
+                for member in self
+                for name in names
+            ]
 
         return Subscription(attach, capacity=capacity, overflow=overflow)
 
-    def _attach_told(self, kind: type[Event], sink: Sink) -> list[Detach]:
-        names = {
-            (member.network, member.vehicle.system_id): member.name for member in self._crew.members.values()
-        }
+    def _attach_member_events(self, kind: type[Event], sink: Sink) -> list[Detach]:
+        names = {(member.network, member.vehicle.system_id): member.name for member in self._context.members.values()}
 
-        def tell(network: str, event: Event) -> None:
+        def publish(network: str, event: Event) -> None:
             member = names.get((network, event.system_id)) if event.system_id else network
             if member is not None:
-                sink(Told(event.at, event.system_id, member, event))
+                sink(MemberEvent(event.at, event.system_id, member, event))
 
         return [
-            connection.bus.attach_event(kind, partial(tell, network))
-            for network, connection in self._crew.networks.items()
+            connection.bus.attach_event(kind, partial(publish, network))
+            for network, connection in self._context.networks.items()
         ]
-
-
-def _tell_state(
-    sink: Sink, now: Callable[[], float], member: str, system_id: int, name: str, _: Any, value: Any
-) -> None:
-    sink(StateTold(now(), system_id, member, name, value))

@@ -1,31 +1,59 @@
-"""``Formation``: who flies where, as seen from a leader. Without IO."""
+"""Formations: positions relative to a leader, flown once (``form``) or kept while it moves (``following``)."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
+import anyio
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit.errors import InvalidArgument
+from aerokit.connection.tasks import BackgroundTasks
+from aerokit.errors import (
+    BusyError,
+    InvalidArgument,
+    OperationRejected,
+    SetpointStreamStopped,
+    ValueUnknownError,
+)
+from aerokit.fleets.action import FleetAction
+from aerokit.fleets.distances import altitude_amsl, position_of
+from aerokit.fleets.events import FollowingStopped
+from aerokit.fleets.members import Member
+from aerokit.fleets.policy import FleetResult
+from aerokit.fleets.separation import to_local_points
+from aerokit.fleets.travel import Travel
+from aerokit.position import Position
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from typing_extensions import Self
 
-__all__ = ["Formation", "Offset", "follow_velocity"]
+    from aerokit.fleets.action import FleetContext
+
+__all__ = ["Following", "Formation", "Formations", "Offset", "follow_velocity"]
+
+LEADER_MAX_AGE_S = 1.5
+
+# Speed per metre of distance to the own place, in 1/s.
+FOLLOW_GAIN = 0.6
 
 
 class Offset(Snapshot):
-    """Metres from the leader: north and east, or ahead and right of it, and up."""
+    """Offset from the leader in metres: north (or ahead), east (or right) and up."""
 
     north_m: float = 0.0
     east_m: float = 0.0
     up_m: float = 0.0
 
     def turned(self, heading_deg: float) -> Offset:
-        """The same as north and east, where it was ahead and right of somebody with this heading."""
+        """Convert from ahead and right of a vehicle with this heading to north and east."""
         angle = math.radians(heading_deg)
         return Offset(
             self.north_m * math.cos(angle) - self.east_m * math.sin(angle),
@@ -40,46 +68,40 @@ class Offset(Snapshot):
 
 
 class Formation(Snapshot):
-    """Member's name → its place; ``frame`` ``"north"``: metres north and east, ``"heading"``: ahead and right."""
+    """Maps member names to offsets. ``frame`` is ``"north"`` (north and east) or ``"heading"`` (ahead and right)."""
 
     offsets: Mapping[str, Offset]
     frame: Literal["north", "heading"] = "north"
 
     @classmethod
-    def line(
-        cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading"
-    ) -> Self:
-        """One behind the other, ``spacing_m`` metres apart."""
+    def line(cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading") -> Self:
+        """Make a line behind the leader, with ``spacing_m`` metres between neighbours."""
         return cls({name: Offset(-spacing_m * number, 0.0) for number, name in enumerate(names, 1)}, frame)
 
     @classmethod
-    def wedge(
-        cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading"
-    ) -> Self:
-        """Behind the leader to the left and the right in turn, as geese fly; ``spacing_m`` back and aside each."""
+    def wedge(cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading") -> Self:
+        """Make a V behind the leader, alternating left and right; each row is ``spacing_m`` farther back and out."""
         places = {
-            name: Offset(
-                -spacing_m * (number // 2 + 1), spacing_m * (number // 2 + 1) * (1 if number % 2 else -1)
-            )
+            name: Offset(-spacing_m * (number // 2 + 1), spacing_m * (number // 2 + 1) * (1 if number % 2 else -1))
             for number, name in enumerate(names)
         }
         return cls(places, frame)
 
     def offset_of(self, name: str, heading_deg: float | None) -> Offset:
-        """Its place as metres north, east and up of the leader.
+        """Return the offset of a member as metres north, east and up of the leader.
 
         Raises:
-            InvalidArgument: the leader's heading is needed and not known.
+            InvalidArgument: the leader's heading is needed and unknown.
         """
         offset = self.offsets[name]
         if self.frame == "north":
             return offset
         if heading_deg is None:
-            raise InvalidArgument("frame = 'heading' needs the leader's heading, and it is not known")
+            raise InvalidArgument("frame = 'heading' needs the leader's heading, which is unknown")
         return offset.turned(heading_deg)
 
-    def least_distance_m(self) -> float:
-        """Between any two places, the leader's among them."""
+    def min_distance_m(self) -> float:
+        """Return the smallest distance between any two places, including the leader's."""
         places = [(each.north_m, each.east_m, each.up_m) for each in (Offset(), *self.offsets.values())]
         pairs = (math.dist(one, other) for number, one in enumerate(places) for other in places[:number])
         return min(pairs, default=math.inf)
@@ -100,15 +122,265 @@ def follow_velocity(
     gain: float,
     max_speed_m_s: float,
 ) -> tuple[float, float, float]:
-    """How fast to fly to come to a place that moves: its velocity, and ``gain`` of the way that is left each second.
+    """Return the velocity to reach a moving target: its velocity plus ``gain`` times the distance vector.
 
     Args:
-        to_go: metres to the place, each way.
-        of_target: its velocity in m/s.
+        to_go: distance vector to the target in metres.
+        of_target: velocity of the target in m/s.
         gain: 1/s.
-        max_speed_m_s: of all three together.
+        max_speed_m_s: limit of the resulting speed.
     """
-    wanted = [v + gain * d for v, d in zip(of_target, to_go, strict=True)]
-    speed = math.hypot(*wanted)
-    share = 1.0 if speed <= max_speed_m_s else max_speed_m_s / speed
-    return wanted[0] * share, wanted[1] * share, wanted[2] * share
+    velocity = [v + gain * d for v, d in zip(of_target, to_go, strict=True)]
+    speed = math.hypot(*velocity)
+    scale = 1.0 if speed <= max_speed_m_s else max_speed_m_s / speed
+    return velocity[0] * scale, velocity[1] * scale, velocity[2] * scale
+
+
+@checks_arguments
+class Following:
+    """Keeps followers at their places while its ``async with`` block runs. Leaving the block makes them hold.
+
+    Following stops early if the leader is lost or taken over, or if the fleet's policy stops it because a follower
+    failed. Then :class:`FollowingStopped` is published and ``wait_stopped`` returns. The block continues to run;
+    ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
+    """
+
+    def __init__(
+        self,
+        context: FleetContext,
+        leader: Member,
+        followers: list[Member],
+        formation: Formation,
+        rate_hz: float,
+        max_speed_m_s: float,
+    ) -> None:
+        self._context, self._leader, self._followers, self._formation = context, leader, followers, formation
+        self._period_s, self._rate_hz, self._max_speed_m_s = 1 / rate_hz, rate_hz, max_speed_m_s
+        self._tasks = BackgroundTasks(self._on_error)
+        self._ended = asyncio.Event()
+        self._was_entered = self._was_raised = False
+        self._reason = ""
+
+    @property
+    def is_running(self) -> bool:
+        """True while the followers follow."""
+        return self._was_entered and not self._ended.is_set()
+
+    @property
+    def reason(self) -> str:
+        """Reason for an early stop; empty if there was none."""
+        return self._reason
+
+    def error_m(self, name: str) -> float:
+        """Return the distance of a follower from its place in metres; infinite if unknown."""
+        member = next((each for each in self._followers if each.name == name), None)
+        try:
+            return math.inf if member is None else math.hypot(*self._to_go(member))
+        except (ValueUnknownError, OperationRejected):
+            return math.inf
+
+    async def wait_stopped(self) -> str:
+        """Wait for an early stop and return its reason; an empty string after the block has ended."""
+        await self._ended.wait()
+        return self._reason
+
+    def raise_if_stopped(self) -> None:
+        """Raise if following has stopped early. For loops in the block.
+
+        Raises:
+            SetpointStreamStopped: it has stopped; the text has the reason.
+        """
+        if self._reason:
+            self._was_raised = True
+            raise SetpointStreamStopped(f"following has stopped: {self._reason}")
+
+    async def __aenter__(self) -> Self:
+        if self._was_entered:
+            raise BusyError("a Following can be entered only once; call following() again")
+        self._was_entered = True
+        self._check_leader()
+        self._action = FleetAction(self._context, "following", self._followers, self._fly)
+        self._tasks.start(self._follow, "aerokit following")
+        return self
+
+    async def __aexit__(self, exc_type: object, exc: object, traceback: object) -> None:
+        self._ended.set()
+        await self._tasks.aclose()
+        if exc is None and not self._was_raised:
+            self.raise_if_stopped()
+
+    # --------------------------------------------------------------------------------------- private
+
+    async def _follow(self) -> None:
+        await self._action.run()
+        self._stop_if_no_followers()
+
+    async def _fly(self, member: Member) -> None:
+        try:
+            async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
+                while not self._stop_if_leader_lost():
+                    stream.set(self._setpoint(member))
+                    await anyio.sleep(self._period_s)
+                # Wait for the cancellation by `_stop_if_leader_lost`: leaving the stream then makes the vehicle hold.
+                await asyncio.Event().wait()
+        finally:
+            # Soon rather than at the end of the action: the policy may still land the others. Not now: the action has
+            # yet to record the failure.
+            asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
+
+    def _stop_if_no_followers(self) -> None:
+        if not self._action.active and self._action.program_error is None:
+            result = self._action.result_so_far()
+            failed = {name: str(error) for name, error in result.failed.items()}
+            reason = "; ".join(f"{name}: {error}" for name, error in failed.items())
+            self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
+
+    def _stop_if_leader_lost(self) -> bool:
+        if not self._ended.is_set():
+            try:
+                self._check_leader()
+                position_of(self._leader, LEADER_MAX_AGE_S)
+            except (OperationRejected, ValueUnknownError) as error:
+                following = self._action.active  # they hold because their streams are cancelled below
+                skipped = {
+                    member.name: member.status if member.reason else "it does not follow"
+                    for member in self._followers
+                    if member.name not in following
+                }
+                self._stop(str(error), dict.fromkeys(following, "hold"), skipped)
+                self._tasks.cancel()
+        return self._ended.is_set()
+
+    def _setpoint(self, member: Member) -> VelocitySetpoint:
+        moving = self._leader.vehicle.velocity.latest
+        target = (0.0, 0.0, 0.0) if moving is None else (moving.north_m_s, moving.east_m_s, -moving.down_m_s)
+        north, east, up = follow_velocity(
+            self._to_go(member), target, gain=FOLLOW_GAIN, max_speed_m_s=self._max_speed_m_s
+        )
+        return VelocitySetpoint(north, east, -up)
+
+    def _to_go(self, member: Member) -> tuple[float, float, float]:
+        """Return metres north, east and up to the member's place, with both positions extrapolated to now."""
+        leader, vehicle = self._leader.vehicle, member.vehicle
+        there, here = position_of(self._leader, LEADER_MAX_AGE_S), position_of(member, LEADER_MAX_AGE_S)
+        points = to_local_points(
+            {
+                "there": (there.latitude_deg, there.longitude_deg, altitude_amsl(self._leader, there)),
+                "here": (here.latitude_deg, here.longitude_deg, altitude_amsl(member, here)),
+            }
+        )
+        offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
+        to_go = [
+            points["there"][i] - points["here"][i] + each
+            for i, each in enumerate((offset.north_m, offset.east_m, offset.up_m))
+        ]
+        for source, sign in ((leader, 1.0), (vehicle, -1.0)):
+            moving = source.velocity.latest
+            if moving is not None:
+                age = sign * source.position.age
+                to_go[0] += age * moving.north_m_s
+                to_go[1] += age * moving.east_m_s
+                to_go[2] -= age * moving.down_m_s
+        return to_go[0], to_go[1], to_go[2]
+
+    def _check_leader(self) -> None:
+        self._leader.refresh()
+        if not self._leader.is_available:
+            raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
+
+    def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
+        if self._ended.is_set():
+            return
+        self._reason = reason
+        self._ended.set()
+        leader = self._leader
+        event = FollowingStopped(
+            self._context.now(), leader.vehicle.system_id, leader.name, reason, dict(orders), dict(skipped)
+        )
+        self._context.publish(event)
+
+    def _on_error(self, error: Exception) -> None:
+        holding = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
+        self._stop(str(error) or type(error).__name__, self._action.orders or holding, {})
+
+
+@checks_arguments
+class Formations(Travel):
+    """Positions relative to a leader."""
+
+    async def form(
+        self,
+        formation: Formation,
+        *,
+        leader: str,
+        speed_m_s: float | None = None,
+        timeout: float | None = None,
+    ) -> FleetResult:
+        """Fly each follower to its place around the leader, which stays where it is; see :meth:`go_to`.
+
+        Args:
+            formation: the places.
+            leader: name of the leading member; it has no offset in the formation.
+            speed_m_s: ground speed; None: unchanged.
+            timeout: seconds for each member and leg; None: no limit.
+
+        Raises:
+            InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
+            OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
+            ValueUnknownError: the position of the leader or of a follower is unknown.
+        """
+        member, followers = self._leader_and_followers(formation, leader)
+        here, heading = position_of(member), member.vehicle.heading_deg.latest
+        targets: dict[str, Position] = {}
+        for follower in followers:
+            offset = formation.offset_of(follower.name, heading)
+            there = here.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
+            # Above sea level, because the homes of the followers may be at other altitudes than the leader's.
+            targets[follower.name] = (
+                there
+                if there.altitude_amsl_m is None
+                else Position(there.latitude_deg, there.longitude_deg, altitude_amsl_m=there.altitude_amsl_m)
+            )
+        if speed_m_s is not None:
+            check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
+        return await self._travel("form", targets, speed_m_s, timeout)
+
+    def following(
+        self, formation: Formation, *, leader: str, rate_hz: float = 5.0, max_speed_m_s: float = 10.0
+    ) -> Following:
+        """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
+
+        Each follower is flown by velocity set-points. If the leader is lost or taken over, the followers hold. If a
+        follower fails, the fleet's policy decides about the others.
+
+        Args:
+            formation: the places.
+            leader: name of the leading member; your program flies it, for example in the block.
+            rate_hz: set-points per second, 2 to 50.
+            max_speed_m_s: maximum speed of the followers in m/s.
+
+        Raises:
+            InvalidArgument: a name is unknown, or an argument is out of range.
+            OperationRejected: the leader is unavailable.
+        """
+        check_range("rate_hz", rate_hz, 2, 50)
+        check_range("max_speed_m_s", max_speed_m_s, 0, 100, above=True)
+        member, followers = self._leader_and_followers(formation, leader)
+        return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
+
+    def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
+        for name in (leader, *formation.offsets):
+            if name not in self.members:
+                raise InvalidArgument(f"formation: {short_repr(name)} is not one of {', '.join(self.members)}")
+        if leader in formation.offsets:
+            raise InvalidArgument(f"formation: {leader!r} is the leader and cannot have an offset")
+        min_m, closest_m = self._context.min_distance_m, formation.min_distance_m()
+        if min_m is not None and closest_m < min_m:
+            raise InvalidArgument(
+                f"formation: two places are {closest_m:.1f} m apart; the minimum of this fleet is {min_m:g} m"
+            )
+        member = self.members[leader]
+        member.refresh()
+        if not member.is_available:
+            raise OperationRejected(f"the leader {leader} is {member.status}")
+        return member, [self.members[name] for name in formation.offsets]

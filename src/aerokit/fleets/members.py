@@ -1,281 +1,203 @@
-"""``Member``: one vehicle of a fleet, and how it stands with it."""
+"""``Member``: one vehicle of a fleet, and its state in the fleet."""
 
 from __future__ import annotations
 
 import asyncio
 import enum
-from functools import partial
 from typing import TYPE_CHECKING
 
-from aerokit.connection.tasks import Background, to_its_end
-from aerokit.events import VehicleBack, VehicleSilent
-from aerokit.fleets.events import MemberBack, MemberFailed, MemberLost, MemberTakenBack, MemberTakenOver
-from aerokit.fleets.finding import telling_who_is_missing
+from aerokit.events import VehicleRecovered, VehicleSilent
+from aerokit.fleets.events import MemberBack, MemberFailed, MemberLost, MemberReclaimed, MemberTakenOver
 from aerokit.mavlink.enums import MavState
 from aerokit.vehicle.commanding.order import FAILSAFE_STATES, is_worse
-from aerokit.vehicle.connect import connect
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-    from types import TracebackType
-    from typing import Any
+    from collections.abc import Callable
 
     from aerokit.connection.bus import Detach
-    from aerokit.connection.connection import Connection
     from aerokit.fleets.events import FleetEvent
-    from aerokit.mavlink.message import Message
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["Keepers", "Member", "MemberState"]
+__all__ = ["Member", "MemberState"]
 
 
 class MemberState(enum.Enum):
-    """How it stands with a member."""
+    """State of a member in its fleet."""
 
-    IN = "in"
-    """It takes part."""
+    ACTIVE = "active"
+    """It takes part in actions."""
     LOST = "lost"
-    """It is not heard: nothing is ordered of it until it is heard again."""
+    """Its heartbeats stopped or its link closed. The fleet sends it no orders until it is back."""
     TAKEN_OVER = "taken over"
-    """A pilot, a failsafe or another program has it: nothing is ordered of it until ``take_back``."""
+    """A pilot, a failsafe or another program controls it. The fleet sends it no orders until ``reclaim``."""
     FAILED = "failed"
-    """It has not done what was ordered last; it takes part in what is ordered next."""
-    LEFT = "left"
-    """The program has let it go: nothing is ordered of it until ``take_back``."""
+    """It failed in its last action. It takes part in the next one."""
+    RELEASED = "released"
+    """The program released it. The fleet sends it no orders until ``reclaim``."""
 
 
 class Member:
-    """One vehicle of a fleet. ``why`` says in words how it came to its ``state``."""
+    """One vehicle of a fleet."""
 
     def __init__(self, name: str, network: str, vehicle: Vehicle, *, group: str = "", role: str = "") -> None:
         self.name: str = name
-        """Unique in the fleet: ``"north/7"``, or as the program has called it."""
+        """Unique name in the fleet: ``"north/7"``, or a name given by the program."""
         self.network: str = network
-        """The name of the connection that it is on."""
+        """The name of its network."""
         self.vehicle: Vehicle = vehicle
-        """For all that is not done in common."""
+        """The vehicle object, for anything that the fleet does not do."""
         self.group: str = group
-        """The group that it is in; empty: none."""
+        """The group that it is in, or an empty string."""
         self.role: str = role
-        """What it does in it, in the program's words; empty: none."""
-        self.state: MemberState = MemberState.IN
-        """How it stands with it."""
-        self.why: str = ""
-        """How it came to that, in words; empty while it is IN."""
+        """Its role, or an empty string."""
+        self.state: MemberState = MemberState.ACTIVE
+        """Its state in the fleet."""
+        self.reason: str = ""
+        """The cause of its state; empty while it is ACTIVE."""
         self._lost_at = 0.0
-        self._taken_back: tuple[object, object] | None = None
-        self._forgiven_state: int | None = None
-        """The failsafe that was active when the program took it back."""
+        self._control_when_reclaimed: tuple[object, object] | None = None
+        # MAV_STATE when the program reclaimed it: this failsafe does not count as a takeover.
+        self._ignored_failsafe: int | None = None
         self._detach: list[Detach] = []
-        self._tell: Callable[[FleetEvent], None] = lambda _: None
-        self._on_fallen_out: Callable[[Member], None] = lambda _: None
+        self._publish: Callable[[FleetEvent], None] = lambda _: None
+        self._on_unavailable: Callable[[Member], None] = lambda _: None
 
     @property
-    def takes_orders(self) -> bool:
-        """Whether it may be ordered something: it is heard, and nobody else flies it."""
-        return self.state in (MemberState.IN, MemberState.FAILED)
+    def is_available(self) -> bool:
+        """True while the fleet can order it: it is neither lost, taken over nor released."""
+        return self.state in (MemberState.ACTIVE, MemberState.FAILED)
 
     @property
     def is_flown_by_program(self) -> bool:
-        """Whether it flies by what this program has ordered: only then a policy, or a watch, may stop it."""
-        return self.takes_orders and self.vehicle.is_flown_by_program
+        """True while an order of this program flies it. Only then do policies and the distance monitor stop it."""
+        return self.is_available and self.vehicle.is_flown_by_program
+
+    @property
+    def status(self) -> str:
+        """State and reason as text, such as ``"lost: no heartbeat for 5.0 s"``."""
+        return f"{self.state.value}: {self.reason}"
 
     def __repr__(self) -> str:
-        return f"<Member {self.name} {self.state.value}{f': {self.why}' if self.why else ''}>"
+        return f"<Member {self.name} {self.status if self.reason else self.state.value}>"
 
-    # ------------------------------------------------------------------------------- by the fleet
+    # ------------------------------------------------------------------- called by the fleet
 
-    def watch(self, tell: Callable[[FleetEvent], None], on_fallen_out: Callable[[Member], None]) -> None:
-        """Begin to listen; ``on_fallen_out`` is called when it is lost or taken over."""
-        self._tell, self._on_fallen_out = tell, on_fallen_out
+    def start_monitoring(self, publish: Callable[[FleetEvent], None], on_unavailable: Callable[[Member], None]) -> None:
+        """Subscribe to the vehicle. ``on_unavailable`` is called when it is lost or taken over."""
+        self._publish, self._on_unavailable = publish, on_unavailable
         vehicle, bus = self.vehicle, self.vehicle.connection.bus
-        later = partial(self._soon, self.look)
         self._detach = [
             bus.attach_event(VehicleSilent, self._on_silent),
-            bus.attach_event(VehicleBack, self._on_back),
-            vehicle.mode.observe(later),
-            # Each HEARTBEAT, though nothing has changed: it tells more than the CURRENT_MODE before it.
-            vehicle.armed.observe(later, every_arrival=True),
+            bus.attach_event(VehicleRecovered, self._on_back),
+            vehicle.mode.observe(self._refresh_soon),
+            # every_arrival: a HEARTBEAT without a change still has more to evaluate than the CURRENT_MODE before it.
+            vehicle.armed.observe(self._refresh_soon, every_arrival=True),
             vehicle.connection.on_end(self._on_end),
         ]
         if vehicle.is_silent:
-            self._lose(vehicle.describe_link())
-        self.look()  # others may have flown it before
+            self._set_lost(vehicle.describe_link())
+        self.refresh()  # another program may have flown it before
 
-    def stop_watching(self) -> None:
-        """Listen no more."""
+    def stop_monitoring(self) -> None:
+        """Unsubscribe."""
         for detach in self._detach:
             detach()
         self._detach = []
 
-    def look(self) -> None:
-        """Find out whether it is gone, or somebody else has it by now."""
+    def refresh(self) -> None:
+        """Update the state: the link may have closed, or a pilot may have taken over."""
         if self._detach and not self.vehicle.connection.is_open:
-            self._lose(f"its link has gone, {self.vehicle.describe_link()}")
-        if self.takes_orders and self._detach and (why := self._who_has_it()):
-            self._change(MemberState.TAKEN_OVER, why)
-            self._tell(MemberTakenOver(*self._when(), why))
-            self._on_fallen_out(self)
+            self._set_lost(f"its link is closed, {self.vehicle.describe_link()}")
+        if self.is_available and self._detach and (reason := self._takeover_reason()):
+            self._set_taken_over(reason)
+            self._on_unavailable(self)
 
-    def note_failed(self, action: str, error: Exception) -> None:
-        """It has not done its part."""
-        self.look()
-        if self.takes_orders:
+    def record_failure(self, action: str, error: Exception) -> None:
+        """Set the state to FAILED, unless it is lost or taken over, and publish :class:`MemberFailed`."""
+        self.refresh()
+        if self.is_available:
             self._change(MemberState.FAILED, str(error))
-        self._tell(MemberFailed(*self._when(), action, str(error)))
+        self._publish(MemberFailed(*self._when(), action, str(error)))
 
-    def note_done(self) -> None:
-        """It has done its part."""
+    def record_success(self) -> None:
+        """Set the state back to ACTIVE after FAILED."""
         if self.state is MemberState.FAILED:
-            self._change(MemberState.IN, "")
+            self._change(MemberState.ACTIVE, "")
 
-    def take_back(self) -> None:
-        """The program orders it again: what somebody else has done until now does not count."""
-        self._taken_back = self._who_steers()
-        self._forgiven_state = self.vehicle.system_status.latest
-        self.vehicle._arbiter.forgive_failsafe()
+    def reclaim(self) -> None:
+        """Make it available again. The takeover or failsafe that is active now no longer counts."""
+        self._control_when_reclaimed = self._current_control()
+        self._ignored_failsafe = self.vehicle.system_status.latest
+        self.vehicle._arbiter.clear_failsafe()
         if self.vehicle.is_silent:
             self._lost_at = self.vehicle.connection.now()
             self._change(MemberState.LOST, self.vehicle.describe_link())
-        elif self.state is not MemberState.IN:
-            self._change(MemberState.IN, "")
-            self._tell(MemberTakenBack(*self._when()))
+        elif self.state is not MemberState.ACTIVE:
+            self._change(MemberState.ACTIVE, "")
+            self._publish(MemberReclaimed(*self._when()))
 
-    def leave(self, why: str) -> None:
-        """The program orders it no more."""
-        self._change(MemberState.LEFT, why)
+    def release(self, reason: str) -> None:
+        """Set the state to RELEASED."""
+        self._change(MemberState.RELEASED, reason)
 
-    # --------------------------------------------------------------------------------- inside
+    # --------------------------------------------------------------------------------- private
 
-    def _who_has_it(self) -> str:
+    def _takeover_reason(self) -> str:
         vehicle = self.vehicle
-        if vehicle.is_surely_disarmed:  # on the ground there is nothing to take over
+        if vehicle.is_confirmed_disarmed:  # nothing to take over on the ground
             return ""
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
-            self._forgiven_state = None
-        elif state is not None and is_worse(state, self._forgiven_state):
-            return f"it is under a failsafe (MAV_STATE {MavState(state).name})"
-        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.explains_mode
-        if has_ended_mission or self._who_steers() == self._taken_back:
+            self._ignored_failsafe = None
+        elif state is not None and is_worse(state, self._ignored_failsafe):
+            return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
+        has_ended_mission = "mission" in vars(vehicle) and vehicle.mission.has_ended
+        if has_ended_mission or self._current_control() == self._control_when_reclaimed:
             return ""
-        is_others = vehicle.is_armed and vehicle._arbiter.current is None
-        return vehicle.taken_over or ("somebody else has armed it" if is_others else "")
+        armed_elsewhere = vehicle.is_armed and vehicle._arbiter.current is None
+        return vehicle.taken_over or ("this program did not arm it" if armed_elsewhere else "")
 
-    def _who_steers(self) -> tuple[object, object]:
+    def _current_control(self) -> tuple[object, object]:
         return self.vehicle._arbiter.newest, self.vehicle.mode.latest
 
-    def _soon(self, function: Callable[[], None], *_: Any) -> None:
-        """After all of the HEARTBEAT has been read: who landed disarms and changes its mode in the same one."""
-        asyncio.get_running_loop().call_soon(function)
+    def _refresh_soon(self, *_: object) -> None:
+        # Once the whole HEARTBEAT is read: a vehicle that landed disarms and changes its mode in the same one.
+        asyncio.get_running_loop().call_soon(self.refresh)
 
     def _on_silent(self, event: VehicleSilent) -> None:
         if event.system_id == self.vehicle.system_id:
-            self._lose(f"no heartbeat for {event.silent_for_s:.1f} s")
+            self._set_lost(f"no heartbeat for {event.silent_for_s:.1f} s")
 
     def _on_end(self, error: Exception) -> None:
-        self._lose(str(error))
+        self._set_lost(str(error))
 
-    def _lose(self, why: str) -> None:
-        if not self.takes_orders:
+    def _on_back(self, event: VehicleRecovered) -> None:
+        if event.system_id == self.vehicle.system_id:  # its HEARTBEAT is still being processed
+            asyncio.get_running_loop().call_soon(self._set_back)
+
+    def _set_lost(self, reason: str) -> None:
+        if not self.is_available:
             return
         self._lost_at = self.vehicle.connection.now()
-        self._change(MemberState.LOST, why)
-        self._tell(MemberLost(*self._when(), why))
-        self._on_fallen_out(self)
+        self._change(MemberState.LOST, reason)
+        self._publish(MemberLost(*self._when(), reason))
+        self._on_unavailable(self)
 
-    def _on_back(self, event: VehicleBack) -> None:
-        if event.system_id == self.vehicle.system_id:  # its HEARTBEAT is being read just now
-            self._soon(self._come_back)
-
-    def _come_back(self) -> None:
+    def _set_back(self) -> None:
         if self.state is not MemberState.LOST or not self._detach:
             return
-        if why := self._who_has_it():
-            self._change(MemberState.TAKEN_OVER, why)
-            self._tell(MemberTakenOver(*self._when(), why))
+        if reason := self._takeover_reason():
+            self._set_taken_over(reason)
         else:
-            self._change(MemberState.IN, "")
-            self._tell(MemberBack(*self._when(), self.vehicle.connection.now() - self._lost_at))
+            self._change(MemberState.ACTIVE, "")
+            self._publish(MemberBack(*self._when(), self.vehicle.connection.now() - self._lost_at))
 
-    def _change(self, state: MemberState, why: str) -> None:
-        self.state, self.why = state, why
+    def _set_taken_over(self, reason: str) -> None:
+        self._change(MemberState.TAKEN_OVER, reason)
+        self._publish(MemberTakenOver(*self._when(), reason))
+
+    def _change(self, state: MemberState, reason: str) -> None:
+        self.state, self.reason = state, reason
 
     def _when(self) -> tuple[float, int, str]:
         return self.vehicle.connection.now(), self.vehicle.system_id, self.name
-
-
-class _CutShort(Exception):
-    """The fleet's block was left by an exception: each vehicle's own is left like that, too."""
-
-
-class Keepers:
-    """A task for each vehicle, in whose block it is connected: so all are let go at once, not one after another."""
-
-    def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
-        self._timeout, self._rates = timeout, rates
-        self._tasks = Background(self._on_mistake)
-        self._open: dict[int, tuple[str, Vehicle]] = {}
-        self._error: Exception | None = None
-        self._news = asyncio.Event()
-        self._leave = asyncio.Event()
-        self._is_cut_short = False
-        self._running = 0
-        self._all_left = asyncio.Event()
-
-    async def keep(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
-        """Connect to all of them: network, connection and system id each. The vehicles, in the same order."""
-        for number, (network, connection, system_id) in enumerate(systems):
-            self._running += 1
-            self._tasks.start(partial(self._keep, number, network, connection, system_id))
-        with telling_who_is_missing(self._timeout, lambda: f"nothing is heard of {self._missing(systems)}"):
-            while len(self._open) < len(systems) and self._error is None:
-                self._news.clear()
-                await self._news.wait()
-        if self._error is not None:
-            raise self._error
-        return [self._open[number] for number in range(len(systems))]
-
-    def _missing(self, systems: Sequence[tuple[str, Connection, int]]) -> str:
-        return ", ".join(
-            f"{network}/{system_id}"
-            for number, (network, _, system_id) in enumerate(systems)
-            if number not in self._open
-        )
-
-    async def leave(
-        self,
-        kind: type[BaseException] | None = None,
-        error: BaseException | None = None,
-        traceback: TracebackType | None = None,
-    ) -> None:
-        """Let all of them go, as the block of the fleet is left."""
-        self._is_cut_short = error is not None
-        self._leave.set()
-        if self._running and len(self._open) == self._running:
-            await to_its_end(self._wait_until_all_left())
-        await self._tasks.aclose()
-
-    async def _wait_until_all_left(self) -> None:
-        await self._all_left.wait()
-
-    async def _keep(self, number: int, network: str, connection: Connection, system_id: int) -> None:
-        try:
-            async with connect(
-                connection, system_id=system_id, timeout=self._timeout, rates=self._rates
-            ) as vehicle:
-                self._open[number] = (network, vehicle)
-                self._news.set()
-                await self._leave.wait()
-                if self._is_cut_short:
-                    raise _CutShort
-        except _CutShort:
-            pass
-        finally:
-            self._running -= 1
-            if not self._running:
-                self._all_left.set()
-
-    def _on_mistake(self, error: Exception) -> None:
-        self._error = self._error or error
-        self._news.set()

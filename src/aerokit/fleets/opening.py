@@ -1,34 +1,48 @@
-"""``aerokit.fleet``: from addresses, connections and vehicles to a fleet, for the time of an ``async with`` block."""
+"""``aerokit.fleet``: opens connections, finds and connects vehicles, and yields the fleet."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Literal
+
+import anyio
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.connection.connection import Connection
-from aerokit.connection.opening import open_connection
-from aerokit.errors import InvalidArgument
-from aerokit.fleets.action import Crew
-from aerokit.fleets.distances import DistanceWatch
-from aerokit.fleets.finding import find_systems
+from aerokit.connection.heartbeats import discovery_event
+from aerokit.connection.opening import explain_no_vehicle, open_connection
+from aerokit.connection.tasks import BackgroundTasks, run_shielded
+from aerokit.errors import ConnectFailed, InvalidArgument
+from aerokit.events import VehicleFound
+from aerokit.fleets.action import FleetContext
+from aerokit.fleets.distances import DistanceMonitor
 from aerokit.fleets.fleet import Fleet
-from aerokit.fleets.members import Keepers, Member
-from aerokit.fleets.policy import Failure, PolicyName, PolicyOrder, Rules
+from aerokit.fleets.members import Member
+from aerokit.fleets.policy import MemberFailure, PolicyDecision, PolicyName, PolicyRules
 from aerokit.transport.link import Link
+from aerokit.vehicle.connect import connect
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator, Sequence
+    from types import TracebackType
 
     from aerokit.mavlink.message import Message
 
-WhenTooClose = Literal["hold", "tell"]
-"""What is done about two members that are too near to each other in flight."""
+logger: logging.Logger = logging.getLogger("aerokit")
+
+TooCloseAction = Literal["hold", "report"]
+"""Reaction to two members that come too close to each other in flight."""
 Source = str | Link | Connection | Vehicle
+
+DISCOVERY_S = 2.5  # two heartbeats at 1 Hz
+WAIT_WARNING_S = 5.0
 
 
 @checked
@@ -39,55 +53,53 @@ async def fleet(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None = None,
     groups: Mapping[str, Iterable[str]] | None = None,
     roles: Mapping[str, Iterable[str]] | None = None,
-    on_error: PolicyName | Callable[[Failure], PolicyName | Mapping[str, PolicyOrder] | None] = "hold_others",
-    on_error_of: Mapping[str, PolicyName | Callable[[Failure], PolicyName | Mapping[str, PolicyOrder] | None]]
-    | None = None,
+    on_error: PolicyName | Callable[[MemberFailure], PolicyDecision] = "hold_others",
+    on_error_by_group: Mapping[str, PolicyName | Callable[[MemberFailure], PolicyDecision]] | None = None,
     min_distance_m: float | None = None,
-    too_close: WhenTooClose = "hold",
+    on_too_close: TooCloseAction = "hold",
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
 ) -> AsyncIterator[Fleet]:
-    """Make many vehicles one fleet for the time of the ``async with`` block.
+    """Combine vehicles into a fleet for the duration of the ``async with`` block.
 
-    Each connection is a network with a name, and a member is called by both: ``"north/7"`` is system 7 of the network
-    "north". So system ids, which end at 255, may be the same on several networks.
+    Each connection is a network with a name. A member is named after its network and its system id: ``"north/7"`` is
+    system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links, connections that are open already, on which all vehicles that are heard become
-            members; and vehicles. Networks without a name are called ``"1"``, ``"2"`` …; a mapping gives names: of
-            networks, and of vehicles.
-        count: how many vehicles are waited for, in all; None: at least one on each network, and who is heard in the
-            2.5 seconds after.
-        system_ids: those on the networks that belong to it, for all networks or by the network's name; None: all.
-        groups: group → names or patterns of its members (``"north/*"``). Who is in none has the group ``""``.
-        roles: role → names or patterns, likewise.
-        on_error: what the others do when one fails in a common action (docs/fleets.md).
-        on_error_of: group → the same when one of this group fails.
-        min_distance_m: metres between any two: ways are compared before they are flown, and in flight the event
-            ``TooClose`` tells who is nearer to whom; None: nobody looks.
-        too_close: what is done then: both ``"hold"``, as far as they take orders, or it is only told (``"tell"``).
-        timeout: seconds to wait for all of them; after five of them a warning of logger "aerokit" says who is missing.
-        rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
+        *sources: addresses, links or open connections, on which all vehicles that are found become members; or
+            vehicles. A mapping names the networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
+            next 2.5 seconds.
+        system_ids: use these system ids only, on all networks or by network name; None: all that are found.
+        groups: group → names or patterns of its members (``"north/*"``). Other members have the group ``""``.
+        roles: role → names or patterns of its members.
+        on_error: policy for the other members when one fails in an action (docs/fleets.md).
+        on_error_by_group: group → policy when a member of this group fails.
+        min_distance_m: minimum distance between any two members in metres. Paths are compared before flight, and the
+            event ``TooClose`` reports violations in flight; None: no checks.
+        on_too_close: ``"hold"``: both members hold, if this program flies them; ``"report"``: event only.
+        timeout: seconds to wait for all members. After five seconds logger "aerokit" warns which are missing.
+        rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
 
     Raises:
         InvalidArgument: an argument is wrong, or two vehicles have the same name.
-        BusyError: this program has a vehicle object of one of ``system_ids`` on that connection already.
+        BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
-        LinkLost, ConnectionClosed: a link went down while waiting.
-        ConnectFailed: not all of them were heard in time; the text says which were.
+        LinkLost, ConnectionClosed: a link closed while waiting.
+        ConnectFailed: some members were not found in time; the text lists those that were.
     """
-    rules = Rules(on_error, on_error_of or {})
+    rules = PolicyRules(on_error, on_error_by_group or {})
     if min_distance_m is not None and not 0 < min_distance_m < 10_000:
         raise InvalidArgument(f"min_distance_m = {min_distance_m!r} is not allowed: above 0 to 10,000 metres")
-    if too_close not in ("hold", "tell"):
-        raise InvalidArgument(f"too_close = {too_close!r} is not allowed: 'hold' or 'tell'")
-    strange = [group for group in on_error_of or {} if group and group not in (groups or {})]
-    if strange:
-        there = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
-        raise InvalidArgument(f"on_error_of = {shown(strange[0])} is not allowed: {there}")
+    if on_too_close not in ("hold", "report"):
+        raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: 'hold' or 'report'")
+    unknown = [group for group in on_error_by_group or {} if group and group not in (groups or {})]
+    if unknown:
+        known = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
+        raise InvalidArgument(f"on_error_by_group = {short_repr(unknown[0])} is not allowed: {known}")
     if count is not None and count < 1:
         raise InvalidArgument(f"count = {count} is not allowed: 1 or more, or None")
-    named = _named(sources)
+    named = _named_sources(sources)
     async with AsyncExitStack() as stack:
         networks: dict[str, Connection] = {}
         for name, source in named.items():
@@ -95,51 +107,54 @@ async def fleet(
                 networks[name] = await stack.enter_async_context(open_connection(source))
             elif isinstance(source, Connection):
                 networks[name] = source
-        members = _given(named, networks)
-        found = [name for name, source in named.items() if not isinstance(source, Vehicle)]
+        members = _members_of_vehicles(named, networks)
+        searched = [name for name, source in named.items() if not isinstance(source, Vehicle)]
         ids = await find_systems(
-            {name: networks[name] for name in found}, _ids(system_ids, found), count, len(members), timeout
+            {name: networks[name] for name in searched},
+            _requested_ids(system_ids, searched),
+            count,
+            len(members),
+            timeout,
         )
-        keepers = Keepers(timeout, rates)
-        stack.push_async_exit(keepers.leave)
-        kept = await keepers.keep([(name, networks[name], each) for name in found for each in ids[name]])
-        members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in kept]
+        connections = MemberConnections(timeout, rates)
+        stack.push_async_exit(connections.aclose)
+        connected = await connections.open(
+            [(name, networks[name], system_id) for name in searched for system_id in ids[name]]
+        )
+        members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in connected]
         _check_names(members)
-        crew = Crew(members, networks, rules, next(iter(networks.values())).now, _raise, min_distance_m)
-        _sort(crew, groups or {}, "group")
-        _sort(crew, roles or {}, "role")
-        stack.push_async_callback(crew.aclose)
-        crew.start()
+        context = FleetContext(members, networks, rules, next(iter(networks.values())).now, _raise, min_distance_m)
+        _assign(context, groups or {}, "group")
+        _assign(context, roles or {}, "role")
+        stack.push_async_callback(context.aclose)
+        context.start()
         if min_distance_m is not None:
-            watch = DistanceWatch(crew, min_distance_m, holds=too_close == "hold")
-            crew.background.start(watch.run, "aerokit distances")
-        yield Fleet(crew)
+            monitor = DistanceMonitor(context, min_distance_m, holds=on_too_close == "hold")
+            context.background.start(monitor.run, "aerokit distances")
+        yield Fleet(context)
 
 
-def _named(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
-    """Name → source: network or vehicle."""
+def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[str, Source]:
     named: dict[str, Source] = {}
     for number, source in enumerate(sources, 1):
-        more = source if isinstance(source, Mapping) else {str(number): source}
-        for name, each in more.items():
+        entries = source if isinstance(source, Mapping) else {str(number): source}
+        for name, each in entries.items():
             if not isinstance(name, str) or not name:
-                raise InvalidArgument(f"sources: {shown(name)} is no name")
+                raise InvalidArgument(f"sources: {short_repr(name)} is not a name: a non-empty string is needed")
             if name in named:
-                raise InvalidArgument(f"sources: two are called {name!r}")
+                raise InvalidArgument(f"sources: two are named {name!r}")
             named[name] = each
     if not named:
         raise InvalidArgument("sources: a fleet needs an address, a connection or a vehicle")
     return named
 
 
-def _given(named: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
-    """Members of the vehicles that were handed in; their connections are networks, too."""
+def _members_of_vehicles(named: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
+    """Return the members for vehicles among the sources, and add their connections to the networks."""
     members: list[Member] = []
     for name, source in named.items():
         if isinstance(source, Vehicle):
-            network = next(
-                (each for each, open_one in networks.items() if open_one is source.connection), None
-            )
+            network = next((known for known, connection in networks.items() if connection is source.connection), None)
             if network is None:
                 network = name
                 networks[name] = source.connection
@@ -148,45 +163,206 @@ def _given(named: Mapping[str, Source], networks: dict[str, Connection]) -> list
     return members
 
 
-def _ids(
+def _requested_ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
     ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
     by_network: dict[str, Iterable[int]] = {}
     if isinstance(system_ids, Mapping):
-        by_network = {str(name): those for name, those in system_ids.items()}
+        by_network = {str(name): numbers for name, numbers in system_ids.items()}
     elif system_ids is not None:
         ids = {name: list(system_ids) for name in networks}
-    for name, those in by_network.items():
+    for name, numbers in by_network.items():
         if name not in ids:
-            raise InvalidArgument(f"system_ids: {shown(name)} is no network: {', '.join(networks)}")
-        ids[name] = list(those)
-    for each in (number for those in ids.values() for number in those or ()):
-        if not isinstance(each, int) or not 1 <= each <= 255:
-            raise InvalidArgument(f"system_ids: {shown(each)} is not allowed: 1 to 255")
+            raise InvalidArgument(
+                f"system_ids: {short_repr(name)} is not a network; the networks are {', '.join(networks)}"
+            )
+        ids[name] = list(numbers)
+    for number in (number for numbers in ids.values() for number in numbers or ()):
+        if not isinstance(number, int) or not 1 <= number <= 255:
+            raise InvalidArgument(f"system_ids: {short_repr(number)} is not allowed: 1 to 255")
     return ids
 
 
 def _check_names(members: list[Member]) -> None:
     seen: dict[str, Member] = {}
-    for each in members:
-        other = seen.setdefault(each.name, each)
-        if other is not each:
-            raise InvalidArgument(f"two vehicles are called {each.name!r}: give them names of their own")
-        twice = next((one.name for one in members if one is not each and one.vehicle is each.vehicle), None)
+    for member in members:
+        if seen.setdefault(member.name, member) is not member:
+            raise InvalidArgument(f"two vehicles are named {member.name!r}: name them in a mapping")
+        twice = next((other.name for other in members if other is not member and other.vehicle is member.vehicle), None)
         if twice is not None:
-            raise InvalidArgument(f"{each.name!r} and {twice!r} are the same vehicle")
+            raise InvalidArgument(f"{member.name!r} and {twice!r} are the same vehicle")
 
 
-def _sort(crew: Crew, sorts: Mapping[str, Iterable[str]], what: str) -> None:
-    for name, patterns in sorts.items():
-        those = [patterns] if isinstance(patterns, str) else list(patterns)
-        for each in crew.matching(*those):
-            before = getattr(crew.members[each], what)
+def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
+    for name, patterns in patterns_by_name.items():
+        for member in context.matching(*([patterns] if isinstance(patterns, str) else patterns)):
+            before = getattr(context.members[member], attribute)
             if before:
-                raise InvalidArgument(f"{each} is in two {what}s: {before!r} and {name!r}")
-            setattr(crew.members[each], what, name)
+                raise InvalidArgument(f"{member} is in two {attribute}s: {before!r} and {name!r}")
+            setattr(context.members[member], attribute, name)
 
 
 def _raise(error: Exception) -> None:
     raise error
+
+
+# --------------------------------------------------------------------------------------- discovery
+
+
+async def find_systems(
+    networks: Mapping[str, Connection],
+    requested: Mapping[str, list[int] | None],
+    count: int | None,
+    given: int,
+    timeout: float,
+) -> dict[str, list[int]]:
+    """Return the system ids to connect to, by network: the requested ones, or all found that have no vehicle object.
+
+    Args:
+        networks: connections by name.
+        requested: system ids by network; None: find them.
+        count: total number to wait for, including ``given``.
+        given: number of vehicles that the program passed to ``fleet()``.
+        timeout: seconds.
+
+    Raises:
+        ConnectFailed: not enough were found in time.
+    """
+    searched = [name for name in networks if requested[name] is None]
+    found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
+    changed = anyio.Event()
+
+    def on_found(name: str, event: object) -> None:
+        if isinstance(event, VehicleFound) and event.system_id not in networks[name].attached:
+            found[name].setdefault(event.system_id)
+            changed.set()
+
+    def is_complete() -> bool:
+        if count is not None:
+            return given + sum(map(len, found.values())) >= count
+        return all(found[name] for name in searched)
+
+    def progress() -> str:
+        names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
+        passed = f", {given} of them passed as vehicles" if given else ""
+        listed = ", ".join(names)
+        if count is not None:
+            found_count = given + len(names) or "none"
+            return f"{found_count} of {count} vehicles were found{passed}{f': {listed}' if names else ''}"
+        silent = ", ".join(name for name in searched if not found[name])
+        return f"no vehicle was found on {silent}{f'; found: {listed}' if names else ''}"
+
+    detach = []
+    try:
+        for name in searched:
+            connection = networks[name]
+            connection.raise_if_ended()
+            detach.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
+            for source, heartbeat in connection.heartbeats.items():
+                on_found(name, discovery_event(heartbeat, connection.now(), *source))
+        with anyio.move_on_after(timeout):
+            with warn_while_waiting(timeout, progress):
+                while not is_complete():
+                    changed = anyio.Event()
+                    await changed.wait()
+            if searched and count is None:
+                await anyio.sleep(DISCOVERY_S)
+    finally:
+        for each in detach:
+            each()
+    if not is_complete():
+        reasons = "".join(
+            f"\n  - network {name}: {explain_no_vehicle(networks[name], None)}" for name in searched if not found[name]
+        )
+        raise ConnectFailed(f"within {timeout:g} s {progress()}{reasons}")
+    return {name: sorted(ids) for name, ids in found.items()}
+
+
+@contextmanager
+def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[None]:
+    """Log one warning if the block takes longer than five seconds."""
+
+    def warn() -> None:
+        logger.warning("fleet: %s after %g s; waiting up to %g s in total", describe(), WAIT_WARNING_S, timeout)
+
+    timer = asyncio.get_running_loop().call_later(WAIT_WARNING_S, warn)
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+class _BlockFailed(Exception):
+    """Raised in each vehicle's own block when the fleet's block raises."""
+
+
+class MemberConnections:
+    """Connects vehicles, each in a task of its own, so that closing the fleet closes all of them at once."""
+
+    def __init__(self, timeout: float, rates: Mapping[type[Message], float] | None) -> None:
+        self._timeout, self._rates = timeout, rates
+        self._tasks = BackgroundTasks(self._on_error)
+        self._open: dict[int, tuple[str, Vehicle]] = {}
+        self._error: Exception | None = None
+        self._changed = asyncio.Event()
+        self._close = asyncio.Event()
+        self._block_failed = False
+        self._running = 0
+        self._all_closed = asyncio.Event()
+
+    async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
+        """Connect to all systems, given as network, connection and system id; keeps their order."""
+        for number, (network, connection, system_id) in enumerate(systems):
+            self._running += 1
+            self._tasks.start(partial(self._run, number, network, connection, system_id))
+
+        def missing() -> str:
+            names = (
+                f"{network}/{system_id}"
+                for number, (network, _, system_id) in enumerate(systems)
+                if number not in self._open
+            )
+            return f"no heartbeat of {', '.join(names)}"
+
+        with warn_while_waiting(self._timeout, missing):
+            while len(self._open) < len(systems) and self._error is None:
+                self._changed.clear()
+                await self._changed.wait()
+        if self._error is not None:
+            raise self._error
+        return [self._open[number] for number in range(len(systems))]
+
+    async def aclose(
+        self,
+        kind: type[BaseException] | None = None,
+        error: BaseException | None = None,
+        traceback: TracebackType | None = None,
+    ) -> None:
+        self._block_failed = error is not None
+        self._close.set()
+        if self._running and len(self._open) == self._running:
+            await run_shielded(self._wait_until_all_closed())
+        await self._tasks.aclose()
+
+    async def _wait_until_all_closed(self) -> None:
+        await self._all_closed.wait()
+
+    async def _run(self, number: int, network: str, connection: Connection, system_id: int) -> None:
+        try:
+            async with connect(connection, system_id=system_id, timeout=self._timeout, rates=self._rates) as vehicle:
+                self._open[number] = (network, vehicle)
+                self._changed.set()
+                await self._close.wait()
+                if self._block_failed:
+                    raise _BlockFailed
+        except _BlockFailed:
+            pass
+        finally:
+            self._running -= 1
+            if not self._running:
+                self._all_closed.set()
+
+    def _on_error(self, error: Exception) -> None:
+        self._error = self._error or error
+        self._changed.set()

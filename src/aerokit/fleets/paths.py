@@ -1,6 +1,6 @@
-"""Ways through the air with times, and how near two of them come: geometry, without IO.
+"""Timed paths, and the distance between two of them. Geometry without IO.
 
-Places are metres north, east and up of a common origin, times are seconds from a common start.
+Points are metres north, east and up of a common origin; times are seconds since a common start.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from aerokit.errors import InvalidArgument
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-__all__ = ["Approach", "Path", "PathPoint", "Place", "horizontal_distance", "least_distance"]
+__all__ = ["Approach", "LocalPoint", "Path", "PathPoint", "horizontal_distance", "min_path_distance"]
 
-Place = tuple[float, float, float]
+LocalPoint = tuple[float, float, float]
 """Metres north, east and up."""
-NEARLY = 1e-9
+TOLERANCE = 1e-9
 
 
 class PathPoint(Snapshot):
-    """Where a vehicle is to be at ``t_s`` seconds: metres north, east and up of the origin."""
+    """A point of a path: ``t_s`` in seconds, and metres north, east and up of the origin."""
 
     t_s: float
     north_m: float
@@ -32,8 +32,8 @@ class PathPoint(Snapshot):
     up_m: float
 
     @property
-    def place(self) -> Place:
-        """Without the time."""
+    def place(self) -> LocalPoint:
+        """The point without its time."""
         return self.north_m, self.east_m, self.up_m
 
     def _check(self) -> None:
@@ -42,14 +42,14 @@ class PathPoint(Snapshot):
 
 
 class Path(Snapshot):
-    """The way of one vehicle: straight from point to point, each at its time; before and after it rests."""
+    """Path of one vehicle: straight lines between timed points; before the first and after the last it rests."""
 
     name: str
     points: Sequence[PathPoint]
 
     @classmethod
-    def straight(cls, name: str, start: Place, end: Place, speed_m_s: float, at_s: float = 0.0) -> Self:
-        """A straight leg at one speed that begins at ``at_s``.
+    def straight(cls, name: str, start: LocalPoint, end: LocalPoint, speed_m_s: float, at_s: float = 0.0) -> Self:
+        """Make a straight path at constant speed that starts at ``at_s``.
 
         Raises:
             InvalidArgument: the speed is not above 0.
@@ -61,16 +61,16 @@ class Path(Snapshot):
 
     @property
     def begins_at_s(self) -> float:
-        """When it sets off."""
+        """Time of the first point in seconds."""
         return self.points[0].t_s
 
     @property
     def ends_at_s(self) -> float:
-        """When it is there."""
+        """Time of the last point in seconds."""
         return self.points[-1].t_s
 
     def legs(self, begin_s: float, end_s: float) -> list[tuple[PathPoint, PathPoint]]:
-        """From point to point, and the rests before and after."""
+        """Return pairs of consecutive points, including the rests from ``begin_s`` and until ``end_s``."""
         first, last = self.points[0], self.points[-1]
         points = [
             first.replace(t_s=min(begin_s, first.t_s)),
@@ -85,31 +85,26 @@ class Path(Snapshot):
             raise InvalidArgument(f"points: the path of {self.name} has no points")
         for one, other in pairwise(self.points):
             if other.t_s < one.t_s:
-                raise InvalidArgument(f"points: the path of {self.name} goes back in time at {other.t_s:g} s")
+                raise InvalidArgument(f"points: the times of {self.name} decrease at {other.t_s:g} s")
 
 
 class Approach(Snapshot):
-    """How near two paths come: ``distance_m``, the one at ``at_s`` of its own time, the other at ``other_at_s``."""
+    """Closest approach of two paths: distance, and the time of the closest point on each path."""
 
     distance_m: float
     at_s: float
     other_at_s: float
 
 
-def least_distance(
-    one: Path, other: Path, *, slack_s: float = math.inf, below_m: float = math.inf
-) -> Approach:
-    """How near two vehicles may come to each other.
+def min_path_distance(one: Path, other: Path, *, slack_s: float = math.inf, below_m: float = math.inf) -> Approach:
+    """Return the closest approach of two paths.
 
     Args:
-        one: the path of the first.
-        other: of the second.
-        slack_s: how much earlier or later than planned one of them may be compared with the other, in seconds; 0: both
-            are exactly on time, infinite: the times count for nothing.
-        below_m: what is farther apart than this is not looked at closely: the result is then at least as much.
-
-    Returns:
-        The nearest that two points of them come whose times differ by no more than the slack.
+        one: the first path.
+        other: the second path.
+        slack_s: compare points whose times differ by at most this many seconds. 0: both vehicles are exactly on time;
+            infinite: ignore times.
+        below_m: larger distances are not computed exactly; the result is then at least this distance.
     """
     begin = min(one.begins_at_s, other.begins_at_s)
     end = max(one.ends_at_s, other.ends_at_s)
@@ -119,41 +114,35 @@ def least_distance(
         for other_leg in others:
             if other_leg[0].t_s - slack_s > leg[1].t_s or other_leg[1].t_s + slack_s < leg[0].t_s:
                 continue
-            if _at_least(leg, other_leg) >= min(best.distance_m, below_m):
+            if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
                 best = best if best.distance_m < math.inf else Approach(below_m, leg[0].t_s, other_leg[0].t_s)
                 continue
-            found = _nearest(leg, other_leg, slack_s)
+            found = _closest(leg, other_leg, slack_s)
             if found is not None and found.distance_m < best.distance_m:
                 best = found
     return best
 
 
-def horizontal_distance(one: tuple[Place, Place], other: tuple[Place, Place]) -> float:
-    """Metres between two straight ways as seen from above, whenever they are flown."""
-    (a, b), (c, d) = [
-        tuple(PathPoint(0.0, place[0], place[1], 0.0) for place in each) for each in (one, other)
-    ]
-    found = _nearest((a, b), (c, d), math.inf)
+def horizontal_distance(one: tuple[LocalPoint, LocalPoint], other: tuple[LocalPoint, LocalPoint]) -> float:
+    """Return the distance in metres between two straight lines as seen from above, regardless of time."""
+    (a, b), (c, d) = [tuple(PathPoint(0.0, place[0], place[1], 0.0) for place in each) for each in (one, other)]
+    found = _closest((a, b), (c, d), math.inf)
     assert found is not None
     return found.distance_m
 
 
-def _at_least(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint]) -> float:
-    """They are no nearer than this: the distance of the middles without half of both lengths."""
-    middles = [
-        tuple((a + b) / 2 for a, b in zip(leg[0].place, leg[1].place, strict=True)) for leg in (one, other)
-    ]
+def _lower_bound(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint]) -> float:
+    """Return a lower bound of their distance: that of the midpoints minus half of both lengths."""
+    middles = [tuple((a + b) / 2 for a, b in zip(leg[0].place, leg[1].place, strict=True)) for leg in (one, other)]
     lengths = math.dist(one[0].place, one[1].place) + math.dist(other[0].place, other[1].place)
     return math.dist(*middles) - lengths / 2
 
 
-def _nearest(
-    one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint], slack_s: float
-) -> Approach | None:
-    """The least distance of two legs; None when no two of their times are near enough.
+def _closest(one: tuple[PathPoint, PathPoint], other: tuple[PathPoint, PathPoint], slack_s: float) -> Approach | None:
+    """Return the closest approach of two legs; None if no two of their times are within the slack.
 
-    With s and t from 0 to 1 along the legs the square of the distance is a convex function of both, and the times
-    cut a strip out of the square: the least is inside, or on the border of what is left.
+    With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition cuts
+    a strip out of the unit square, so the minimum is inside it or on the border of the remaining polygon.
     """
     a, b = one[0].place, other[0].place
     along = [one[1].place[i] - a[i] for i in range(3)]
@@ -161,24 +150,24 @@ def _nearest(
     between = [a[i] - b[i] for i in range(3)]
     one_lasts, other_lasts = one[1].t_s - one[0].t_s, other[1].t_s - other[0].t_s
 
-    def ahead(s: float, t: float) -> float:
+    def time_difference(s: float, t: float) -> float:
         return (one[0].t_s + s * one_lasts) - (other[0].t_s + t * other_lasts)
 
-    def apart(s: float, t: float) -> list[float]:
+    def difference(s: float, t: float) -> list[float]:
         return [between[i] + s * along[i] - t * others[i] for i in range(3)]
 
-    inside = _inside(between, along, others)
-    if inside is not None and abs(ahead(*inside)) <= slack_s:
+    inside = _closest_inside(between, along, others)
+    if inside is not None and abs(time_difference(*inside)) <= slack_s:
         corners = [inside]
     else:
         corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
         if slack_s < math.inf:
-            corners = _cut(corners, lambda s, t: ahead(s, t) - slack_s)
-            corners = _cut(corners, lambda s, t: -ahead(s, t) - slack_s)
+            corners = _cut(corners, lambda s, t: time_difference(s, t) - slack_s)
+            corners = _cut(corners, lambda s, t: -time_difference(s, t) - slack_s)
     best: tuple[float, float, float] | None = None
     for number, corner in enumerate(corners):
-        s, t = _best_between(corner, corners[number - 1], apart(*corner), apart(*corners[number - 1]))
-        distance = math.hypot(*apart(s, t))
+        s, t = _closest_on_edge(corner, corners[number - 1], difference(*corner), difference(*corners[number - 1]))
+        distance = math.hypot(*difference(s, t))
         if best is None or distance < best[0]:
             best = distance, s, t
     if best is None:
@@ -187,37 +176,37 @@ def _nearest(
     return Approach(distance, one[0].t_s + s * one_lasts, other[0].t_s + t * other_lasts)
 
 
-def _inside(
+def _closest_inside(
     between: Sequence[float], along: Sequence[float], others: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Where two lines are nearest, if that is within both legs; None for parallel ones."""
+    """Return the closest point of two lines if it is within both legs; None also for parallel lines."""
     aa, bb, ab = _dot(along, along), _dot(others, others), _dot(along, others)
     determinant = aa * bb - ab * ab
-    if determinant <= NEARLY * max(aa * bb, NEARLY):
+    if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):
         return None
     c, d = _dot(between, along), _dot(between, others)
     s, t = (ab * d - bb * c) / determinant, (aa * d - ab * c) / determinant
     return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
 
 
-def _cut(corners: list[tuple[float, float]], beyond: _Beyond) -> list[tuple[float, float]]:
-    """What of a convex figure is not beyond a line."""
+def _cut(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[float, float]]:
+    """Return the part of a convex polygon where ``outside`` is not positive."""
     kept: list[tuple[float, float]] = []
     for number, corner in enumerate(corners):
         before = corners[number - 1]
-        here, there = beyond(*corner), beyond(*before)
-        if (here > NEARLY) != (there > NEARLY):
+        here, there = outside(*corner), outside(*before)
+        if (here > TOLERANCE) != (there > TOLERANCE):
             share = there / (there - here)
             kept.append(tuple(p + share * (q - p) for p, q in zip(before, corner, strict=True)))  # type: ignore[arg-type]
-        if here <= NEARLY:
+        if here <= TOLERANCE:
             kept.append(corner)
     return kept
 
 
-def _best_between(
+def _closest_on_edge(
     one: tuple[float, float], other: tuple[float, float], here: Sequence[float], there: Sequence[float]
 ) -> tuple[float, float]:
-    """The place on an edge at which the two are nearest."""
+    """Return the point on an edge where the distance is smallest."""
     step = [q - p for p, q in zip(here, there, strict=True)]
     length = _dot(step, step)
     share = 0.0 if length == 0 else min(1.0, max(0.0, -_dot(here, step) / length))
@@ -231,4 +220,4 @@ def _dot(one: Sequence[float], other: Sequence[float]) -> float:
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    _Beyond = Callable[[float, float], float]
+    _Outside = Callable[[float, float], float]

@@ -1,25 +1,33 @@
-"""What the others do when one of them fails: rules, without IO."""
+"""Failure policies: what the other members do when one fails. Without IO."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, get_args
 
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit._internal.wording import shown
 from aerokit.errors import FleetError, InvalidArgument
 
-__all__ = ["Failure", "FleetResult", "Policy", "PolicyName", "PolicyOrder", "Rules"]
+__all__ = [
+    "FleetResult",
+    "MemberFailure",
+    "Policy",
+    "PolicyDecision",
+    "PolicyName",
+    "PolicyOrder",
+    "PolicyRules",
+]
 
-PolicyName = Literal["hold_others", "land_others", "return_others", "go_on"]
-"""What a policy is called."""
+PolicyName = Literal["hold_others", "land_others", "return_others", "continue_others"]
+"""The built-in policies."""
 
 PolicyOrder = Literal["hold", "land", "return"]
-"""What one member is told to do."""
+"""An order that a policy can send to one member."""
 
 
-class Failure(Snapshot):
-    """One member has failed: ``member``, of ``group``, in ``action``, with ``error``; ``others`` are the rest."""
+class MemberFailure(Snapshot):
+    """Failure of ``member`` (of ``group``) in ``action``; ``others`` are the members that the policy can order."""
 
     member: str
     group: str
@@ -28,11 +36,11 @@ class Failure(Snapshot):
     others: tuple[str, ...]
 
 
-Policy = PolicyName | Callable[[Failure], "PolicyName | Mapping[str, PolicyOrder] | None"]
-"""One of the four, or a function that gives one of them, or an order for each of some members; None: go on.
+PolicyDecision = PolicyName | Mapping[str, PolicyOrder] | None
+"""Result of a policy function: a built-in policy, or a mapping of names to orders, or None to continue."""
 
-It is called on the event loop and must not wait.
-"""
+Policy = PolicyName | Callable[[MemberFailure], PolicyDecision]
+"""A built-in policy, or a function. The function is called on the event loop and must not block."""
 
 ORDERS: Mapping[str, PolicyOrder] = {
     "hold_others": "hold",
@@ -41,29 +49,30 @@ ORDERS: Mapping[str, PolicyOrder] = {
 }
 
 
-class Rules:
-    """The policy of a fleet, and those of groups: that of the group of who failed is the one that holds."""
+class PolicyRules:
+    """The policy of a fleet and those of its groups. The group of the failed member selects the policy."""
 
     def __init__(self, policy: Policy, of_groups: Mapping[str, Policy]) -> None:
         for name, each in (
             ("on_error", policy),
-            *((f"on_error of {group}", of_groups[group]) for group in of_groups),
+            *((f"on_error_by_group[{group!r}]", of_groups[group]) for group in of_groups),
         ):
             if not callable(each) and each not in get_args(PolicyName):
                 raise InvalidArgument(
-                    f"{name} = {shown(each)} is not allowed: one of {', '.join(get_args(PolicyName))}, or a function"
+                    f"{name} = {short_repr(each)} is not allowed: one of"
+                    f" {', '.join(get_args(PolicyName))}, or a function"
                 )
         self._policy, self._of_groups = policy, dict(of_groups)
 
-    def decide(self, failure: Failure) -> dict[str, PolicyOrder]:
-        """What each of the others is told; who is not in it goes on.
+    def decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
+        """Return the order for each of the others; members that are missing in it continue.
 
         Raises:
-            InvalidArgument: the program's function gave something else, or a member that is not one of the others.
+            InvalidArgument: the policy function returned something else, or a name that is not among the others.
         """
         policy = self._of_groups.get(failure.group, self._policy)
         decided = policy(failure) if callable(policy) else policy
-        if decided is None or decided == "go_on":
+        if decided is None or decided == "continue_others":
             return {}
         if isinstance(decided, str) and decided in ORDERS:
             return dict.fromkeys(failure.others, ORDERS[decided])
@@ -73,22 +82,19 @@ class Rules:
             ]
             if not wrong:
                 return dict(decided)
-            raise self._nonsense(wrong[0])
-        raise self._nonsense(decided)
+            raise self._invalid_decision(wrong[0])
+        raise self._invalid_decision(decided)
 
     @staticmethod
-    def _nonsense(decided: object) -> InvalidArgument:
+    def _invalid_decision(decided: object) -> InvalidArgument:
         return InvalidArgument(
-            f"the policy decided {shown(decided)}: allowed are {', '.join(get_args(PolicyName))}, or for some of the"
-            f" others one of {', '.join(get_args(PolicyOrder))} each"
+            f"the policy function returned {short_repr(decided)}: allowed are {', '.join(get_args(PolicyName))}, or a"
+            f" mapping of other members to {', '.join(get_args(PolicyOrder))}"
         )
 
 
 class FleetResult(Mapping[str, Any]):
-    """Member's name → what its action returned, or the exception that it raised.
-
-    A member that was not ordered anything, because it is lost or somebody else flies it, is in ``left_out`` only.
-    """
+    """Result of a fleet action: maps each member's name to its return value, or to the exception that it raised."""
 
     def __init__(
         self,
@@ -97,29 +103,29 @@ class FleetResult(Mapping[str, Any]):
         *,
         failed: Mapping[str, Exception],
         stopped: Mapping[str, Exception],
-        left_out: Mapping[str, str],
+        skipped: Mapping[str, str],
     ) -> None:
         self.action: str = action
-        """What was ordered."""
+        """The name of the action."""
         self.failed: dict[str, Exception] = dict(failed)
-        """Those that did not do it, and why."""
+        """Members that failed, with their errors."""
         self.stopped: dict[str, Exception] = dict(stopped)
-        """Those that were stopped by the policy because another one had failed."""
-        self.left_out: dict[str, str] = dict(left_out)
-        """Those of whom nothing was ordered, and why."""
+        """Members that the policy stopped because another one failed."""
+        self.skipped: dict[str, str] = dict(skipped)
+        """Members that were not ordered, with the reason (lost, taken over); they are not in the mapping."""
         self._outcomes = dict(outcomes)
 
     @property
     def is_complete(self) -> bool:
-        """Whether every member that was ordered to has done it."""
+        """True if no member failed or was stopped."""
         return not self.failed and not self.stopped
 
     def raise_for_errors(self) -> None:
-        """Raise FleetError if a member has failed, or was stopped; its ``errors`` has all of them."""
+        """Raise FleetError if a member failed or was stopped; its ``errors`` has all of them."""
         errors = {**self.failed, **self.stopped}
         if errors:
             done = len(self._outcomes) - len(errors)
-            raise FleetError(f"{self.action}: {done} of {len(self._outcomes)} did it", errors=errors)
+            raise FleetError(f"{self.action}: {done} of {len(self._outcomes)} succeeded", errors=errors)
 
     def __getitem__(self, name: str) -> Any:
         return self._outcomes[name]
@@ -134,5 +140,5 @@ class FleetResult(Mapping[str, Any]):
         parts = [f"{len(self) - len(self.failed) - len(self.stopped)} of {len(self)} done"]
         parts += [f"failed: {', '.join(self.failed)}"] if self.failed else []
         parts += [f"stopped: {', '.join(self.stopped)}"] if self.stopped else []
-        parts += [f"left out: {', '.join(self.left_out)}"] if self.left_out else []
+        parts += [f"skipped: {', '.join(self.skipped)}"] if self.skipped else []
         return f"<FleetResult of {self.action}: {'; '.join(parts)}>"

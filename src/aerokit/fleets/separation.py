@@ -1,4 +1,4 @@
-"""Kept apart: ways are compared before they are flown, and given heights or times of their own. Without IO."""
+"""Path conflicts, and their separation by altitude or time. Without IO."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from typing import Literal
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
-from aerokit.fleets.paths import Path, PathPoint, Place, horizontal_distance, least_distance
+from aerokit.fleets.paths import LocalPoint, Path, PathPoint, horizontal_distance, min_path_distance
 
 __all__ = [
     "Conflict",
     "Deconfliction",
     "Route",
-    "conflicts_of",
-    "in_corridors",
-    "in_layers",
-    "local_places",
-    "near_pairs",
+    "find_conflicts",
+    "pairs_within",
+    "separate_by_altitude",
+    "separate_by_time",
+    "to_local_points",
 ]
 
-STEP_S = 1.0
+DELAY_STEP_S = 1.0
 
 
 class Route(Snapshot):
-    """Straight from one place to another: metres north, east and up of a common origin."""
+    """A straight path: metres north, east and up of a common origin."""
 
     name: str
-    start: Place
-    target: Place
+    start: LocalPoint
+    target: LocalPoint
 
 
 class Conflict(Snapshot):
-    """Two ways come nearer to each other than they may; ``at_s``: when, of the first one's time; None: whenever."""
+    """Two paths that come too close; ``at_s`` is the time on the first path, or None if times are ignored."""
 
     name: str
     other: str
@@ -43,133 +43,134 @@ class Conflict(Snapshot):
 
 
 class Deconfliction(Snapshot):
-    """What was decided about some ways, and why.
+    """Result of comparing paths: a decision and its reason.
 
-    ``decision`` is ``"clear"`` (they may be flown as they are), ``"layers"`` (all climb to ``heights_m`` first, cross
-    there, and come down when all have crossed), ``"corridors"`` (each sets off ``delays_s`` later) or ``"refused"``.
-    ``conflicts`` are those of the ways as they were. Heights are metres above the sea.
+    ``decision`` is one of
+
+    - ``"clear"``: no conflicts;
+    - ``"layers"``: all climb to ``heights_m``, cross there, and descend after all have crossed;
+    - ``"corridors"``: each starts after ``delays_s``;
+    - ``"refused"``: the conflicts cannot be resolved.
+
+    ``conflicts`` are those of the original paths. Heights are metres above sea level.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]
-    why: str
+    reason: str
     min_distance_m: float
     conflicts: Sequence[Conflict] = ()
     heights_m: Mapping[str, float] = {}
     delays_s: Mapping[str, float] = {}
 
 
-def conflicts_of(
-    paths: Sequence[Path], min_distance_m: float, *, slack_s: float = math.inf
-) -> tuple[Conflict, ...]:
-    """All pairs of paths that come nearer to each other than ``min_distance_m`` metres.
+def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: float = math.inf) -> tuple[Conflict, ...]:
+    """Return all pairs of paths that come closer than ``min_distance_m``.
 
     Args:
         paths: of the vehicles.
         min_distance_m: metres.
-        slack_s: by how many seconds one may be early or late compared with another; infinite: times do not count.
+        slack_s: how early or late one vehicle may be relative to another, in seconds; infinite: ignore times.
     """
     _check_distance(min_distance_m)
     found: list[Conflict] = []
     for one, other in combinations(paths, 2):
-        near = least_distance(one, other, slack_s=slack_s, below_m=min_distance_m)
+        near = min_path_distance(one, other, slack_s=slack_s, below_m=min_distance_m)
         if near.distance_m < min_distance_m:
             at_s = near.at_s if slack_s < math.inf else None
             found.append(Conflict(one.name, other.name, near.distance_m, at_s))
     return tuple(found)
 
 
-def in_layers(
+def separate_by_altitude(
     routes: Sequence[Route],
-    standing: Mapping[str, Place],
+    stationary: Mapping[str, LocalPoint],
     min_distance_m: float,
     *,
-    highest_m: float = math.inf,
+    max_altitude_m: float = math.inf,
 ) -> Deconfliction:
-    """Let ways cross at heights of their own, if they come too near to each other.
+    """Separate conflicting routes by altitude.
 
-    All go up where they are, then across, then down, and nobody begins the next of these before all are done with the
-    one before: so only what happens at the same time has to be apart.
+    All climb, then cross, then descend. No vehicle begins the next phase before all have finished the previous one, so
+    only movements of the same phase have to be separated.
 
     Args:
-        routes: of those that move.
-        standing: those that stay where they are, on the ground or in the air.
-        min_distance_m: metres; also between two layers.
-        highest_m: no layer is above this height.
+        routes: of the moving vehicles.
+        stationary: positions of the others, on the ground or in the air.
+        min_distance_m: minimum distance in metres, also between layers.
+        max_altitude_m: highest layer in metres above sea level.
     """
-    conflicts = _conflicts(routes, standing, min_distance_m)
+    conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
-        return Deconfliction("clear", "no two ways come too near", min_distance_m)
-    ends = _ends_too_near(routes, standing, min_distance_m)
-    if ends:
-        return Deconfliction("refused", ends, min_distance_m, conflicts)
+        return Deconfliction("clear", "no paths come too close", min_distance_m)
+    reason = _vertical_conflict(routes, stationary, min_distance_m)
+    if reason:
+        return Deconfliction("refused", reason, min_distance_m, conflicts)
     base = max(max(each.start[2], each.target[2]) for each in routes)
     layers: dict[str, int] = {}
     for route in routes:
-        taken = {
-            layers[each.name]
-            for each in routes
-            if each.name in layers and _cross(each, route, min_distance_m)
-        }
+        taken = {layers[each.name] for each in routes if each.name in layers and _cross(each, route, min_distance_m)}
         layer = 0
-        while layer in taken or _meets(route, standing, base + layer * min_distance_m, min_distance_m):
+        while layer in taken or _meets(route, stationary, base + layer * min_distance_m, min_distance_m):
             layer += 1
         layers[route.name] = layer
     heights = {name: base + layer * min_distance_m for name, layer in layers.items()}
     highest = max(heights.values())
-    if highest > highest_m:
-        why = f"the ways cross, and the layers would go up to {highest:.0f} m, above {highest_m:.0f} m"
-        return Deconfliction("refused", why, min_distance_m, conflicts)
-    why = f"{_pairs(conflicts)} come too near: they cross in {len(set(layers.values()))} layers"
-    return Deconfliction("layers", why, min_distance_m, conflicts, heights)
+    if highest > max_altitude_m:
+        reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
+        return Deconfliction("refused", reason, min_distance_m, conflicts)
+    reason = f"{_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
+    return Deconfliction("layers", reason, min_distance_m, conflicts, heights)
 
 
-def in_corridors(
+def separate_by_time(
     routes: Sequence[Route],
-    standing: Mapping[str, Place],
+    stationary: Mapping[str, LocalPoint],
     min_distance_m: float,
     speed_m_s: float,
     *,
     slack_s: float = 3.0,
-    longest_s: float = 300.0,
+    max_delay_s: float = 300.0,
 ) -> Deconfliction:
-    """Let ways cross at times of their own, if they come too near to each other.
+    """Separate conflicting routes by time.
 
     Args:
-        routes: of those that move, at one speed.
-        standing: those that stay where they are.
-        min_distance_m: metres.
-        speed_m_s: of all of them.
-        slack_s: by how many seconds one may be early or late compared with another.
-        longest_s: nobody waits longer than this.
+        routes: of the moving vehicles.
+        stationary: positions of the others.
+        min_distance_m: minimum distance in metres.
+        speed_m_s: ground speed of all moving vehicles.
+        slack_s: how early or late one vehicle may be relative to another, in seconds.
+        max_delay_s: maximum delay of a start in seconds.
     """
-    conflicts = _conflicts(routes, standing, min_distance_m)
+    conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
-        return Deconfliction("clear", "no two ways come too near", min_distance_m)
-    rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in standing.items()]
+        return Deconfliction("clear", "no paths come too close", min_distance_m)
+    rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in stationary.items()]
     order, refusal = list(routes), ""
     for _ in routes:
-        delays, stuck, behind = _delays(order, rests, min_distance_m, speed_m_s, slack_s, longest_s)
-        if stuck is None:
+        delays, blocked, blocker = _delays(order, rests, min_distance_m, speed_m_s, slack_s, max_delay_s)
+        if blocked is None:
             in_order = {each.name: delays[each.name] for each in routes}
-            why = f"{_pairs(conflicts)} come too near: they set off up to {max(delays.values()):g} s later"
-            return Deconfliction("corridors", why, min_distance_m, conflicts, {}, in_order)
-        refusal = f"{stuck.name} would have to wait for {behind} longer than {longest_s:g} s"
-        order = [stuck, *(each for each in order if each is not stuck)]  # who is in the way goes first
+            reason = f"{_pairs(conflicts)} come too close; starts are delayed by up to {max(delays.values()):g} s"
+            return Deconfliction("corridors", reason, min_distance_m, conflicts, {}, in_order)
+        refusal = f"{blocked.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
+        order = [
+            blocked,
+            *(each for each in order if each is not blocked),
+        ]  # retry with the blocked one first
     return Deconfliction("refused", refusal, min_distance_m, conflicts)
 
 
-# ------------------------------------------------------------------------------------------- inside
 def _conflicts(
-    routes: Sequence[Route], standing: Mapping[str, Place], min_distance_m: float
+    routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float
 ) -> tuple[Conflict, ...]:
     _check_distance(min_distance_m)
     paths = [Path.straight(each.name, each.start, each.target, 1.0) for each in routes]
-    moving = conflicts_of(paths, min_distance_m)
-    rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in standing.items()]
+    moving = find_conflicts(paths, min_distance_m)
+    rests = [Path(name, (PathPoint(0.0, *place),)) for name, place in stationary.items()]
     found = list(moving)
     for path in paths:
         for rest in rests:
-            near = least_distance(path, rest, below_m=min_distance_m)
+            near = min_path_distance(path, rest, below_m=min_distance_m)
             if near.distance_m < min_distance_m:
                 found.append(Conflict(path.name, rest.name, near.distance_m))
     return tuple(found)
@@ -181,39 +182,37 @@ def _delays(
     min_distance_m: float,
     speed_m_s: float,
     slack_s: float,
-    longest_s: float,
+    max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
-    """How long each waits; and who would wait too long, if anybody, and for whom."""
+    """Return the delay of each route; and, if one would exceed the maximum, this route and the name of its blocker."""
     placed: list[Path] = []
     delays: dict[str, float] = {}
     for route in order:
         delay_s = 0.0
         while True:
             path = Path.straight(route.name, route.start, route.target, speed_m_s, delay_s)
-            in_the_way = _first_near(path, [*placed, *rests], min_distance_m, slack_s)
-            if in_the_way is None:
+            blocker = _first_near(path, [*placed, *rests], min_distance_m, slack_s)
+            if blocker is None:
                 break
-            delay_s += STEP_S
-            if delay_s > longest_s:
-                return delays, route, in_the_way
+            delay_s += DELAY_STEP_S
+            if delay_s > max_delay_s:
+                return delays, route, blocker
         placed.append(path)
         delays[route.name] = delay_s
     return delays, None, ""
 
 
-def _ends_too_near(routes: Sequence[Route], standing: Mapping[str, Place], min_distance_m: float) -> str:
-    """Why nobody can go straight up or down; empty: they can."""
+def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPoint], min_distance_m: float) -> str:
+    """Return why the vehicles cannot climb and descend vertically; empty if they can."""
     for what in ("start", "target"):
         ends = {each.name: getattr(each, what) for each in routes}
-        # who stands well below an end is not in the way of one who goes up from it, or comes down to it
+        # A stationary vehicle well below an end point is not on the vertical path above it.
         for name, place in ends.items():
-            near = {other: there for other, there in standing.items() if there[2] > place[2] - min_distance_m}
+            near = {other: there for other, there in stationary.items() if there[2] > place[2] - min_distance_m}
             for other, there in {**ends, **near}.items():
                 distance = math.dist(place[:2], there[:2])
                 if other != name and distance < min_distance_m:
-                    return (
-                        f"the {what} of {name} is {distance:.1f} m beside that of {other}, as seen from above"
-                    )
+                    return f"the {what} of {name} is {distance:.1f} m from that of {other} horizontally: too close"
     return ""
 
 
@@ -221,25 +220,25 @@ def _cross(one: Route, other: Route, min_distance_m: float) -> bool:
     return horizontal_distance((one.start, one.target), (other.start, other.target)) < min_distance_m
 
 
-def _meets(route: Route, standing: Mapping[str, Place], height_m: float, min_distance_m: float) -> bool:
+def _meets(route: Route, stationary: Mapping[str, LocalPoint], height_m: float, min_distance_m: float) -> bool:
     return any(
         abs(place[2] - height_m) < min_distance_m
         and horizontal_distance((route.start, route.target), (place, place)) < min_distance_m
-        for place in standing.values()
+        for place in stationary.values()
     )
 
 
 def _first_near(path: Path, others: Sequence[Path], min_distance_m: float, slack_s: float) -> str | None:
     for other in others:
-        if least_distance(path, other, slack_s=slack_s, below_m=min_distance_m).distance_m < min_distance_m:
+        if min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m).distance_m < min_distance_m:
             return other.name
     return None
 
 
 def _pairs(conflicts: Sequence[Conflict]) -> str:
-    shown = [f"{each.name} and {each.other} ({each.distance_m:.1f} m)" for each in conflicts[:3]]
-    more = len(conflicts) - len(shown)
-    return ", ".join(shown) + (f" and {more} more pairs" if more else "")
+    texts = [f"{each.name} and {each.other} ({each.distance_m:.1f} m)" for each in conflicts[:3]]
+    more = len(conflicts) - len(texts)
+    return ", ".join(texts) + (f" and {more} more pairs" if more else "")
 
 
 def _check_distance(min_distance_m: float) -> None:
@@ -249,14 +248,14 @@ def _check_distance(min_distance_m: float) -> None:
 
 METRES_PER_DEGREE = 111_319.5
 
-AHEAD = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
-"""Half of the neighbours of a cube: the others have it for a neighbour."""
+# Half of the 26 neighbours of a cube; the other half has this cube among theirs.
+NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 
-def near_pairs(places: Mapping[str, Place], within_m: float) -> list[tuple[str, str, float]]:
-    """All pairs that are nearer to each other than ``within_m``, with their distance in metres.
+def pairs_within(places: Mapping[str, LocalPoint], within_m: float) -> list[tuple[str, str, float]]:
+    """Return all pairs that are closer than ``within_m``, with their distance in metres.
 
-    The air is divided into cubes of that size: only neighbouring ones are compared.
+    Space is divided into cubes of that size, and only vehicles in the same or neighbouring cubes are compared.
     """
     cubes: dict[tuple[int, int, int], list[str]] = {}
     for name, (north, east, up) in places.items():
@@ -266,7 +265,7 @@ def near_pairs(places: Mapping[str, Place], within_m: float) -> list[tuple[str, 
     found: list[tuple[str, str, float]] = []
     for (x, y, z), names in cubes.items():
         pairs = list(combinations(names, 2))
-        for dx, dy, dz in AHEAD:
+        for dx, dy, dz in NEIGHBOURS:
             others = cubes.get((x + dx, y + dy, z + dz))
             if others is not None:
                 pairs += product(names, others)
@@ -278,10 +277,10 @@ def near_pairs(places: Mapping[str, Place], within_m: float) -> list[tuple[str, 
     return sorted(found, key=lambda pair: (order[pair[0]], order[pair[1]]))
 
 
-def local_places(places: Mapping[str, tuple[float, float, float]]) -> dict[str, Place]:
-    """Latitudes, longitudes (degrees) and altitudes (metres) as metres around the first of them.
+def to_local_points(places: Mapping[str, tuple[float, float, float]]) -> dict[str, LocalPoint]:
+    """Convert latitude, longitude (degrees) and altitude (metres) to metres around the first position.
 
-    Good to a thousandth for some kilometres: for distances between neighbours.
+    Accurate to 0.1 % within a few kilometres.
     """
     if not places:
         return {}

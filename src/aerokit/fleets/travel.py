@@ -1,32 +1,40 @@
-"""``Travel``: going to places together, on ways that were compared before."""
+"""``Travel`` and ``Missions``: flying members to targets and missions on paths that are compared before."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
-from aerokit.fleets.action import FleetPart
-from aerokit.fleets.distances import Around, altitude_amsl, position_of
-from aerokit.fleets.events import PathsDecided
+from aerokit.fleets.action import SelectionBase
+from aerokit.fleets.distances import LocalOrigin, altitude_amsl, position_of
+from aerokit.fleets.events import PathsCompared
 from aerokit.fleets.members import Member
+from aerokit.fleets.paths import Path, PathPoint
 from aerokit.fleets.policy import FleetResult
-from aerokit.fleets.separation import Deconfliction, Route, in_corridors, in_layers
+from aerokit.fleets.separation import (
+    Deconfliction,
+    Route,
+    find_conflicts,
+    separate_by_altitude,
+    separate_by_time,
+)
+from aerokit.missions.mission import Mission
 from aerokit.position import Position
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
-WayApart = Literal["layers", "corridors", "refuse"]
-"""What is done about ways that cross: heights of their own, times of their own, or nothing is flown."""
+SeparationMethod = Literal["layers", "corridors", "refuse"]
+"""How crossing paths are separated: by altitude, by time, or not at all."""
 
 
 @checks_arguments
-class Travel(FleetPart):
-    """Places for each, and ways that do not meet."""
+class Travel(SelectionBase):
+    """Targets for each member, on paths that do not conflict."""
 
     async def go_to(
         self,
@@ -36,150 +44,148 @@ class Travel(FleetPart):
         max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         stagger_s: float | None = None,
-        apart: Deconfliction | None = None,
+        separation: Deconfliction | None = None,
     ) -> FleetResult:
-        """Fly each to a place of its own; as :meth:`aerokit.Vehicle.go_to`.
+        """Fly each member to its own target; see :meth:`aerokit.Vehicle.go_to`.
 
-        In a fleet with a ``min_distance_m`` the ways are compared first, and flown in layers if they cross.
+        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
-            speed_m_s: ground speed; None leaves it.
-            max_distance_m: metres from where each is; a place farther away is refused.
-            timeout: seconds that each of them has for a leg; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
-            apart: what :meth:`plan_apart` has decided about these targets.
+            targets: member's name → target; other members stay where they are. Or a function that returns a member's
+                target.
+            speed_m_s: ground speed; None: unchanged.
+            max_distance_m: reject targets farther than this from the vehicle.
+            timeout: seconds for each member and leg; None: no limit.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
+            separation: result of :meth:`plan_separation` for these targets.
 
         Raises:
-            InvalidArgument: a name is nobody's, or a place is too far away. Nothing was sent.
-            ValueUnknownError: it is not known where one of them is. Nothing was sent.
-            OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
-                out between two legs in layers: the others stay where they are.
+            InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
+            ValueUnknownError: the position of a member is unknown. Nothing was sent.
+            OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
+                unavailable between two legs in layers: the others stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        places = self._places(targets)
-        names = tuple(self.members) if callable(targets) else tuple(places)
-        for name, place in places.items():
-            self.members[name].vehicle._where.check_reach(f"targets[{name!r}]", [place], max_distance_m)
+        positions = self._resolve_targets(targets)
+        names = tuple(self.members) if callable(targets) else tuple(positions)
+        for name, target in positions.items():
+            self.members[name].vehicle._position.check_reach(f"targets[{name!r}]", [target], max_distance_m)
         return await self._travel(
-            "go_to", places, speed_m_s, timeout, stagger_s, apart, names=names, max_distance_m=max_distance_m
+            "go_to",
+            positions,
+            speed_m_s,
+            timeout,
+            stagger_s,
+            separation,
+            names=names,
+            max_distance_m=max_distance_m,
         )
 
-    def plan_apart(
+    def plan_separation(
         self,
         targets: Mapping[str, Position] | Callable[[Member], Position],
         *,
         min_distance_m: float | None = None,
-        by: WayApart = "layers",
+        by: SeparationMethod = "layers",
         speed_m_s: float | None = None,
-        highest_m: float | None = None,
+        max_altitude_m: float | None = None,
         slack_s: float = 3.0,
     ) -> Deconfliction:
-        """Compare the straight ways to these places, and decide how they are flown. Nothing is sent.
+        """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Who is not named counts where it is. The event :class:`PathsDecided` tells what was decided.
+        Members without a target count at their current position. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
-            min_distance_m: metres that have to be between any two; None: the fleet's own.
-            by: ``"layers"``: heights of their own; ``"corridors"``: times of their own, for which ``speed_m_s`` is
-                needed; ``"refuse"``: ways that cross are not flown.
-            speed_m_s: of all of them.
-            highest_m: no layer is higher, in metres above the sea; None: no limit.
-            slack_s: for corridors: by how many seconds one may be early or late compared with another.
+            min_distance_m: minimum distance between any two members in metres; None: the fleet's own.
+            by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
+                ``"refuse"``: refuse crossing paths.
+            speed_m_s: ground speed of all members.
+            max_altitude_m: highest layer in metres above sea level; None: no limit.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds.
 
         Raises:
-            InvalidArgument: a name is nobody's, or an argument is missing.
-            ValueUnknownError: it is not known where one of them is.
+            InvalidArgument: a name is unknown, or an argument is missing.
+            ValueUnknownError: the position of a member is unknown.
         """
-        least_m = self._crew.min_distance_m if min_distance_m is None else min_distance_m
-        if least_m is None:
+        min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
+        if min_m is None:
             raise InvalidArgument("min_distance_m is needed: this fleet has none")
-        routes, standing = self._routes(self._places(targets))
+        routes, stationary = self._routes(self._resolve_targets(targets))
         if by == "corridors":
             if speed_m_s is None:
-                raise InvalidArgument("by = 'corridors' needs speed_m_s: times come of ways and speeds")
-            decided = in_corridors(routes, standing, least_m, speed_m_s, slack_s=slack_s)
+                raise InvalidArgument("by = 'corridors' needs speed_m_s to compute times")
+            deconfliction = separate_by_time(routes, stationary, min_m, speed_m_s, slack_s=slack_s)
         else:
-            decided = in_layers(
-                routes, standing, least_m, highest_m=float("inf") if highest_m is None else highest_m
-            )
-            if by == "refuse" and decided.decision == "layers":
-                decided = decided.replace(decision="refused", heights_m={})
-        self._crew.tell(PathsDecided(self._crew.now(), 0, "", decided))
-        return decided
+            max_m = math.inf if max_altitude_m is None else max_altitude_m
+            deconfliction = separate_by_altitude(routes, stationary, min_m, max_altitude_m=max_m)
+            if by == "refuse" and deconfliction.decision == "layers":
+                deconfliction = deconfliction.replace(decision="refused", heights_m={})
+        self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
+        return deconfliction
 
-    # --------------------------------------------------------------------------------------- inside
+    # --------------------------------------------------------------------------------------- private
 
     async def _travel(
         self,
-        what: str,
-        places: Mapping[str, Position],
+        action: str,
+        targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
         stagger_s: float | None = None,
-        apart: Deconfliction | None = None,
+        separation: Deconfliction | None = None,
         *,
         names: tuple[str, ...] = (),
         max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
-        """On ways that are compared, if nothing is decided about them; ``what``: the action, as errors call it."""
-        if apart is None and self._crew.min_distance_m is not None:
-            apart = self.plan_apart(places, speed_m_s=speed_m_s)
-        if apart is None or apart.decision == "clear":
-            return await self._fly_to(
-                what, places, speed_m_s, timeout, stagger_s, None, names, max_distance_m
-            )
-        if apart.decision == "refused":
-            raise OperationRejected(f"{what}: {apart.why}; nothing was sent")
-        if apart.decision == "corridors":
-            delays_s = apart.delays_s
-            return await self._fly_to(
-                what, places, speed_m_s, timeout, stagger_s, delays_s, (), max_distance_m
-            )
-        return await self._fly_in_layers(what, places, speed_m_s, timeout, apart.heights_m, max_distance_m)
+        if separation is None and self._context.min_distance_m is not None:
+            separation = self.plan_separation(targets, speed_m_s=speed_m_s)
+        if separation is None or separation.decision == "clear":
+            return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, None, names, max_distance_m)
+        if separation.decision == "refused":
+            raise OperationRejected(f"{action}: {separation.reason}; nothing was sent")
+        if separation.decision == "corridors":
+            delays_s = separation.delays_s
+            return await self._fly_to(action, targets, speed_m_s, timeout, stagger_s, delays_s, (), max_distance_m)
+        return await self._fly_in_layers(action, targets, speed_m_s, timeout, separation.heights_m, max_distance_m)
 
-    def _places(self, targets: Mapping[str, Position] | Callable[[Member], Position]) -> dict[str, Position]:
-        for each in self:
-            each.look()
+    def _resolve_targets(self, targets: Mapping[str, Position] | Callable[[Member], Position]) -> dict[str, Position]:
+        for member in self:
+            member.refresh()
         if callable(targets):
-            return {each.name: _target_of(targets, each) for each in self if each.takes_orders}
+            return {member.name: _call(targets, member) for member in self if member.is_available}
         for name in targets:
             if name not in self.members:
-                raise InvalidArgument(f"targets: {shown(name)} is not one of {', '.join(self.members)}")
+                raise InvalidArgument(f"targets: {short_repr(name)} is not one of {', '.join(self.members)}")
         return dict(targets)
 
-    def _routes(
-        self, places: Mapping[str, Position]
-    ) -> tuple[list[Route], dict[str, tuple[float, float, float]]]:
-        """Of those that move, and where all others of the fleet are, as far as that is known."""
-        members = self._crew.members
-        movers = [members[name] for name in places if members[name].takes_orders]
-        if not movers:
+    def _routes(self, targets: Mapping[str, Position]) -> tuple[list[Route], dict[str, tuple[float, float, float]]]:
+        """Return the routes of the moving members, and the known positions of all other members of the fleet."""
+        members = self._context.members
+        moving = [members[name] for name in targets if members[name].is_available]
+        if not moving:
             return [], {}
-        around = Around(position_of(movers[0]))
+        origin = LocalOrigin(position_of(moving[0]))
         routes = [
             Route(
-                each.name,
-                around.of_member(each),
-                around.place(places[each.name], altitude_amsl(each, places[each.name])),
+                member.name,
+                origin.of_member(member),
+                origin.to_local(targets[member.name], altitude_amsl(member, targets[member.name])),
             )
-            for each in movers
+            for member in moving
         ]
-        standing = {
-            each.name: around.place(here, here.altitude_amsl_m)
-            for each in members.values()
-            if each not in movers
-            and (here := each.vehicle.position.latest)
-            and here.altitude_amsl_m is not None
+        stationary = {
+            member.name: origin.to_local(here, here.altitude_amsl_m)
+            for member in members.values()
+            if member not in moving and (here := member.vehicle.position.latest) and here.altitude_amsl_m is not None
         }
-        return routes, standing
+        return routes, stationary
 
     async def _fly_to(
         self,
-        what: str,
-        places: Mapping[str, Position],
+        action: str,
+        targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
         stagger_s: float | None = None,
@@ -191,47 +197,189 @@ class Travel(FleetPart):
             if delays_s and delays_s.get(member.name):
                 await anyio.sleep(delays_s[member.name])
             await member.vehicle.go_to(
-                places[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
+                targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
             )
 
-        return await self._run(what, fly, stagger_s=stagger_s, names=names or tuple(places))
+        return await self._run(action, fly, stagger_s=stagger_s, names=names or tuple(targets))
 
     async def _fly_in_layers(
         self,
-        what: str,
-        places: Mapping[str, Position],
+        action: str,
+        targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
         heights_m: Mapping[str, float],
         max_distance_m: float,
     ) -> FleetResult:
-        """Up, across, down: all of them are done with one before anybody begins the next."""
-        here = {name: position_of(self._crew.members[name], math.inf) for name in heights_m}
-        stages: tuple[dict[str, Position], ...] = (
-            {name: _at(here[name], height) for name, height in heights_m.items()},
-            {name: _at(places[name], height) for name, height in heights_m.items()},
-            {name: places[name] for name in heights_m},
+        """Fly up, across and down. All members finish one leg before the next begins."""
+        here = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
+        legs: tuple[dict[str, Position], ...] = (
+            {name: _at_altitude(here[name], height) for name, height in heights_m.items()},
+            {name: _at_altitude(targets[name], height) for name, height in heights_m.items()},
+            {name: targets[name] for name in heights_m},
         )
         result: FleetResult | None = None
-        for stage in stages:
-            gone = [name for name in stage if not self.members[name].takes_orders]
-            if gone:  # it may stand in anybody's way
+        for leg in legs:
+            missing = [name for name in leg if not self.members[name].is_available]
+            if missing:  # its position is not under control, so it may be in the path of any other
                 raise OperationRejected(
-                    f"{what}: {', '.join(gone)} fell out between two legs; the others stay in their layers"
+                    f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
+                    " layers"
                 )
-            result = await self._fly_to(what, stage, speed_m_s, timeout, max_distance_m=max_distance_m)
+            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m=max_distance_m)
             if not result.is_complete:
                 break
         assert result is not None
         return result
 
 
-def _target_of(targets: Callable[[Member], Position], member: Member) -> Position:
+def _call(targets: Callable[[Member], Position], member: Member) -> Position:
     try:
         return targets(member)
-    except ValueUnknownError as error:  # such as where it is now
+    except ValueUnknownError as error:
         raise type(error)(f"{member.name}: {error}") from error
 
 
-def _at(place: Position, altitude_amsl_m: float) -> Position:
-    return Position(place.latitude_deg, place.longitude_deg, altitude_amsl_m=altitude_amsl_m)
+def _at_altitude(position: Position, altitude_amsl_m: float) -> Position:
+    return Position(position.latitude_deg, position.longitude_deg, altitude_amsl_m=altitude_amsl_m)
+
+
+@checks_arguments
+class Missions(SelectionBase):
+    """Missions, one for each member."""
+
+    async def upload(
+        self,
+        missions: Mapping[str, Mission],
+        *,
+        max_concurrent: int = 8,
+        max_distance_m: float = MAX_DISTANCE_M,
+        timeout: float | None = None,
+    ) -> FleetResult:
+        """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
+
+        :meth:`start_missions` starts them only after all uploads succeeded. A fleet with a ``min_distance_m`` compares
+        the missions first.
+
+        Args:
+            missions: member's name → mission.
+            max_concurrent: maximum number of simultaneous transfers on each network, from 1.
+            max_distance_m: reject missions with a position farther than this from the vehicle.
+            timeout: seconds for each member; None: no limit while data arrives.
+
+        Raises:
+            InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
+            OperationRejected: a member is unavailable, or paths come too close. Nothing was sent.
+            FleetError: an upload failed; ``start_missions`` will start none of them.
+        """
+        if max_concurrent < 1:
+            raise InvalidArgument(f"max_concurrent = {max_concurrent!r} is not allowed: at least 1")
+        members = self._require_available(missions)
+        for name, mission in missions.items():
+            mission.check(home_is_item_0=members[name].vehicle.autopilot.home_is_item_0)
+            positions = filter(None, (item.position for item in mission.to_items()))
+            members[name].vehicle._position.check_reach(f"missions[{name!r}]", positions, max_distance_m)
+        self._context.missions.clear()
+        if self._context.min_distance_m is not None:
+            deconfliction = self.compare_missions(missions)
+            if deconfliction.decision == "refused":
+                raise OperationRejected(f"upload: {deconfliction.reason}; nothing was sent")
+        slots = {name: anyio.Semaphore(max_concurrent) for name in self._context.networks}
+
+        async def upload(member: Member) -> None:
+            async with slots[member.network]:
+                await member.vehicle.mission.upload(
+                    missions[member.name], timeout=timeout, max_distance_m=max_distance_m
+                )
+
+        result = await self._run("upload", upload, names=tuple(missions))
+        result.raise_for_errors()
+        self._context.missions.update(missions)
+        return result
+
+    async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
+        """Start the uploaded missions of all members, or of none; see ``vehicle.mission.start``.
+
+        Args:
+            timeout: seconds until each member reports its mission mode.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
+
+        Raises:
+            OperationRejected: no upload succeeded for all members, or a member is unavailable or not armed. Nothing was
+                sent.
+        """
+        names = tuple(name for name in self._context.missions if name in self.members)
+        if not names:
+            raise OperationRejected("start_missions: no missions were uploaded to all members; call upload() first")
+        members = self._require_available(dict.fromkeys(names))
+        disarmed = [name for name in names if not members[name].vehicle.is_armed]
+        if disarmed:
+            raise OperationRejected(f"start_missions: not armed: {', '.join(disarmed)}; nothing was sent")
+        return await self._run(
+            "mission.start",
+            lambda member: member.vehicle.mission.start(timeout=timeout),
+            stagger_s=stagger_s,
+            names=names,
+        )
+
+    async def wait_missions_finished(self, *, timeout: float | None = None) -> FleetResult:
+        """Wait until each member has finished its mission; see ``vehicle.mission.wait_finished``.
+
+        Args:
+            timeout: seconds until all of them have; None: no limit.
+        """
+        names = tuple(name for name in self._context.missions if name in self.members)
+        return await self._run(
+            "mission.wait_finished",
+            lambda member: member.vehicle.mission.wait_finished(timeout=timeout),
+            names=names,
+        )
+
+    def compare_missions(
+        self, missions: Mapping[str, Mission], *, min_distance_m: float | None = None
+    ) -> Deconfliction:
+        """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
+
+        Ignores items without a position, terrain altitudes and jumps.
+
+        Args:
+            missions: member's name → mission.
+            min_distance_m: minimum distance between any two paths in metres; None: the fleet's own.
+
+        Raises:
+            InvalidArgument: a name is unknown, or an argument is missing.
+            ValueUnknownError: the position of a member is unknown.
+        """
+        min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
+        if min_m is None:
+            raise InvalidArgument("min_distance_m is needed: this fleet has none")
+        members = self._require_available(missions)
+        first = next(iter(members.values()), None)
+        origin = None if first is None else LocalOrigin(position_of(first, math.inf))
+        paths = [] if origin is None else [_path(origin, members[name], each) for name, each in missions.items()]
+        conflicts = find_conflicts([path for path in paths if path is not None], min_m)
+        pairs = ", ".join(f"{each.name} and {each.other} ({each.distance_m:.1f} m)" for each in conflicts[:3])
+        reason = f"{pairs} come too close" if conflicts else "no paths come too close"
+        deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
+        self._context.publish(PathsCompared(self._context.now(), 0, "", deconfliction))
+        return deconfliction
+
+    def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
+        found: dict[str, Member] = {}
+        for name in missions:
+            if name not in self.members:
+                raise InvalidArgument(f"missions: {short_repr(name)} is not one of {', '.join(self.members)}")
+            member = found[name] = self.members[name]
+            member.refresh()
+            if not member.is_available:
+                raise OperationRejected(f"missions: {name} is {member.status}; nothing was sent")
+        return found
+
+
+def _path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
+    points = [
+        PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position)))
+        for position in (item.position for item in mission)
+        if position is not None and not math.isnan(position.latitude_deg)
+    ]
+    return Path(member.name, points) if points else None

@@ -1,4 +1,4 @@
-"""A hub: several links joined into one MAVLink network, with filters, signing at the border and bounded queues."""
+"""``Hub``: joins several links into one MAVLink network, with filters, signing per endpoint and bounded queues."""
 
 from __future__ import annotations
 

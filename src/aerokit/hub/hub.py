@@ -1,4 +1,4 @@
-"""``Hub``: several links joined into one MAVLink network."""
+"""``Hub``: joins several links into one MAVLink network."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import anyio
 from aerokit._internal.arguments import checked, checks_arguments
 from aerokit._internal.async_block import async_block
 from aerokit.connection.frame_observers import Recording
-from aerokit.connection.tasks import Background
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkError
-from aerokit.hub.attachment import Attachment, check_filters
+from aerokit.hub.attachment import Attachment, filters_of
 from aerokit.hub.shared_link import SharedLink
 from aerokit.hub.switch import Switch
 from aerokit.hub.values import Endpoint, HubEvent
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.transport.link import Link
-from aerokit.transport.reconnecting import Delays
+from aerokit.transport.reconnecting import Backoff
 
 if TYPE_CHECKING:
     import os
@@ -37,71 +37,69 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 CLOSE_TIMEOUT_S = 2.0
 
-FLUSH_EVERY_S = 1.0
+FLUSH_INTERVAL_S = 1.0
 
-_QUIET_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "restored")
+_INFO_KINDS = ("opened", "removed", "client_joined", "client_left", "drained", "restored")
 
 
 @checks_arguments
 class Hub:
-    """Passes MAVLink frames on between its endpoints, by MAVLink's own routing rules, and says nothing of its own.
+    """Forwards MAVLink frames between endpoints by MAVLink's routing rules. It sends no messages of its own.
 
     ```python
     async with aerokit.Hub(["serial:///dev/ttyACM0:115200", "tcpin:0.0.0.0:5760", "udpout:10.0.0.7:14550"]) as hub:
         await asyncio.sleep(3600)
     ```
 
-    Each client of a listening endpoint is a place of its own to the routing. Links that are lost are opened again.
-    An endpoint that fails, stalls or is flooded harms no other one: what waits for it is bounded, newer telemetry
-    takes the place of older, and an order that has waited for a second is dropped instead of arriving late.
+    Each client of a listening endpoint is routed separately. Lost links are reopened. An endpoint that fails, stalls or
+    is flooded does not affect the others: its queue is bounded, newer telemetry replaces older telemetry, and a command
+    that has waited for a second is dropped.
 
-    A hub runs in the asyncio loop it was entered in, and is entered once.
+    A hub runs in the asyncio loop in which it is entered, and can be entered once.
     """
 
-    def __init__(
-        self, endpoints: Iterable[str | Endpoint | Link] = (), *, dialect: Dialect = STANDARD
-    ) -> None:
-        """Nothing is opened yet.
+    def __init__(self, endpoints: Iterable[str | Endpoint | Link] = (), *, dialect: Dialect = STANDARD) -> None:
+        """Create a hub without opening it.
 
         Args:
-            endpoints: connection strings, links that are not open, or `Endpoint` with what may pass.
-            dialect: the messages that are understood; others are passed on to everybody, unchecked.
+            endpoints: connection strings, unopened links, or `Endpoint` with filters.
+            dialect: known messages; others are forwarded to all endpoints, unchecked.
 
         Raises:
-            InvalidArgument: an address or a name of a message is wrong, or two endpoints have one name.
+            InvalidArgument: an address or a message name is wrong, or two endpoints have the same name.
         """
         if isinstance(endpoints, str):
             raise InvalidArgument(f"endpoints = {endpoints!r} is not allowed: a list of addresses")
-        self._given = [_endpoint(each) for each in endpoints]
-        for each in self._given:
-            check_filters(each, dialect)
-        names = [each.name for each in self._given if each.name]
+        self._endpoints = [_endpoint(given) for given in endpoints]
+        for endpoint in self._endpoints:
+            filters_of(endpoint, dialect)
+        names = [endpoint.name for endpoint in self._endpoints if endpoint.name]
         for name in names:
             if names.count(name) > 1:
-                raise InvalidArgument(f"two endpoints are called {name!r}")
+                raise InvalidArgument(f"two endpoints have the name {name!r}")
         self._dialect = dialect
         self._attachments: dict[str, Attachment] = {}
         self._listeners: list[Callable[[HubEvent], object]] = []
         self._switch: Switch | None = None
-        self._background: Background | None = None
+        self._background: BackgroundTasks | None = None
         self._is_closed = False
 
     async def __aenter__(self) -> Self:
         """Open all endpoints.
 
         Raises:
-            LinkOpenError: one of them, which is not ``patient``, could not be opened; none is open then.
-            InvalidArgument: two endpoints have one address and no names.
+            LinkOpenError: one of them, without ``retry_open``, could not be opened; all are closed again.
+            InvalidArgument: two endpoints have the same address and no names.
             BusyError: the hub was entered before.
         """
         if self._switch is not None:
-            raise BusyError("a hub is entered once: make another one")
-        self._switch = Switch(self._dialect, _gate, self._on_mistake)
+            raise BusyError("a hub can be entered only once; make a new one")
+        self._switch = Switch(self._dialect, _period, self._on_port_error)
         self._switch.router.on_change = self._on_change
-        self._background = Background(self._on_background_mistake)
+        self._background = BackgroundTasks(self._on_background_error)
         self._background.start(self._flush_recording, "aerokit hub")
         try:
-            for endpoint in self._given:
+            for endpoint in self._endpoints:
                 await self._add(endpoint)
         except BaseException:
             await self._close()
@@ -111,31 +109,31 @@ class Hub:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Close all of them."""
+        """Close all endpoints."""
         await self._close()
 
     @property
     def endpoints(self) -> tuple[EndpointStatistics, ...]:
-        """What has come and gone by each endpoint until now, in the order they were added."""
+        """Counters of each endpoint, in the order in which they were added."""
         return tuple(attachment.statistics() for attachment in self._attachments.values())
 
     async def add(self, endpoint: str | Endpoint | Link) -> EndpointStatistics:
-        """Open one more endpoint, and say what it is called and where it is.
+        """Open another endpoint, and return its name, address and counters.
 
         Raises:
-            LinkOpenError: it could not be opened, and is not ``patient``.
-            InvalidArgument: the address, the name or a name of a message is wrong; nothing was opened.
-            BusyError: the link given is in use.
-            ConnectionClosed: the hub, or the link given, is closed.
+            LinkOpenError: it could not be opened and has no ``retry_open``.
+            InvalidArgument: the address, the name or a message name is wrong; nothing was opened.
+            BusyError: the given link is in use.
+            ConnectionClosed: the hub or the given link is closed.
         """
         self._raise_unless_open()
         return (await self._add(_endpoint(endpoint))).statistics()
 
     async def remove(self, name: str) -> None:
-        """Close an endpoint and forget who was behind it.
+        """Close an endpoint and forget its senders.
 
         Raises:
-            InvalidArgument: there is none of this name.
+            InvalidArgument: no endpoint has this name.
             ConnectionClosed: the hub is closed.
         """
         self._raise_unless_open()
@@ -143,18 +141,18 @@ class Hub:
         if attachment is None:
             raise InvalidArgument(f"name = {name!r} is not allowed: {', '.join(self._attachments) or 'none'}")
         attachment.close()
-        self._tell(attachment, "removed", f"{name} was removed")
+        self._report(attachment, "removed", f"{name} was removed")
         await _closed([attachment])
 
     async def share(self, connection: Connection, *, name: str = "program") -> EndpointStatistics:
-        """Make an open connection of this program an endpoint: its vehicles, and what it sends itself.
+        """Add an open connection of this program as an endpoint.
 
-        The connection goes on as before, with all of its events. What it receives and sends goes to the other endpoints
-        as it would from a link; what they send to its vehicles goes out by it, signed if it signs. Others should have
-        other ids than the program (``source_system``, ``source_component``): what is for these ids is the program's.
+        The connection continues as before. Frames that it receives and sends go to the other endpoints; their frames to
+        its vehicles are sent over it, signed if it signs. Other stations need other ids than this program
+        (``source_system``, ``source_component``), because frames for these ids are for the program.
 
         Raises:
-            InvalidArgument: there is an endpoint of this name.
+            InvalidArgument: an endpoint has this name already.
             ConnectionClosed, LinkLost: the hub is closed, or the connection has ended.
         """
         self._raise_unless_open()
@@ -162,9 +160,9 @@ class Hub:
         return (await self._add(Endpoint(SharedLink(connection), name=name))).statistics()
 
     def on_event(self, listener: Callable[[HubEvent], object]) -> Callable[[], None]:
-        """Have ``listener(event)`` called for what happens to endpoints; call what is returned to end it.
+        """Call ``listener(event)`` for every event; return a function that ends this.
 
-        It must be quick and must not raise; what it raises is logged.
+        The listener must return quickly; its exceptions are logged.
         """
         self._listeners.append(listener)
 
@@ -175,54 +173,54 @@ class Hub:
         return detach
 
     def record(self, path: str | os.PathLike[str]) -> None:
-        """Write every frame that is passed on, once, to a ``.tlog`` file from now on; an existing file is replaced.
+        """Record every forwarded frame once to a ``.tlog`` file. An existing file is replaced.
 
-        Signatures that are taken off at an endpoint are not in it, nor is SETUP_SIGNING, which holds a key. A disk that
-        is full ends the recording, not the hub.
+        The recording has no signatures that an endpoint removes, and no SETUP_SIGNING, which contains a key. A full
+        disk ends the recording, not the hub.
 
         Raises:
             LinkOpenError: the file cannot be written.
-            BusyError: a recording is under way.
+            BusyError: the hub is being recorded already.
             ConnectionClosed: the hub is closed, or not entered yet.
         """
         switch = self._raise_unless_open()
         if switch.recording is not None:
-            raise BusyError("this hub is being recorded already")
+            raise BusyError("this hub is already being recorded")
         switch.recording = Recording(path, asyncio.get_running_loop().time())
 
-    # ------------------------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------------------------ internal
 
     async def _add(self, endpoint: Endpoint) -> Attachment:
         assert self._switch is not None
         assert self._background is not None
         clock = asyncio.get_running_loop().time
-        attachment = Attachment(endpoint, self._switch, self._dialect, clock, self._tell)
+        attachment = Attachment(endpoint, self._switch, self._dialect, clock, self._report)
         if attachment.name in self._attachments:
-            raise InvalidArgument(f"two endpoints are called {attachment.name!r}: give them names")
+            raise InvalidArgument(f"two endpoints have the name {attachment.name!r}: set Endpoint(name=…)")
         self._attachments[attachment.name] = attachment
         try:
             await attachment.open()
         except LinkError as error:
-            if not endpoint.patient:
+            if not endpoint.retry_open:
                 del self._attachments[attachment.name]
                 raise
-            self._tell(attachment, "lost", f"{error}; trying until it can be opened")
-            self._background.start(lambda: self._open_later(attachment), "aerokit hub opening")
+            self._report(attachment, "lost", f"{error}; it is retried until it can be opened")
+            self._background.start(lambda: self._retry_opening(attachment), "aerokit hub opening")
         except BaseException:
             self._attachments.pop(attachment.name, None)
             raise
         return attachment
 
-    async def _open_later(self, attachment: Attachment) -> None:
-        delays = Delays()
+    async def _retry_opening(self, attachment: Attachment) -> None:
+        backoff = Backoff()
         while self._attachments.get(attachment.name) is attachment:
-            await anyio.sleep(delays.take())
+            await anyio.sleep(backoff.next_delay())
             if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
                 return
             try:
                 await attachment.open()
             except LinkError as error:
-                logger.debug("not yet: %s", error)
+                logger.debug("the link still cannot be opened: %s", error)
             else:
                 if self._attachments.get(attachment.name) is not attachment:  # removed meanwhile
                     attachment.close()
@@ -245,59 +243,55 @@ class Hub:
 
     async def _flush_recording(self) -> None:
         while True:
-            await anyio.sleep(FLUSH_EVERY_S)
+            await anyio.sleep(FLUSH_INTERVAL_S)
             if self._switch is not None and self._switch.recording is not None:
                 self._switch.recording.flush()
 
     def _raise_unless_open(self) -> Switch:
         if self._switch is None or self._is_closed:
-            raise ConnectionClosed(
-                "the hub is closed" if self._is_closed else "enter the hub first: async with hub:"
-            )
+            raise ConnectionClosed("the hub is closed" if self._is_closed else "enter the hub first: async with hub:")
         return self._switch
 
-    def _tell(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
-        logger.log(
-            logging.INFO if kind in _QUIET_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text
-        )
+    def _report(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
+        logger.log(logging.INFO if kind in _INFO_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text)
         event = HubEvent(asyncio.get_running_loop().time(), attachment.name, kind, text)
         for listener in tuple(self._listeners):
             try:
                 listener(event)
             except Exception:
-                logger.exception("a listener (%r) raised; the others are told all the same", listener)
+                logger.exception("listener %r raised an exception; the other listeners are called", listener)
 
     def _on_change(self, kind: HubEventKind, source: int, port: Port, before: Port | None) -> None:
-        if before is not None and before.endpoint == port.endpoint and kind == "moved":
-            return  # its guard has told it
-        who = f"{source & 0xFF}/{source >> 8}"
-        other = "an endpoint that has gone" if before is None else before.endpoint
+        if before is not None and before.endpoint == port.endpoint and kind == "route_changed":
+            return  # reported by its IdentityGuard
+        ids = f"{source & 0xFF}/{source >> 8}"
+        other = "a removed endpoint" if before is None else before.endpoint
         text = {
-            "heard_twice": f"{who} is heard here and at {other}, where what is for it goes: two links to one vehicle,"
-            " or two vehicles with the same ids",
-            "moved": f"what is for {who} goes here now: it is not heard at {other} any more",
-            "loop": f"what {who} said at {other} comes back here: both lead to the same network in a circle; what comes"
-            " round is dropped",
+            "duplicate_sender": f"{ids} is received here and at {other}, where its messages are sent: two links to one"
+            " vehicle, or two vehicles with the same ids",
+            "route_changed": f"messages for {ids} are sent here now, because it is no longer received at {other}",
+            "loop": f"frames of {ids} from {other} come back here: both endpoints lead to the same network; returning"
+            " frames are dropped",
         }[kind]
         port.report(kind, text)
 
-    def _on_mistake(self, port: Port, error: Exception) -> None:
-        port.report("mistake", f"what was to be sent is lost: {error}")
+    def _on_port_error(self, port: Port, error: Exception) -> None:
+        port.report("internal_error", f"frames to be sent are lost: {error}")
 
-    def _on_background_mistake(self, error: Exception) -> None:
-        logger.error("a mistake inside aerokit's hub; its endpoints go on", exc_info=error)
+    def _on_background_error(self, error: Exception) -> None:
+        logger.error("internal error of aerokit's hub; its endpoints continue", exc_info=error)
 
 
 def _endpoint(given: str | Endpoint | Link) -> Endpoint:
     return given if isinstance(given, Endpoint) else Endpoint(given)
 
 
-def _gate(port: Port, message_id: int) -> float | None:
+def _period(port: Port, message_id: int) -> float | None:
     return port.period(message_id)
 
 
 async def _closed(attachments: list[Attachment]) -> None:
-    """Wait until nothing is left of their links, for a while at most."""
+    """Wait until their links are closed, at most `CLOSE_TIMEOUT_S`."""
     with anyio.CancelScope(shield=True), anyio.move_on_after(CLOSE_TIMEOUT_S):
         for attachment in attachments:
             await attachment.wait_closed()
@@ -306,16 +300,16 @@ async def _closed(attachments: list[Attachment]) -> None:
 @checked
 @async_block
 async def shared(connection: Connection, endpoints: Iterable[str | Endpoint | Link]) -> AsyncIterator[Hub]:
-    """Share an open connection with other programs for the time of the ``async with`` block; gives the hub that does.
+    """Share an open connection with other programs for an ``async with`` block, which yields the hub.
 
     ``aerokit.connect(…, share=[…])`` does the same. See `Hub.share`.
 
     Args:
-        connection: of this program; it stays open.
-        endpoints: where the others are, or come: ``["tcpin:127.0.0.1:5760"]``.
+        connection: connection of this program; it stays open.
+        endpoints: endpoints for the other programs, e.g. ``["tcpin:127.0.0.1:5760"]``.
 
     Raises:
-        InvalidArgument: an address is wrong, or two endpoints have one name.
+        InvalidArgument: an address is wrong, or two endpoints have the same name.
         LinkOpenError: an endpoint could not be opened.
         ConnectionClosed, LinkLost: the connection has ended.
     """

@@ -1,30 +1,167 @@
-"""``Port``: one peer of one endpoint, which is what frames come from and go to."""
+"""``Port``: one peer of one endpoint, with the queue of frames that wait for its link, and its signing."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from aerokit.hub.outgoing import Held, HeldFrames, Kind, kind_of
+from aerokit.hub.message_rules import ORDER_MAX_AGE_S, MessageKind, kind_of
+from aerokit.mavlink.frame import MAGIC_V2, SIGNED, Frame, x25
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
-    from aerokit.hub.guards import Border, IdentityGuard
-    from aerokit.hub.routing import Node, Plan
+    from aerokit.hub.routing import ForwardingPlan, RouterPort
+    from aerokit.hub.senders import IdentityGuard
     from aerokit.hub.values import HubEventKind
     from aerokit.mavlink.dialect import Dialect
+    from aerokit.mavlink.signing import Signing
     from aerokit.transport.link import Link, Peer
 
-JOINED_BYTES = 1200
-"""Frames that leave together are written together up to so many bytes, which is a datagram that nobody cuts up."""
-NEVER = 1 << 62
-MOST_RATES = 4096
-"""So many (sender, message) are thinned out one by one."""
+MAX_QUEUED_FRAMES = 1024
+
+MAX_QUEUED_BYTES = 128 * 1024
+"""A few seconds of a mission or of parameters on a slow radio."""
 
 
-class Totals:
-    """What an endpoint counts; shared by its ports, and kept when they have gone."""
+class QueuedFrame(NamedTuple):
+    """A frame that waits for a link."""
+
+    raw: bytes
+    kind: MessageKind
+    message_id: int
+    target: tuple[int, int]
+    since: float
+
+
+class FrameQueue:
+    """Queue in which newer telemetry replaces older telemetry of the same message and sender.
+
+    When the queue is full, the oldest telemetry is dropped first, then the new frame.
+    """
+
+    def __init__(self) -> None:
+        # In order. Keys: sender and message for telemetry, negative numbers for all others.
+        self._frames: dict[int, QueuedFrame] = {}
+        self._bytes = 0
+        self._count = 0
+        self._orders = self._telemetry = 0  # counts, to skip searches
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def put(self, frame: QueuedFrame, key: int) -> list[tuple[str, QueuedFrame]]:
+        """Add a frame; ``key`` identifies its sender and message. Return dropped frames with the reason."""
+        dropped: list[tuple[str, QueuedFrame]] = []
+        if frame.kind is MessageKind.TELEMETRY:
+            before = self._frames.get(key)
+            if before is not None:
+                self._bytes += len(frame.raw) - len(before.raw)
+                self._frames[key] = frame
+                return [("superseded", before)]
+        else:
+            self._count -= 1
+            key = self._count
+        while self._is_full(len(frame.raw)):
+            if not self._telemetry:
+                return [*dropped, ("queue_full", frame)]
+            oldest = next(key for key, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
+            dropped.append(("queue_full", self._take(oldest)))
+        self._frames[key] = frame
+        self._bytes += len(frame.raw)
+        self._orders += frame.kind is MessageKind.ORDER
+        self._telemetry += frame.kind is MessageKind.TELEMETRY
+        return dropped
+
+    def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
+        if not self._orders:
+            return []
+        late = [
+            key
+            for key, queued in self._frames.items()
+            if queued.kind is MessageKind.ORDER and now - queued.since > ORDER_MAX_AGE_S
+        ]
+        return [("late", self._take(key)) for key in late]
+
+    def next(self) -> bytes | None:
+        """Remove and return the first frame, or None if the queue is empty. Call :meth:`expire` before."""
+        return self._take(next(iter(self._frames))).raw if self._frames else None
+
+    def clear(self) -> list[tuple[str, QueuedFrame]]:
+        dropped = [("link_lost", frame) for frame in self._frames.values()]
+        self._frames.clear()
+        self._bytes = self._orders = self._telemetry = 0
+        return dropped
+
+    def _is_full(self, size: int) -> bool:
+        return len(self._frames) >= MAX_QUEUED_FRAMES or self._bytes + size > MAX_QUEUED_BYTES
+
+    def _take(self, key: int) -> QueuedFrame:
+        frame = self._frames.pop(key)
+        self._bytes -= len(frame.raw)
+        self._orders -= frame.kind is MessageKind.ORDER
+        self._telemetry -= frame.kind is MessageKind.TELEMETRY
+        return frame
+
+
+def _reframed(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
+    """Return the frame as MAVLink 2, with these incompatibility flags, without signature, and with a new checksum."""
+    body = frame.body
+    payload = body[9:].rstrip(b"\0") or body[9:10]  # MAVLink 2 truncates trailing zeros, MAVLink 1 does not
+    body = bytes((len(payload), flags)) + body[2:9] + payload
+    return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
+
+
+class SigningGateway:
+    """Signs frames that leave an endpoint; verifies and removes the signatures of received ones.
+
+    ``unix_time`` is in seconds since 1970. MAVLink 1 frames are sent as MAVLink 2, and refused on reception unless
+    ``allow_unsigned`` of the `Signing` accepts them. Messages outside the dialect cannot be signed, because their
+    checksum cannot be calculated. ``refused(frame, reason)`` is called for each refused frame.
+    """
+
+    def __init__(
+        self, signing: Signing, crc_extras: Mapping[int, bytes], refused: Callable[[Frame, str], object]
+    ) -> None:
+        self.signing = signing
+        self._extras, self._refused = crc_extras, refused
+
+    def admitted(self, frame: Frame, unix_time: float) -> Frame | None:
+        try:
+            refusal = self.signing.check(frame, unix_time)
+        except Exception as error:  # of the program's allow_unsigned
+            self._refused(frame, f"allow_unsigned raised {error!r}")
+            return None
+        if refusal is not None:
+            self._refused(frame, refusal.value)
+            return None
+        return self.unsigned(frame)
+
+    def unsigned(self, frame: Frame) -> Frame:
+        extra = self._extras.get(frame.message_id)
+        if not frame.incompat_flags & SIGNED or extra is None:
+            return frame
+        return Frame.parse(_reframed(frame, extra, flags=0), frame.received_at)
+
+    def signed(self, raw: bytes, unix_time: float) -> bytes | None:
+        """Return a complete frame with signature; None if the dialect does not have the message."""
+        frame = Frame.parse(raw)
+        extra = self._extras.get(frame.message_id)
+        if extra is None:
+            return None
+        data = _reframed(frame, extra, flags=SIGNED)
+        return data + self.signing.sign(data, unix_time)
+
+
+MAX_JOINED_BYTES = 1200
+"""Frames sent together are joined up to this size, which is not fragmented as a datagram."""
+UNLIMITED = 1 << 62
+MAX_RATE_LIMITS = 4096
+"""(sender, message) pairs whose rate is tracked."""
+
+
+class EndpointCounters:
+    """Counters of an endpoint, shared by its ports."""
 
     def __init__(self, dropped: Counter[str]) -> None:
         self.dropped: Counter[str] = dropped
@@ -33,15 +170,13 @@ class Totals:
 
 
 class Port:
-    """One peer of one endpoint, and a batch, or a queue, for what goes there.
+    """One peer of one endpoint.
 
-    While the link takes everything, frames are gathered in ``batch`` until the present turn of the loop is over. While
-    more than ``hold_above`` bytes (`NEVER`: it is not asked) have not left it, they wait in a queue that knows what
-    they are.
+    While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
+    ``hold_above`` bytes are unsent (`UNLIMITED`: not checked), frames wait in a `FrameQueue`.
 
-    ``endpoint`` is the endpoint's name, ``period(message_id)`` its filters' answer (`Filters.period`). ``report(kind,
-    text)`` tells an event of the endpoint, ``tell(reason, held)`` is called for each frame that was dropped out of the
-    queue.
+    ``endpoint`` is the endpoint's name, ``period(message_id)`` is `Filters.period`. ``report(kind, text)`` publishes an
+    event of the endpoint; ``on_drop(reason, frame)`` is called for each frame dropped from the queue.
     """
 
     link: Link
@@ -51,104 +186,98 @@ class Port:
         self,
         link: Link,
         peer: Peer,
-        totals: Totals,
+        counters: EndpointCounters,
         *,
         endpoint: str,
         dialect: Dialect,
         hold_above: int,
         period: Callable[[int], float | None],
         report: Callable[[HubEventKind, str], object],
-        tell: Callable[[str, Held], object],
-        border: Border | None = None,
+        on_drop: Callable[[str, QueuedFrame], object],
+        gateway: SigningGateway | None = None,
         guard: IdentityGuard | None = None,
-        is_mute: bool = False,
+        is_read_only: bool = False,
     ) -> None:
         self.link, self.peer = link, peer
-        self.totals = totals
+        self.counters = counters
         self.endpoint: str = endpoint
         self.period: Callable[[int], float | None] = period
         self.report: Callable[[HubEventKind, str], object] = report
-        self.tells_bursts: bool = link.tells_bursts
-        """Whether its link says when nothing more comes for now."""
-        self.border: Border | None = border
+        self.reports_bursts: bool = link.reports_bursts
+        self.gateway: SigningGateway | None = gateway
         self.guard: IdentityGuard | None = guard
-        self.is_mute: bool = is_mute
-        """Whether nothing that comes from here is passed on."""
-        self.one_at_a_time = False
-        """Whether each frame is written by itself: autopilots read datagrams into small buffers."""
+        self.is_read_only: bool = is_read_only
+        """True if no received frame is forwarded."""
+        self.writes_single_frames = False
+        """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
-        self.node: Node[Port] | None = None
+        self.node: RouterPort[Port] | None = None
         self._dialect = dialect
-        self._hold_above, self._may_hold = hold_above, hold_above < NEVER
-        self._tell = tell
-        self._held = HeldFrames()
+        self._hold_above, self._may_hold = hold_above, hold_above < UNLIMITED
+        self._on_drop = on_drop
+        self._queue = FrameQueue()
         self._due: dict[int, float] = {}
 
     @property
     def is_holding(self) -> bool:
-        """Whether something waits for the link."""
-        return bool(self._held)
+        return bool(self._queue)
 
     @property
     def waiting(self) -> int:
-        """Frames that wait for the link."""
-        return len(self._held)
+        return len(self._queue)
 
     def must_hold(self) -> bool:
-        """Whether the next frame has to wait."""
-        return self._may_hold and (bool(self._held) or self._is_full())
+        return self._may_hold and (bool(self._queue) or self._is_full())
 
-    def hold(self, raw: bytes, plan: Plan[Port], now: float) -> None:
-        """Have a frame wait for the link."""
-        known = self._dialect.get(plan.message_id)
-        kind = Kind.TRANSFER if known is None else kind_of(known.NAME, is_for_one=plan.target[0] != 0)
-        self._drop(self._held.put(Held(raw, kind, plan.message_id, plan.target, now), plan.key))
+    def hold(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        message_type = self._dialect.get(plan.message_id)
+        kind = (
+            MessageKind.TRANSFER if message_type is None else kind_of(message_type.NAME, is_for_one=plan.target[0] != 0)
+        )
+        self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
-        """Whether a message whose rate is limited may go out again."""
         due = self._due.get(key)
         if due is not None and now < due:
-            self.totals.dropped["thinned"] += 1
+            self.counters.dropped["rate_limited"] += 1
             return False
-        if due is None and len(self._due) >= MOST_RATES:
+        if due is None and len(self._due) >= MAX_RATE_LIMITS:
             self._due.clear()
-        # On average the rate is kept, whatever comes in between; but nothing is made up for after a pause.
+        # The average rate is kept for irregular messages, without a burst after a pause.
         self._due[key] = now + period_s if due is None else max(due, now - period_s) + period_s
         return True
 
     def flush(self, unix_time: float) -> None:
-        """Write what was gathered."""
         batch, self.batch = self.batch, []
-        if self.border is not None:
+        if self.gateway is not None:
             batch = self._signed(batch, unix_time)
-        totals, write, peer = self.totals, self.link.write, self.peer
-        totals.frames_out += len(batch)
-        if len(batch) == 1 or self.one_at_a_time:
+        counters, write, peer = self.counters, self.link.write, self.peer
+        counters.frames_out += len(batch)
+        if len(batch) == 1 or self.writes_single_frames:
             for raw in batch:
-                totals.bytes_out += len(raw)
+                counters.bytes_out += len(raw)
                 write(raw, peer)
             return
         data = b"".join(batch)
-        totals.bytes_out += len(data)
-        if len(data) <= JOINED_BYTES:
+        counters.bytes_out += len(data)
+        if len(data) <= MAX_JOINED_BYTES:
             if data:
                 write(data, peer)
             return
-        for piece in _pieces(batch):
-            write(piece, peer)
+        for chunk in _chunks(batch):
+            write(chunk, peer)
 
     def drain(self, now: float, unix_time: float) -> None:
-        """Write what waits, as far as the link takes it, and drop the orders that have become late."""
-        self._drop(self._held.expire(now))
-        while self._held and not self._is_full():
-            raw = self._held.next()
+        """Write queued frames while the link accepts them, and drop late commands."""
+        self._drop(self._queue.expire(now))
+        while self._queue and not self._is_full():
+            raw = self._queue.next()
             assert raw is not None
             self.batch.append(raw)
             self.flush(unix_time)
 
     def close(self) -> None:
-        """The peer has gone: what waits is dropped."""
-        self._drop(self._held.clear())
+        self._drop(self._queue.clear())
         self.batch.clear()
         self._due.clear()
 
@@ -156,26 +285,26 @@ class Port:
         return self.link.unsent_bytes_to(self.peer) > self._hold_above
 
     def _signed(self, batch: list[bytes], unix_time: float) -> list[bytes]:
-        assert self.border is not None
-        signed = [self.border.signed(raw, unix_time) for raw in batch]
-        self.totals.dropped["unsignable"] += sum(raw is None for raw in signed)
+        assert self.gateway is not None
+        signed = [self.gateway.signed(raw, unix_time) for raw in batch]
+        self.counters.dropped["unsignable"] += sum(raw is None for raw in signed)
         return [raw for raw in signed if raw is not None]
 
-    def _drop(self, dropped: list[tuple[str, Held]]) -> None:
-        for reason, held in dropped:
-            self.totals.dropped[reason] += 1
-            self._tell(reason, held)
+    def _drop(self, dropped: list[tuple[str, QueuedFrame]]) -> None:
+        for reason, frame in dropped:
+            self.counters.dropped[reason] += 1
+            self._on_drop(reason, frame)
 
 
-def _pieces(batch: list[bytes]) -> list[bytes]:
-    pieces: list[bytes] = []
-    piece: list[bytes] = []
+def _chunks(batch: list[bytes]) -> list[bytes]:
+    chunks: list[bytes] = []
+    chunk: list[bytes] = []
     size = 0
     for raw in batch:
-        if size + len(raw) > JOINED_BYTES and piece:
-            pieces.append(b"".join(piece))
-            piece, size = [], 0
-        piece.append(raw)
+        if size + len(raw) > MAX_JOINED_BYTES and chunk:
+            chunks.append(b"".join(chunk))
+            chunk, size = [], 0
+        chunk.append(raw)
         size += len(raw)
-    pieces.append(b"".join(piece))
-    return pieces
+    chunks.append(b"".join(chunk))
+    return chunks

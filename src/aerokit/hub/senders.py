@@ -1,135 +1,176 @@
-"""``Sender``: one component that was heard: at which ports, and what it is. ``Recent``: which frames came."""
+"""Senders known to a hub, the frames received recently, and the guard against duplicate senders on one endpoint."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
-from aerokit.connection.routes import MOVES_AFTER_S
+from aerokit.connection.routes import PEER_TTL_S, ROUTE_TIMEOUT_S, Routes
+from aerokit.events import DuplicateSender, RouteChanged
 from aerokit.mavlink.enums import MavAutopilot, MavType
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
+
+    from aerokit.events import Event
+    from aerokit.hub.values import HubEventKind
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.framer import Framer
+    from aerokit.transport.link import Link, Peer
 
 DUPLICATE_WINDOW_S = 2.0
-"""A frame with the sender, number and checksum of one that came from elsewhere so short a time ago is the same one."""
-REPEATED_WITHIN_S = 0.5
-"""And one that comes again from the same place was doubled on its way only if it comes so soon."""
-LOOP_MEMORY_S = 60.0
-"""A frame that comes back by another port is recognised for this long. Below 256 s, in which the numbers of a sender of
-nothing but heartbeats come round."""
-LOOP_RUN = 8
-"""Frames of one sender that come back before a port is taken for the end of a loop: constant messages may be equal by
-chance, where a vehicle is heard over two radios."""
-MOST_RECENT = 1 << 15
-"""Of more frames than that the memory is shorter."""
+"""A frame with the same sender, number and checksum from another port within this time is a duplicate."""
 
-_TYPE = 9 + 4  # of a HEARTBEAT, in `Frame.body`
+REPEAT_WINDOW_S = 0.5
+"""The same for a late frame from the same port."""
+
+LOOP_WINDOW_S = 60.0
+"""Time for which a frame that returns over another port is recognised. It is below 256 s, in which the sequence numbers
+of a sender of heartbeats only repeat."""
+
+MIN_LOOP_FRAMES = 8
+"""Returning frames of one sender that prove a loop. Fewer may be equal by chance, if a vehicle has two radios."""
+
+MAX_RECENT_FRAMES = 1 << 15
+
+# Offsets in the body of a HEARTBEAT.
+_TYPE = 9 + 4
 _AUTOPILOT = 9 + 5
 _STATION = int(MavType.GCS)
 _NO_AUTOPILOT = int(MavAutopilot.INVALID)
 
 
 def is_autopilot(body: bytes) -> bool:
-    """Whether a HEARTBEAT is an autopilot's."""
     return len(body) > _AUTOPILOT and body[_TYPE] != _STATION and body[_AUTOPILOT] != _NO_AUTOPILOT
 
 
 class Sender:
-    """One component, (system id, component id)."""
-
-    heard_at: float
-    is_autopilot: bool
-    is_vehicles: bool
-    number: int
-    source: int
+    """One component (system id, component id), and the ports at which it was received."""
 
     __slots__ = (
-        *(
-            "component_id",
-            "heard",
-            "heard_at",
-            "is_autopilot",
-            "is_vehicles",
-            "number",
-            "source",
-            "system_id",
-            "told",
-        ),
+        *("component_id", "is_autopilot", "is_vehicle", "number", "ports", "received_at", "reported"),
+        *("source", "system_id"),
     )
 
     def __init__(self, source: int, number: int, now: float) -> None:
-        self.source = source
+        self.source: int = source
         """System id + 256 · component id."""
         self.system_id: int = source & 0xFF
         self.component_id: int = source >> 8
-        self.number = number
-        """Of the port by which it is reached, where one is enough."""
-        self.heard_at = now
-        """When something came from there."""
-        self.heard: dict[int, float] = {number: now}
-        """All ports where it was heard; when, of those beside `number`."""
-        self.is_vehicles = False
-        """Whether it has said to be no ground station: what is for it goes one way only."""
-        self.is_autopilot = False
-        self.told: set[int] = set()
-        """Ports of which it is known that an autopilot is behind them."""
+        self.number: int = number
+        """Number of the port by which it is reached, if one is enough."""
+        self.received_at: float = now
+        """Time of the last frame at that port."""
+        self.ports: dict[int, float] = {number: now}
+        """All ports at which it was received; times are of ports other than `number`."""
+        self.is_vehicle: bool = False
+        """True if its HEARTBEAT is not of a ground station: it is then reached by one port only."""
+        self.is_autopilot: bool = False
+        self.reported: set[int] = set()
+        """Ports already known to lead to this autopilot."""
 
     @property
-    def ways(self) -> Iterable[int]:
-        """Numbers of the ports that what is for it goes to."""
-        return (self.number,) if self.is_vehicles else self.heard
+    def destinations(self) -> Iterable[int]:
+        return (self.number,) if self.is_vehicle else self.ports
 
-    def is_heard_at(self, number: int) -> bool:
-        """Whether it has lately been heard at a port, as of the time when it was heard at `number` last."""
-        return number == self.number or self.heard.get(number, -math.inf) >= self.heard_at - MOVES_AFTER_S
+    def is_at(self, number: int) -> bool:
+        """Return True if it was recently received at a port, by the time of its last frame."""
+        return number == self.number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
-    def hear_elsewhere(self, number: int, now: float) -> bool:
-        """Something came by another port than `number`; whether that changes where to send."""
-        is_new = now - self.heard.get(number, -math.inf) > MOVES_AFTER_S
-        self.heard[number] = now
-        if now - self.heard_at > MOVES_AFTER_S:
-            self.heard[self.number] = self.heard_at
-            self.number, self.heard_at = number, now
+    def record_at_other_port(self, number: int, now: float) -> bool:
+        """Record a frame at another port than `number`. Return True if this changes routes."""
+        is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
+        self.ports[number] = now
+        if now - self.received_at > ROUTE_TIMEOUT_S:
+            self.ports[self.number] = self.received_at
+            self.number, self.received_at = number, now
             return True
         return is_new
 
-    def note_heartbeat(self, body: bytes) -> bool:
-        """What it says it is; whether that is news."""
+    def record_heartbeat(self, body: bytes) -> bool:
         if len(body) <= _AUTOPILOT:
             return False
-        before = self.is_vehicles, self.is_autopilot
-        self.is_vehicles = body[_TYPE] != _STATION
+        before = self.is_vehicle, self.is_autopilot
+        self.is_vehicle = body[_TYPE] != _STATION
         self.is_autopilot = is_autopilot(body)
-        return before != (self.is_vehicles, self.is_autopilot)
+        return before != (self.is_vehicle, self.is_autopilot)
 
-    def leave(self, number: int) -> bool:
-        """A port has gone; whether it was the last one."""
-        self.told.discard(number)
-        self.heard.pop(number, None)
-        if self.number == number and self.heard:
-            self.number = max(self.heard, key=self.heard.__getitem__)
-            self.heard_at = self.heard[self.number]
-        return not self.heard
+    def remove_port(self, number: int) -> bool:
+        self.reported.discard(number)
+        self.ports.pop(number, None)
+        if self.number == number and self.ports:
+            self.number = max(self.ports, key=self.ports.__getitem__)
+            self.received_at = self.ports[self.number]
+        return not self.ports
 
 
-class Recent:
-    """The frames of the last `LOOP_MEMORY_S` to twice that, in two generations: nothing has to be searched."""
-
-    ends_at: float
+class RecentFrames:
+    """Frames of the last one to two `LOOP_WINDOW_S`, in two generations, so that nothing is searched for expiry."""
 
     __slots__ = ("ends_at", "newer", "older")
 
     def __init__(self) -> None:
+        # Sender, sequence number and checksum as one number → port number, number of ports created so far, time.
         self.newer: dict[int, tuple[int, int, float]] = {}
-        """Sender, sequence number and checksum as one number → the number of the port it came from, how many ports
-        there had been by then, and when."""
         self.older: dict[int, tuple[int, int, float]] = {}
-        self.ends_at = float("-inf")
-        """When the next generation begins."""
+        self.ends_at: float = float("-inf")
+        """End of the current generation."""
 
-    def begin_next(self, now: float) -> None:
-        """Forget the older ones."""
-        is_over = now - self.ends_at >= LOOP_MEMORY_S
-        self.older, self.newer = {} if is_over else self.newer, {}
-        self.ends_at = now + LOOP_MEMORY_S
+    def start_generation(self, now: float) -> None:
+        is_expired = now - self.ends_at >= LOOP_WINDOW_S
+        self.older, self.newer = {} if is_expired else self.newer, {}
+        self.ends_at = now + LOOP_WINDOW_S
+
+
+REPEAT_EVENT_S = 60.0
+"""Minimum interval of events about duplicate senders of one autopilot, for any number of peers."""
+
+
+class IdentityGuard:
+    """Applies the rules of `Routes` to the peers of one endpoint.
+
+    The first peer of an autopilot owns its route; frames of other peers under the same ids are dropped. Ground stations
+    and companions may share ids. ``report(kind, peer, text)`` publishes an event.
+    """
+
+    def __init__(self, link: Link, report: Callable[[HubEventKind, Peer, str], object]) -> None:
+        self.is_shared = False
+        """True if the endpoint has several peers. With one peer, only heartbeats are checked."""
+        self._routes = Routes(link, self._publish)
+        self._report = report
+        self._heartbeat_at: dict[Peer, float] = {}
+        self._reported_at: dict[tuple[int, int], float] = {}
+        self._current_peer: Peer = None
+
+    def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
+        """Return True if this peer may send this frame. Call it for heartbeats, and for all frames if `is_shared`."""
+        if self._routes.arrived_on_other_peer(frame, peer):
+            self._current_peer = peer
+            if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):
+                return False
+        if frame.message_id == 0:
+            self._heartbeat_at[peer] = frame.received_at
+            if is_autopilot(frame.body):
+                self._routes.record_heartbeat(frame, peer, framer.counters_of(frame))
+        return True
+
+    def evictable_peers(self, peers: Iterable[Peer], now: float) -> Iterable[Peer]:
+        """Return the first peer without a heartbeat in the last 30 s, if any."""
+        silent = (peer for peer in peers if now - self._heartbeat_at.get(peer, -math.inf) > PEER_TTL_S)
+        return self._routes.evictable_peers(silent, now)
+
+    def forget(self, peer: Peer) -> None:
+        self._heartbeat_at.pop(peer, None)
+
+    def _publish(self, event: Event) -> None:
+        if isinstance(event, RouteChanged):
+            source = event.system_id, event.component_id
+            self._reported_at.pop(source, None)
+            text = f"{source[0]}/{source[1]} is reached here now, no longer at {event.before}"
+            self._report("route_changed", self._current_peer, text)
+        elif isinstance(event, DuplicateSender):
+            source = event.system_id, event.component_id
+            if event.at - self._reported_at.get(source, -math.inf) > REPEAT_EVENT_S:
+                self._reported_at[source] = event.at
+                text = f"frames as {source[0]}/{source[1]} are dropped, because another peer has these ids"
+                self._report("duplicate_sender", self._current_peer, text)

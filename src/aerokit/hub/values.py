@@ -1,49 +1,50 @@
-"""What programs give to a hub and read from it: `Endpoint`, `EndpointStatistics`, `HubEvent`."""
+"""Values of a hub's API: `Endpoint`, `EndpointStatistics`, `HubEvent`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Literal
 
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
 from aerokit.transport.address import parse_address
 from aerokit.transport.link import Link
 
 if TYPE_CHECKING:
     from aerokit.mavlink.signing import Signing
-    from aerokit.transport.sockets import Peers
+    from aerokit.transport.sockets import PeerFilter
 
 
 class Endpoint(Snapshot):
-    """One link of a hub, and what may pass.
+    """One link of a hub, with its filters.
 
     Raises:
-        InvalidArgument: a field is wrong. Names of messages are checked when the hub takes it.
+        InvalidArgument: a field is wrong. The hub checks message names when the endpoint is added.
     """
 
     address: str | Link
-    """A connection string, ``"tcpin:0.0.0.0:5760"``, or a link that is not open yet; a link is not opened again when it
-    is lost."""
+    """A connection string such as ``"tcpin:0.0.0.0:5760"``, or an unopened link, which is not reopened when it is
+    lost."""
     name: str = ""
-    """What to call it; empty: its address."""
+    """Name of the endpoint; empty: its address."""
     only: tuple[str, ...] = ()
-    """Messages that go out here, as patterns: ``("HEARTBEAT", "GPS_*")``; none: all."""
+    """Patterns of messages that go out here, e.g. ``("HEARTBEAT", "GPS_*")``; empty: all."""
     block: tuple[str, ...] = ()
-    """Messages that do not go out here."""
+    """Patterns of messages that do not go out here."""
     rates: Mapping[str, float] = {}
-    """Message → at most so many a second from each sender, above 0, at most 1000 Hz. What is for one is not thinned."""
+    """Pattern → maximum rate per sender in Hz, above 0 and at most 1000. Messages with a target are not limited."""
     read_only: bool = False
-    """Whether nothing that comes from here is passed on, not even heartbeats: its programs can only look on."""
+    """True to forward nothing that is received here, not even heartbeats."""
     signing: Signing | None = None
-    """Signs what goes out here; what comes in without its signature is refused. Inside, frames have no signature."""
-    peers: Peers | None = None
-    """IP addresses and networks that are listened to: udpin, udpbcast, tcpin. None: all."""
+    """Key that signs frames sent here; frames received without its signature are refused. Frames inside the hub are
+    not signed."""
+    peers: PeerFilter | None = None
+    """IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all."""
     baud: int = 57600
-    """Of a serial link whose address names none, bits per second."""
-    patient: bool = False
-    """Whether the hub begins without it when it cannot be opened, and tries until it can: a server that comes later."""
+    """Bits per second of a serial link whose address has none."""
+    retry_open: bool = False
+    """True to start the hub even if this endpoint cannot be opened, and to retry. For servers that start later."""
 
     def _check(self) -> None:
         if not isinstance(self.address, (str, Link)):
@@ -51,13 +52,13 @@ class Endpoint(Snapshot):
         if isinstance(self.address, str):
             parse_address(self.address)
         elif self.peers is not None:
-            raise InvalidArgument("peers = … is not allowed with a link: give them to the link")
-        elif self.patient:
-            raise InvalidArgument("patient = True is not allowed with a link, which can be opened once only")
+            raise InvalidArgument("peers = … is not allowed with a link object: pass them to the link")
+        elif self.retry_open:
+            raise InvalidArgument("retry_open = True is not allowed with a link object, which can be opened only once")
         for field in ("only", "block"):
             patterns = getattr(self, field)
             if isinstance(patterns, str) or not _are_texts(patterns):
-                raise _not_allowed(field, patterns, "several names of messages, a tuple for example")
+                raise _not_allowed(field, patterns, "a tuple of message names")
         if not isinstance(self.rates, Mapping) or not _are_texts(self.rates):
             raise _not_allowed("rates", self.rates, "names of messages and Hz: {'ATTITUDE': 5}")
         for hz in self.rates.values():
@@ -74,38 +75,41 @@ def _are_texts(values: object) -> bool:
 
 
 def _not_allowed(field: str, value: object, allowed: str) -> InvalidArgument:
-    return InvalidArgument(f"{field} = {shown(value)} is not allowed: {allowed}")
+    return InvalidArgument(f"{field} = {short_repr(value)} is not allowed: {allowed}")
 
 
 class EndpointStatistics(Snapshot):
-    """What has come and gone by one endpoint since it was added."""
+    """Counters of one endpoint since it was added."""
 
     name: str
     address: str
-    """With the real port where the system chose one."""
+    """Address, with the actual port instead of 0."""
     is_open: bool
-    """Whether frames can pass; False while a lost link is being opened again."""
+    """True while frames can pass; False while a lost link is being reopened."""
     peers: int
-    """Clients, senders, or the one other side."""
+    """Number of clients or senders."""
     frames_in: int
-    """Good frames, refused and doubled ones among them."""
+    """Valid frames, including refused and duplicate ones."""
     bytes_in: int
     frames_out: int
     bytes_out: int
-    """As written; what the link could not get rid of is in ``dropped["link"]``, in writes."""
+    """Bytes written; writes that the link dropped are counted in ``dropped["link"]``."""
     lost: int
-    """Frames that the numbers of its senders say were lost on the way here."""
+    """Frames lost before they arrived here, by sequence numbers."""
     bad_bytes: int
-    """Bytes that were in no good frame."""
+    """Bytes outside valid frames."""
     waiting: int
-    """Frames that wait because the link takes no more."""
+    """Frames that wait because the link is full."""
     dropped: Mapping[str, int]
-    """Why → how many frames. On the way in: ``no_route`` (for somebody who was never heard), ``duplicate``, ``loop``
-    (it went round), ``read_only``, ``refused`` (signature), ``foreign`` (another peer speaks as an autopilot that is
-    heard), ``secret`` (SETUP_SIGNING), ``unknown`` (no message of the dialect, from nobody known). On the way out:
-    ``late`` (orders), ``queue_full``, ``superseded``, ``thinned`` (telemetry), ``away``, ``unsignable``, ``link``."""
+    """Reason → number of dropped frames.
+
+    Received: ``no_route`` (unknown target), ``duplicate``, ``loop``, ``read_only``, ``refused`` (signature),
+    ``foreign`` (another peer has the ids of this autopilot), ``secret`` (SETUP_SIGNING), ``unknown`` (message outside
+    the dialect, from an unknown sender). Sent: ``late`` (commands), ``queue_full``, ``superseded``, ``rate_limited``
+    (telemetry), ``link_lost``, ``unsignable``, ``link``.
+    """
     systems: tuple[tuple[int, int], ...]
-    """(system id, component id) of everybody who was heard here."""
+    """(system id, component id) of all senders received here."""
 
 
 HubEventKind = Literal[
@@ -119,27 +123,34 @@ HubEventKind = Literal[
     "drained",
     "order_dropped",
     "refused",
-    "heard_twice",
-    "moved",
-    "turned_away",
+    "duplicate_sender",
+    "route_changed",
+    "peer_rejected",
     "loop",
-    "mistake",
+    "internal_error",
 ]
 
 
 class HubEvent(Snapshot):
-    """Something that happened to an endpoint."""
+    """An event of one endpoint."""
 
     at_s: float
-    """On the event loop's clock."""
+    """Event loop time in seconds."""
     endpoint: str
-    """Its name."""
+    """Name of the endpoint."""
     kind: HubEventKind
-    """``opened``; ``lost`` and ``restored``: its link; ``removed``; ``client_joined`` and ``client_left``: of a
-    server (``tcpin:``), where clients connect; ``stalled`` and ``drained``: what is written does
-    not leave, and does again; ``order_dropped``: an order had waited too long, or met a full queue or a link that went;
-    ``refused``: the first frame that a key did not fit, for each reason; ``heard_twice``: an autopilot is heard from a
-    second peer or endpoint; ``moved``: it is reached there now; ``turned_away``: no place is left for a new peer;
-    ``loop``: what this hub has passed on comes back; ``mistake``: one inside aerokit."""
+    """Kind of the event.
+
+    - ``opened``, ``lost``, ``restored``, ``removed``: of its link
+    - ``client_joined``, ``client_left``: a client of a server (``tcpin:``) has connected or disconnected
+    - ``stalled``, ``drained``: written data does not leave, or leaves again
+    - ``order_dropped``: a command waited too long, met a full queue, or its link was lost
+    - ``refused``: a frame had no valid signature; reported once for each reason
+    - ``duplicate_sender``: an autopilot's ids are also used by another peer or endpoint
+    - ``route_changed``: a vehicle is reached by another peer or endpoint now
+    - ``peer_rejected``: there is no room for a new peer
+    - ``loop``: frames that this hub forwarded come back
+    - ``internal_error``: an error inside aerokit
+    """
     text: str
-    """In words."""
+    """Description."""

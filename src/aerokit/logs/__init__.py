@@ -1,1 +1,1 @@
-"""Flight logs: reading flights, converting them to other formats, and reports."""
+"""Flight logs: reading, conversion and reports."""

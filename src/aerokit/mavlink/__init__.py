@@ -1,4 +1,4 @@
-"""The wire: framing, messages and enums of MAVLink, dialects, telemetry logs; knows no clock and no socket.
+"""MAVLink on the wire: framing, messages, enums, dialects, signing and telemetry logs. Sans-IO, without clocks.
 
 https://mavlink.io/en/guide/serialization.html
 """

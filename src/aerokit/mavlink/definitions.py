@@ -1,7 +1,7 @@
-"""MAVLink XML read into plain definitions, for the generator and for dialects that are loaded at run time.
+"""Parser of MAVLink XML, for the generator and for dialects that are loaded at run time.
 
-The rules are the standard's: https://mavlink.io/en/guide/xml_schema.html and, for the order of fields on the wire and
-for CRC_EXTRA, https://mavlink.io/en/guide/serialization.html.
+See https://mavlink.io/en/guide/xml_schema.html, and for the order of fields and for CRC_EXTRA
+https://mavlink.io/en/guide/serialization.html.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from aerokit.mavlink.message import BYTES_IN_CHARS, SIZES
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-_LOWEST, _HIGHEST = -(1 << 63), (1 << 64) - 1
+_MIN_VALUE, _MAX_VALUE = -(1 << 63), (1 << 64) - 1
 
-# Names that a message class needs for itself; a private dialect's field of that name gets a trailing underscore.
+# Names used by message classes. A field of a private dialect with such a name gets a trailing underscore.
 _RESERVED = frozenset(
     (
         *("ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame"),
@@ -38,76 +38,76 @@ _FIELD_TYPE = re.compile(r"(\w+?)(?:_mavlink_version)?(?:\[([0-9]{1,3})\])?\Z")
 
 @dataclass(frozen=True)
 class FieldDefinition:
-    """One field of a message, as the XML has it."""
+    """One field of a message."""
 
     name: str
     type: str  # without the array brackets
     array_length: int = 0  # 0: not an array
     units: str = ""
     enum: str = ""
-    invalid: str = ""  # the value which means "not known"
+    invalid: str = ""  # the value that means "unknown"
     description: str = ""
     extension: bool = False
-    default: int | None = None  # only mavlink_version, which the standard fills in
+    default: int | None = None  # only for mavlink_version
     carries_bytes: bool = False  # of a char array: see BYTES_IN_CHARS
 
     @property
     def attribute(self) -> str:
-        """The name in Python: the standard's, with an underscore behind a keyword."""
+        """Name in Python: that in the standard, with a trailing underscore if it is a keyword."""
         reserved = keyword.iskeyword(self.name) or self.name in _RESERVED
         return self.name + "_" if reserved else self.name
 
     @property
     def length(self) -> int:
-        """Bytes on the wire."""
+        """Number of bytes in the payload."""
         return SIZES[self.type] * (self.array_length or 1)
 
     @property
     def is_text(self) -> bool:
-        """Whether its value is a ``str``."""
+        """True if the value is a ``str``."""
         return self.type == "char" and not self.carries_bytes
 
     @property
     def is_bytes(self) -> bool:
-        """Whether its value is ``bytes``."""
+        """True if the value is ``bytes``."""
         return self.carries_bytes or (self.type == "uint8_t" and bool(self.array_length))
 
 
 @dataclass(frozen=True)
 class MessageDefinition:
-    """One message; ``fields`` are in the standard's order, extensions last."""
+    """One message. ``fields`` are in the order of the XML, extensions last."""
 
     id: int
     name: str
     fields: tuple[FieldDefinition, ...]
     description: str = ""
-    origin: str = ""  # the XML file's name without its ending
+    origin: str = ""  # name of the XML file without suffix
     remarks: tuple[str, ...] = ()  # deprecated, superseded, work in progress
 
     @property
     def class_name(self) -> str:
-        """The name of its class: ``GPS2_RAW`` is ``Gps2Raw``."""
+        """Name of the class: ``Gps2Raw`` for ``GPS2_RAW``."""
         return cap_words(self.name)
 
     @property
     def wire_fields(self) -> tuple[FieldDefinition, ...]:
-        """The fields in wire order: largest type first, extensions untouched at the end."""
+        """The fields in wire order: sorted by size of type, largest first, then extensions in their order."""
         base = sorted((f for f in self.fields if not f.extension), key=lambda f: -SIZES[f.type])
         return (*base, *(f for f in self.fields if f.extension))
 
     @property
     def base_length(self) -> int:
-        """Bytes of the payload without extensions: the only length MAVLink 1 knows."""
+        """Payload length without extensions, as in MAVLink 1."""
         return sum(f.length for f in self.fields if not f.extension)
 
     @property
     def length(self) -> int:
-        """Bytes of the payload with extensions."""
+        """Payload length with extensions."""
         return sum(f.length for f in self.fields)
 
     @property
     def crc_extra(self) -> int:
-        """The byte which makes frames of another definition fail their checksum."""
+        """The byte that makes the checksum fail for frames of a different definition."""
         text = self.name + " "
         for f in self.wire_fields:
             if not f.extension:
@@ -118,7 +118,7 @@ class MessageDefinition:
 
 @dataclass(frozen=True)
 class EntryDefinition:
-    """One entry of an enum; ``params`` are filled for MAV_CMD only: (index, label, units, description)."""
+    """One entry of an enum. MAV_CMD entries have ``params``: (index, label, units, description)."""
 
     name: str
     value: int
@@ -137,27 +137,27 @@ class EnumDefinition:
     description: str = ""
     origin: str = ""
     remarks: tuple[str, ...] = ()
-    own_prefix: str = ""  # see `prefix`; empty: worked out from the entries
+    own_prefix: str = ""  # see `prefix`; empty: derived from the entries
 
     @property
     def class_name(self) -> str:
-        """The name of its class: ``MAV_CMD`` is ``MavCmd``."""
+        """Name of the class: ``MavCmd`` for ``MAV_CMD``."""
         return cap_words(self.name)
 
     @property
     def prefix(self) -> str:
-        """What is taken off the names of the entries: what they begin with."""
+        """Prefix that is removed from the names of entries."""
         return self.own_prefix or _common_prefix(self.name, [entry.name for entry in self.entries])
 
     def members(self) -> list[tuple[str, EntryDefinition]]:
-        """The entries with their Python names."""
+        """Return the entries with their names in Python."""
         prefix = self.prefix
         return [(_member_name(self.name, prefix, entry.name), entry) for entry in self.entries]
 
 
 @dataclass(frozen=True)
 class DialectDefinition:
-    """What one XML file defines itself; ``includes`` are the files it builds on."""
+    """The definitions of one XML file. ``includes`` are the files that it includes."""
 
     name: str
     messages: tuple[MessageDefinition, ...] = ()
@@ -166,16 +166,18 @@ class DialectDefinition:
 
 
 def cap_words(name: str) -> str:
-    """``GLOBAL_POSITION_INT`` → ``GlobalPositionInt``."""
+    """Convert ``GLOBAL_POSITION_INT`` to ``GlobalPositionInt``."""
     words = "".join(part.capitalize() for part in name.split("_"))
     return words + "_" if keyword.iskeyword(words) else words  # None, True, False
 
 
 def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinition]:
-    """Read a file and everything it includes, the included first.
+    """Read a file and its includes; included files come first.
 
-    Includes are looked for beside the file, then in the folders of ``search``.
-    Raises InvalidArgument when a file is missing, has more than 16 MB or is no MAVLink XML.
+    Includes are searched beside the file, then in the folders of ``search``.
+
+    Raises:
+        InvalidArgument: a file is missing, has more than 16 MB, or is not MAVLink XML.
     """
     found: dict[str, DialectDefinition] = {}
     pending: set[str] = set()
@@ -194,10 +196,8 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 
 def read_xml(path: Path) -> DialectDefinition:
-    """Read one file, without what it includes; InvalidArgument when it is no MAVLink XML."""
-    from xml.etree.ElementTree import (
-        ParseError,  # not for those who have definitions of pymavlink's classes only
-    )
+    """Read one file without its includes. InvalidArgument if it is not MAVLink XML."""
+    from xml.etree.ElementTree import ParseError  # not needed for definitions from pymavlink
 
     from defusedxml import ElementTree as DefusedXml
 
@@ -218,7 +218,7 @@ def read_xml(path: Path) -> DialectDefinition:
 
 
 def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
-    """All enums, each once: a later file's entries are added to the enum of the first file that defines it."""
+    """Return all enums. Entries in later files are added to the enum of the first file that defines it."""
     merged: dict[str, EnumDefinition] = {}
     for dialect in dialects:
         for enum in dialect.enums:
@@ -238,7 +238,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
 def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     folders = [file.parent, *search]
     for folder in folders:
-        if os.path.isfile(folder / include):  # whatever the name is: Path.is_file raises for a long one
+        if os.path.isfile(folder / include):  # unlike Path.is_file, it does not raise for long names
             return folder / include
     looked = ", ".join(str(folder) for folder in folders)
     raise InvalidArgument(f"{file.name} includes {include}, which is in none of: {looked}")
@@ -262,10 +262,10 @@ def _message(node: Element, origin: str) -> MessageDefinition:
     )
     if not 0 <= message.id < 1 << 24:
         raise ValueError(f"{message.name}: message id {message.id} is not in 0..16777215")
-    names = Counter(each.attribute for each in fields)
-    twice = [name for name, count in names.items() if count > 1]
-    if twice:
-        raise ValueError(f"{message.name}: the field {twice[0]} is defined twice")
+    names = Counter(field.attribute for field in fields)
+    duplicates = [name for name, count in names.items() if count > 1]
+    if duplicates:
+        raise ValueError(f"{message.name}: the field {duplicates[0]} is defined twice")
     if message.length > 255:
         raise ValueError(f"{message.name}: a payload of {message.length} bytes, at most 255 fit in a frame")
     return message
@@ -290,7 +290,7 @@ def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
 
 
 def carries_bytes(message: str, field_name: str, kind: str) -> bool:
-    """Whether a field is one of BYTES_IN_CHARS, in whichever dialect."""
+    """Return True for fields in BYTES_IN_CHARS, in any dialect."""
     return kind == "char" and (message, field_name) in BYTES_IN_CHARS
 
 
@@ -324,19 +324,19 @@ def _param(node: Element) -> tuple[int, str, str, str]:
 
 
 def _integer(text: str) -> int:
-    """``16``, ``0x10``, ``0b10000``, ``1<<4`` or ``2**4``."""
+    """Parse ``16``, ``0x10``, ``0b10000``, ``1<<4`` or ``2**4``."""
     for operator in ("<<", "**"):
         if operator in text:
             left, right = (int(part.strip(), 0) for part in text.split(operator))
-            if not (0 <= left <= _HIGHEST and 0 <= right <= 64):
-                raise ValueError(f"{text!r} is no value of an enum")
+            if not (0 <= left <= _MAX_VALUE and 0 <= right <= 64):
+                raise ValueError(f"{text!r} is not a valid enum value")
             return _in_range(left << right if operator == "<<" else int(left**right))
     return _in_range(int(text.strip(), 0))
 
 
 def _in_range(value: int) -> int:
-    if not _LOWEST <= value <= _HIGHEST:
-        raise ValueError(f"the value of an enum is beyond 64 bits: {value:#x}")
+    if not _MIN_VALUE <= value <= _MAX_VALUE:
+        raise ValueError(f"an enum value exceeds 64 bits: {value:#x}")
     return value
 
 
@@ -383,7 +383,7 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 
 
 def _member_name(enum: str, prefix: str, name: str) -> str:
-    if not name.startswith(prefix):  # an entry that forgot the first words of its enum's name
+    if not name.startswith(prefix):  # the entry lacks the first words of the enum's name
         words = enum.split("_")
         tails = ("_".join(words[i:]) + "_" for i in range(1, len(words)))
         prefix = next((tail for tail in tails if name.startswith(tail)), "")

@@ -1,8 +1,8 @@
-"""`Dialect`: which message an id stands for.
+"""`Dialect`: maps message ids to message classes.
 
-`STANDARD` knows all generated messages: MAVLink's own minimal, standard, common and development, and ardupilotmega
-(with what it includes). Others are read at run time from an XML file or a pymavlink dialect module; their messages
-which are the standard's are the same classes, so that ``isinstance(message, messages.Heartbeat)`` goes on working.
+`STANDARD` has all generated messages: minimal, standard, common and development of MAVLink, and ardupilotmega with its
+includes. Other dialects are read at run time from an XML file or a pymavlink module. Messages that they share with the
+standard have the same classes, so that ``isinstance(message, messages.Heartbeat)`` works.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import aerokit.mavlink.enums as enums
 import aerokit.mavlink.messages as messages
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enumeration import make_enum
-from aerokit.mavlink.message import Message
+from aerokit.mavlink.message import Message, make_enum
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,34 +27,33 @@ Row = tuple[int, int, int]
 
 
 class Dialect:
-    """Message ids and their classes. Dialects do not change once they are made."""
+    """Message ids, their classes, and enums. Immutable."""
 
     def __init__(
         self, name: str, classes: Iterable[type[Message]], enum_types: Mapping[str, type[Any]] | None = None
     ) -> None:
-        """Make a dialect of classes; ``enum_types`` maps the standard's spelling, ``"MAV_CMD"``, to enums."""
+        """Create a dialect. ``enum_types`` maps names in the standard, such as ``"MAV_CMD"``, to enums."""
         self.name = name
-        """Its name, the XML file's for example."""
+        """Name of the dialect, for example that of its XML file."""
         self._classes = {cls.ID: cls for cls in classes}
         self._enums = dict(enum_types or {})
-        self._take(
-            {cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()},
-        )
+        self._set_rows({cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()})
 
-    def _take(self, rows: dict[int, Row]) -> None:
+    def _set_rows(self, rows: dict[int, Row]) -> None:
         self.rows = rows
-        """Message id → (CRC_EXTRA, length of the payload without extensions, and with them)."""
+        """Maps message ids to (CRC_EXTRA, payload length without extensions, payload length with extensions)."""
         self.extras: dict[int, bytes] = {message_id: bytes((row[0],)) for message_id, row in rows.items()}
-        """Message id → CRC_EXTRA as the byte that goes behind the payload into the checksum."""
+        """Maps message ids to CRC_EXTRA as a byte, which is appended to the payload for the checksum."""
         self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
             message_id: partial(self._decode_first, message_id) for message_id in rows
         }
 
     @classmethod
     def from_xml(cls, path: str | Path) -> Dialect:
-        """Read an XML file and all it includes, beside it or in pymavlink's package.
+        """Read an XML file with its includes, which are searched beside it and in pymavlink's package.
 
-        Raises InvalidArgument when a file is missing or wrong, or an id is defined twice.
+        Raises:
+            InvalidArgument: a file is missing or invalid, or an id is defined twice.
         """
         from aerokit.mavlink.runtime_dialect import read_xml_dialect
 
@@ -63,31 +61,32 @@ class Dialect:
 
     @classmethod
     def from_pymavlink(cls, module: str | ModuleType) -> Dialect:
-        """Take over a pymavlink dialect: the module, its dotted name, or the last part of it (``"storm32"``).
+        """Convert a pymavlink dialect: a module, its dotted name, or the last part of the name (``"storm32"``).
 
-        Raises InvalidArgument when there is no such module or it is no dialect.
+        Raises:
+            InvalidArgument: there is no such module, or it is not a dialect.
         """
         from aerokit.mavlink.runtime_dialect import read_pymavlink_dialect
 
         return Dialect(*read_pymavlink_dialect(module, STANDARD))
 
     def __getitem__(self, message_id: int) -> type[Message]:
-        """The class of a message id; KeyError when the dialect has none."""
+        """Return the class of a message id; KeyError if there is none."""
         return self._classes[message_id]
 
     def get(self, message_id: int) -> type[Message] | None:
-        """The class of a message id, or None."""
+        """Return the class of a message id, or None."""
         return self[message_id] if message_id in self.rows else None
 
     def by_name(self, name: str) -> type[Message]:
-        """The class of the standard's name, ``"GLOBAL_POSITION_INT"``; InvalidArgument when there is none."""
+        """Return the class of a message by name, ``"GLOBAL_POSITION_INT"``. InvalidArgument if there is none."""
         for message_class in self:
             if name == message_class.NAME:
                 return message_class
         raise InvalidArgument(f"dialect {self.name!r} has no message {name!r}")
 
     def enum(self, name: str) -> type[Any]:
-        """The enum of the standard's name, ``"MAV_CMD"``; InvalidArgument when there is none."""
+        """Return an enum by name, ``"MAV_CMD"``. InvalidArgument if there is none."""
         if name in self._enums:
             return self._enums[name]
         raise InvalidArgument(f"dialect {self.name!r} has no enum {name!r}")
@@ -105,16 +104,16 @@ class Dialect:
         return f"<Dialect {self.name!r}: {len(self)} messages>"
 
     def decode(self, frame: Frame) -> Message:
-        """The message of a frame, its ``received_frame`` set; KeyError when the dialect does not know the id."""
+        """Decode a frame. The message has it as its ``received_frame``. KeyError if the dialect lacks the id."""
         return self._decoders[frame.message_id](frame.body, frame)
 
     def _decode_first(self, message_id: int, body: bytes, frame: Frame | None) -> Message:
-        """Stands in for a class that is not loaded yet, so that `decode` need not ask each time."""
+        # Replaces itself by the decoder of the class, so that `decode` needs no check whether the class is loaded.
         decoder = self._decoders[message_id] = self[message_id].decode_body
         return decoder(body, frame)
 
     def extended_by(self, other: Dialect) -> Dialect:
-        """Both together. InvalidArgument when an id means one message here and another there."""
+        """Return a dialect with the messages of both. InvalidArgument if an id has different messages in them."""
         for message_id in self.rows.keys() & other.rows.keys():
             if self.rows[message_id] != other.rows[message_id]:
                 raise InvalidArgument(
@@ -126,11 +125,11 @@ class Dialect:
 
 
 class _Standard(Dialect):
-    """The generated messages; their modules are imported when one of them is first needed."""
+    """The generated messages, whose modules are imported on first use."""
 
     def __init__(self) -> None:
         super().__init__("standard", ())
-        self._take({message_id: row[2:] for message_id, row in messages.INDEX.items()})
+        self._set_rows({message_id: row[2:] for message_id, row in messages.INDEX.items()})
 
     def __getitem__(self, message_id: int) -> type[Message]:
         message_class: type[Message] = getattr(messages, messages.INDEX[message_id][0])
@@ -149,7 +148,7 @@ class _Extended(Dialect):
     def __init__(self, first: Dialect, second: Dialect) -> None:
         super().__init__(f"{first.name}+{second.name}", ())
         self._parts = (first, second)
-        self._take({**second.rows, **first.rows})
+        self._set_rows({**second.rows, **first.rows})
 
     def __getitem__(self, message_id: int) -> type[Message]:
         first, second = self._parts
@@ -165,12 +164,12 @@ class _Extended(Dialect):
         if len(found) < 2 or found[1].__members__.keys() <= found[0].__members__.keys():
             return found[0] if found else super().enum(name)
         if name not in self._enums:
-            self._enums[name] = _united(*found)
+            self._enums[name] = _merge_enums(*found)
         return self._enums[name]
 
 
-def _united(first: type[Any], second: type[Any]) -> type[Any]:
-    """An enum with the entries of both: private dialects add to enums of the standard, which has more than theirs."""
+def _merge_enums(first: type[Any], second: type[Any]) -> type[Any]:
+    # Private dialects add entries to enums of the standard.
     members = {**second.__members__, **first.__members__}
     bitmask = issubclass(first, IntFlag)
     return make_enum(first.__module__, first.__name__, bitmask, first.__doc__ or "", members.items())
@@ -181,4 +180,4 @@ def _cap_words(name: str) -> str:
 
 
 STANDARD: Dialect = _Standard()
-"""All messages that aerokit carries; made without importing one of them."""
+"""All messages of aerokit. Its creation imports none of them."""

@@ -1,4 +1,4 @@
-"""`FrameEncoder`: messages in, frames out, with one sequence counter."""
+"""`FrameEncoder`: encodes messages to frames."""
 
 from __future__ import annotations
 
@@ -18,34 +18,32 @@ _BYTES = tuple(bytes((number,)) for number in range(256))
 
 
 class FrameEncoder:
-    """We, as one component: puts our ids, the sequence number and the checksum around messages.
+    """Adds ids, sequence number, checksum and signature of one component to its messages.
 
-    Use one for each link, so that the peer can count what was lost on it.
+    Use one for each link, so that the peer can detect losses.
     """
 
     def __init__(self, system_id: int, component_id: int, *, version: int = 2) -> None:
-        """``system_id`` is 1..255, ``component_id`` 0..255, ``version`` 1 or 2; InvalidArgument otherwise.
+        """Create an encoder. ``system_id`` is 1..255, ``component_id`` 0..255, ``version`` 1 or 2.
 
-        Component 0 addresses everyone and is nobody's id; it is allowed because old ground stations call themselves so.
+        Component 0 is the broadcast address, but is allowed because old ground stations use it.
         """
         if not 1 <= system_id <= 255:
-            raise InvalidArgument(
-                f"system_id = {system_id!r} must be in 1..255 (0 addresses everyone, and is nobody)"
-            )
+            raise InvalidArgument(f"system_id = {system_id!r} must be in 1..255 (0 is the broadcast address)")
         if not 0 <= component_id <= 255:
             raise InvalidArgument(f"component_id = {component_id!r} must be in 0..255")
         self.system_id: int = int(system_id)
         self.component_id: int = int(component_id)
         self.sequence: int = 0
-        """The sequence number of the next frame, 0..255."""
+        """Sequence number of the next frame, 0..255."""
         self.signing: Signing | None = None
-        """Signs the frames of MAVLink 2; None: they are not signed. MAVLink 1 has no signatures."""
+        """Signs MAVLink 2 frames; None to send them unsigned. MAVLink 1 has no signatures."""
         self._version = 2
         self.version = version
 
     @property
     def version(self) -> int:
-        """Of the next frames, 1 or 2; InvalidArgument when it is set to anything else."""
+        """MAVLink version of the next frames, 1 or 2."""
         return self._version
 
     @version.setter
@@ -55,23 +53,26 @@ class FrameEncoder:
         self._version = int(version)
 
     def encode(self, message: Message, now: float = 0.0) -> bytes:
-        """The whole frame. InvalidArgument names a field that does not fit; the sequence number is not used then.
+        """Encode a whole frame.
 
-        MAVLink 2 drops zeros from the end of the payload, MAVLink 1 all extension fields; it has no ids above 255.
-        ``now`` is seconds since 1970, for the time stamp of a signature.
+        MAVLink 2 truncates trailing zeros of the payload. MAVLink 1 omits extension fields and has no ids above 255.
+        ``now`` is in seconds since 1970, for the timestamp of the signature.
+
+        Raises:
+            InvalidArgument: a field has an invalid value; no sequence number is used.
         """
         signing = self.signing if self._version == 2 else None
         payload = message.encode()
         number = message.ID
         if self._version == 2:
-            payload = payload.rstrip(b"\0") or payload[:1]  # the standard never cuts the first byte
+            payload = payload.rstrip(b"\0") or payload[:1]  # the standard keeps the first byte
             flags = 0 if signing is None else SIGNED
             source = self.system_id, self.component_id
             body = _HEADER_V2(len(payload), flags, 0, self.sequence, *source, number & 0xFFFF, number >> 16)
             body, magic = body + payload, _MAGIC_V2
         else:
             if number > 255:
-                raise InvalidArgument(f"{message.NAME} has id {number}, MAVLink 1 has none above 255")
+                raise InvalidArgument(f"{message.NAME} has id {number}, but MAVLink 1 has no ids above 255")
             payload = payload[: message.BASE_LENGTH]
             source = self.system_id, self.component_id
             body, magic = bytes((len(payload), self.sequence, *source, number)) + payload, _MAGIC_V1

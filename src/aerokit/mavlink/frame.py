@@ -1,8 +1,6 @@
-"""`Frame`: one checked frame off the wire, payload not decoded.
+"""`Frame`: one received frame with a valid checksum and an undecoded payload.
 
-https://mavlink.io/en/guide/serialization.html#packet_format
-
-https://mavlink.io/en/guide/serialization.html#checksum
+https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ MAGIC_V2 = 0xFD
 """First byte of a MAVLink 2 frame."""
 
 SIGNED = 0x01
-"""The one incompatibility flag that exists: the frame ends with 13 bytes of signature."""
+"""The only defined incompatibility flag: the frame has a signature of 13 bytes."""
 
 HEADER_LENGTH = 9  # without the magic byte
 
@@ -24,28 +22,28 @@ SIGNATURE_LENGTH = 13
 
 
 class Frame:
-    """One frame whose checksum was right. Treat it as immutable: it is shared by everyone who listens."""
+    """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
-    # No constructor: the framer fills in what it has at hand, the rest is worked out when somebody asks.
+    # No constructor, for speed: the framer sets the attributes, and properties compute the rest.
     __slots__ = ("_raw", "body", "checksum", "component_id", "message_id", "received_at", "system_id")
 
     body: bytes
-    """What the checksum covers: nine bytes of header, then the payload; of MAVLink 1 too, as MAVLink 2 has it."""
+    """The data covered by the checksum: a header of nine bytes, in the layout of MAVLink 2, and the payload."""
     checksum: int
-    """As on the wire, 0..65535."""
+    """Checksum of the frame, 0..65535."""
     message_id: int
-    """The standard's number of the message, 0..16777215."""
+    """Message id, 0..16777215."""
     system_id: int
-    """Who sent it: the system, 0..255 (0 is nobody's)."""
+    """System id of the sender, 0..255 (0 is invalid)."""
     component_id: int
-    """Who sent it: the component, 0..255."""
-    _raw: bytes  # only where `raw` cannot be put together again: MAVLink 1, signed, or parsed
+    """Component id of the sender, 0..255."""
+    _raw: bytes  # only if `raw` cannot be reconstructed: MAVLink 1, signed or parsed frames
     received_at: float
-    """The ``now`` that the framer was given with its bytes, in seconds."""
+    """Time in seconds that was passed to the framer with the data."""
 
     @classmethod
     def parse(cls, raw: bytes, received_at: float = 0.0) -> Frame:
-        """Take a frame that is known to be whole and right, out of a log for example, apart."""
+        """Create a frame from bytes that are known to be valid, for example from a log."""
         frame = cls()
         frame._raw = raw
         frame.received_at = received_at
@@ -61,38 +59,38 @@ class Frame:
 
     @property
     def raw(self) -> bytes:
-        """The whole frame, from the magic byte to the end of checksum or signature."""
-        raw: bytes | None = getattr(self, "_raw", None)  # half the time of an AttributeError that is caught
+        """The whole frame, from the magic byte to the checksum or signature."""
+        raw: bytes | None = getattr(self, "_raw", None)  # twice as fast as catching AttributeError
         return b"\xfd" + self.body + self.checksum.to_bytes(2, "little") if raw is None else raw
 
     @property
     def payload(self) -> bytes:
-        """The payload as on the wire: MAVLink 2 cuts zeros off its end."""
+        """The payload as received. MAVLink 2 truncates trailing zeros."""
         return self.body[HEADER_LENGTH:]
 
     @property
     def sequence(self) -> int:
-        """The sender's counter, 0..255, then from 0 again."""
+        """Sequence number, 0..255."""
         return self.body[3]
 
     @property
     def version(self) -> int:
-        """1 or 2."""
+        """MAVLink version, 1 or 2."""
         return 1 if self.raw[0] == MAGIC_V1 else 2
 
     @property
     def incompat_flags(self) -> int:
-        """What a receiver must understand to read it: 0, or `SIGNED`."""
+        """Flags that a receiver must support: 0 or `SIGNED`."""
         return self.body[1]
 
     @property
     def compat_flags(self) -> int:
-        """What a receiver may ignore."""
+        """Flags that a receiver may ignore."""
         return self.body[2]
 
     @property
     def signature(self) -> bytes:
-        """Link id, time stamp and signature, 13 bytes, not verified; empty when it is not signed."""
+        """Link id, timestamp and signature, 13 bytes, not verified; empty if the frame is not signed."""
         return self.raw[-SIGNATURE_LENGTH:] if self.incompat_flags & SIGNED else b""
 
     def __repr__(self) -> str:
@@ -101,7 +99,7 @@ class Frame:
 
 
 def is_whole_frame(data: bytes) -> bool:
-    """Whether these bytes have the form of exactly one frame; its checksum is not looked at."""
+    """Return True if the bytes have the length and header of exactly one frame. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
         return False
     if data[0] == MAGIC_V1:
@@ -110,7 +108,7 @@ def is_whole_frame(data: bytes) -> bool:
 
 
 def x25_in_python() -> Callable[[bytes], int]:
-    """Make the function without any library, for platforms where pymavlink comes without ``fastcrc``."""
+    """Create a checksum function in Python, for platforms where pymavlink does not install ``fastcrc``."""
     table: list[int] = []
     for byte in range(256):
         for _ in range(8):
@@ -126,7 +124,7 @@ def x25_in_python() -> Callable[[bytes], int]:
     return x25
 
 
-def _fastest() -> Callable[[bytes], int]:
+def _fastest_x25() -> Callable[[bytes], int]:
     try:
         from fastcrc.crc16 import mcrf4xx
     except ImportError:
@@ -134,5 +132,5 @@ def _fastest() -> Callable[[bytes], int]:
     return mcrf4xx
 
 
-x25: Callable[[bytes], int] = _fastest()
-"""The checksum of some bytes, 0..65535."""
+x25: Callable[[bytes], int] = _fastest_x25()
+"""Computes the checksum of bytes (CRC-16/MCRF4XX), 0..65535."""

@@ -1,9 +1,9 @@
-"""`Framer`: any bytes in, checked frames out.
+"""`Framer`: extracts frames from bytes.
 
-It is fed whatever a link delivers, datagrams or a stream cut anywhere, with noise and text in between, and never
-raises. What it does with each byte that could start a frame follows one order: a good checksum wins, a
-plausible header is worth waiting for, anything else is passed over one byte at a time, so that a good frame behind
-noise is found. https://mavlink.io/en/guide/serialization.html
+The input may be datagrams or a stream cut anywhere, with noise and text between frames. The framer never raises. At
+each byte that could start a frame it follows one order: a valid checksum wins, a plausible header is waited for, and
+anything else is skipped one byte at a time, so that a valid frame after noise is found.
+https://mavlink.io/en/guide/serialization.html
 """
 
 from __future__ import annotations
@@ -18,77 +18,73 @@ from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED, Frame, x25
 from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, SourceStatistics
 
-MOST_SOURCES = 1024
-"""So many senders are counted apart by a framer that shares no `SourceLimit` with others."""
+MAX_SOURCES = 1024
+"""Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# The last of version 2 is the id in its lower three bytes; the byte above them belongs to what follows.
+# The last item is the id in its lower three bytes; the upper byte belongs to the payload.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
 _CHECKSUM = Struct("<H").unpack_from
-_SHORTEST_V2 = 12
-_SHORTEST_V1 = 8
+_MIN_LENGTH_V2 = 12
+_MIN_LENGTH_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
-# What may be the beginning of a frame; of version 2 only with flags that exist, or cut off before them.
+# Possible starts of frames; of version 2 only with known flags, or truncated before them.
 _magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
-# What a place in the bytes may be.
-_GOOD = 0  # a whole frame with the right checksum
-_WAIT = 1  # the beginning of a likely frame
-_DOUBTFUL = 2  # the beginning of an unlikely frame: wait, but look behind it meanwhile
-_UNKNOWN = 3  # a whole frame of an unknown message, if it is one
+# Verdicts about a position in the data.
+_GOOD = 0  # a whole frame with a valid checksum
+_WAIT = 1  # the beginning of a plausible frame
+_IMPLAUSIBLE = 2  # the beginning of an implausible frame: wait, but examine what follows
+_UNKNOWN = 3  # a whole frame of an unknown message, if it is a frame
 _BAD_CRC = 4
 _NOISE = 5
 
+# Begin, end, message id, sequence, source.
 _Found = tuple[int, int, int, int, int]
-"""Begin, end, message id, sequence, source."""
 
-_Known = tuple[int, list[tuple[int, int, int]], list[int]]
-"""Of bytes that are kept: how far they were looked at, what may become something (begin, verdict, until which size),
-and places with bad checksums. So no byte is examined again and again while others come one by one."""
-_NOTHING_KNOWN: _Known = (0, [], [])
+# State of the data that is kept: how far it was examined, candidates (begin, verdict, size at which to examine again),
+# and positions of bad checksums. It avoids examining the same bytes again while others arrive one by one.
+_ScanState = tuple[int, list[tuple[int, int, int]], list[int]]
+_NEW_SCAN: _ScanState = (0, [], [])
 
 
 class Framer:
-    """Turns bytes of one link and one peer into frames; keeps at most two unfinished frames, about 600 bytes."""
+    """Extracts frames from the data of one peer on one link. Keeps at most two unfinished frames, about 600 bytes."""
 
     def __init__(self, dialect: Dialect = STANDARD, limit: SourceLimit | None = None) -> None:
         self.dialect = dialect
-        """Knows the messages; ids it does not know cannot be checked and are only counted."""
+        """The known messages. Frames with other ids cannot be verified and are only counted."""
         self.wanted: Container[int] | None = None
-        """Ids of the messages that are returned, None for all; the others are checked and counted, nothing more."""
+        """Ids of the messages to return, or None for all. Other frames are only verified and counted."""
         self.keep_unknown = False
-        """Whether frames of messages that the dialect does not know are returned too, whatever is wanted: for a
-        recording. Their checksums cannot be checked."""
+        """True to return frames of unknown messages as well, for recordings. Their checksums are not verified."""
         self.statistics: FramerStatistics = FramerStatistics()
         """Counters since the beginning."""
         self.late: list[Frame] = []
-        """Those frames of the last `receive` that newer ones of their sender have overtaken, or that came before."""
+        """Frames of the last `receive` that newer ones of their sender have overtaken, and repeated ones."""
         self.foreign: list[Frame] = []
-        """Those that come from another sender with the same ids."""
+        """Frames of the last `receive` from another sender with the same ids."""
         self._rest = b""
-        self._known = _NOTHING_KNOWN
+        self._scan = _NEW_SCAN
         self._unknown: list[bytes] = []
         self._rows = dialect.rows
         self._extras = dialect.extras
-        self._limit = SourceLimit(MOST_SOURCES) if limit is None else limit
+        self._limit = SourceLimit(MAX_SOURCES) if limit is None else limit
         self._limit.join(self.statistics)
         self._sources = self.statistics.by_key
 
     def receive(self, data: bytes, now: float = 0.0) -> list[Frame]:
-        """The wanted frames that are complete with ``data``, in order; ``now`` becomes their ``received_at``.
-
-        Never raises, whatever the bytes.
-        """
-        # The loop is long and repeats `_examine` on purpose: it runs for every frame on the air. What is no good frame
-        # of MAVLink 2 whose message is known takes the slow path.
+        """Return the wanted frames that ``data`` completes, in order. ``now`` becomes their ``received_at``."""
+        # This loop is long and duplicates `_examine` deliberately, because it runs for every frame. Anything but a
+        # valid MAVLink 2 frame of a known message takes the slow path.
         if type(data) is not bytes:
             data = bytes(data)
         size = len(data)
         self.statistics.bytes += size
         if self.late or self.foreign:
             self.late, self.foreign = [], []
-        elif size >= _SHORTEST_V2 and not self._rest:
-            # Most datagrams are one good frame, the next one of its sender: a sixth quicker than by the loop.
+        elif size >= _MIN_LENGTH_V2 and not self._rest:
+            # Most datagrams are a single valid frame in sequence: a sixth faster than the loop below.
             magic, length, flags, sequence, key, message_id = _HEADER_V2(data)
             upto = 10 + length
             end = upto + (2 + SIGNATURE_LENGTH if flags else 2)
@@ -98,10 +94,7 @@ class Framer:
                     source = self._sources[key]
                     body = data[1:upto]
                     (checksum,) = _CHECKSUM(data, upto)
-                    if (
-                        source.expected & 0xFF == sequence
-                        and x25(body + self._extras[message_id]) == checksum
-                    ):
+                    if source.expected & 0xFF == sequence and x25(body + self._extras[message_id]) == checksum:
                         source.expected += 1
                         if self.wanted is not None and message_id not in self.wanted:
                             return []
@@ -117,9 +110,9 @@ class Framer:
                         return [frame]
                 except KeyError:
                     pass
-        known = _NOTHING_KNOWN
+        scan = _NEW_SCAN
         if self._rest:
-            known, data, self._rest = self._known, self._rest + data, b""
+            scan, data, self._rest = self._scan, self._rest + data, b""
             size = len(data)
         extras, sources, wanted = self._extras, self._sources, self.wanted
         frames: list[Frame] = []
@@ -144,10 +137,10 @@ class Framer:
                 end = sequence = key = message_id = checksum = 0
             if not good:
                 found = None
-                if data[begin] in _MAGICS and (begin or known is _NOTHING_KNOWN):
+                if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
                     found = self._examine(data, begin)[2]
                 if found is None:
-                    found = self._search(data, begin, _NOTHING_KNOWN if begin else known)
+                    found = self._search(data, begin, _NEW_SCAN if begin else scan)
                 if self._unknown:
                     frames += [Frame.parse(raw, now) for raw in self._unknown]
                     self._unknown.clear()
@@ -183,48 +176,48 @@ class Framer:
             self._sort_out(frames, out_of_order)
         return frames
 
-    def begin_anew(self) -> None:
-        """Forget the beginning of a frame: what comes next is another stream of bytes."""
+    def reset(self) -> None:
+        """Drop incomplete data, because the next bytes belong to another stream."""
         self._rest = b""
 
-    def retire(self) -> None:
-        """Give back the places of its senders in a `SourceLimit` that others share; it is not used any more."""
+    def close(self) -> None:
+        """Release the framer's senders in a shared `SourceLimit`. Do not use it afterwards."""
         self._limit.leave(self.statistics)
 
     def counters_of(self, frame: Frame) -> SourceStatistics | None:
-        """The counters of a frame's sender; None if it is not counted apart."""
+        """Return the counters of a frame's sender, or None if it has no separate ones."""
         return self._sources.get(frame.component_id << 8 | frame.system_id)
 
     @property
     def waiting(self) -> int:
-        """Bytes kept because they may become a frame, a few hundred at most."""
+        """Number of bytes kept because they may become a frame; at most a few hundred."""
         return len(self._rest)
 
     def _sort_out(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        """Name those out of order among the frames that are returned; others were not wanted."""
+        # Unwanted frames are not in the list, so the frame at that position may be another one.
         for place, verdict, which in out_of_order:
             if place < len(frames):
                 frame = frames[place]
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id == which:
                     (self.foreign if verdict == OTHERS else self.late).append(frame)
 
-    # ------------------------------------------------------------------------------ the slow path
+    # -------------------------------------------------------------------------------- slow path
 
-    def _search(self, data: bytes, begin: int, known: _Known) -> _Found | None:
-        """The next good frame from ``begin`` on; or None, with what may yet become one kept in ``_rest``."""
+    def _search(self, data: bytes, begin: int, scan: _ScanState) -> _Found | None:
+        """Find the next valid frame from ``begin`` on. Otherwise keep in ``_rest`` what may become one, return None."""
         size = len(data)
-        hold = -1  # from here on the bytes are kept
-        unknown = unknown_end = -1  # a whole frame of an unknown message, unless a good one is found inside
-        looked_at, before, bad_crcs = known
+        hold = -1  # data is kept from here on
+        unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid one
+        examined, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
         reached = size
-        news = ((place.start(), _NOISE, 0) for place in _magics(data, max(begin, looked_at)))
-        for here, verdict, end in chain(before, news, ((size, _NOISE, size),)):
+        new = ((match.start(), _NOISE, 0) for match in _magics(data, max(begin, examined)))
+        for here, verdict, end in chain(candidates, new, ((size, _NOISE, size),)):
             if unknown >= 0 and here >= unknown_end:
                 if unknown_end == size or data[unknown_end] in _MAGICS:
-                    self._pass(begin, unknown, bad_crcs)
-                    self._unknown_passed(data, unknown, unknown_end)
+                    self._skip(begin, unknown, bad_crcs)
+                    self._skip_unknown(data, unknown, unknown_end)
                     begin = unknown_end
                     hold, pending = -1, []
                     bad_crcs = [place for place in bad_crcs if place >= begin]
@@ -234,7 +227,7 @@ class Framer:
             if end <= size and verdict != _UNKNOWN:
                 verdict, end, found = self._examine(data, here)
                 if verdict == _GOOD:
-                    self._pass(begin, here, bad_crcs)
+                    self._skip(begin, here, bad_crcs)
                     return found
             if verdict == _BAD_CRC:
                 bad_crcs.append(here)
@@ -244,22 +237,22 @@ class Framer:
                 hold = _earliest(hold, unknown, here)
                 reached = here + 1
                 break
-            if verdict == _DOUBTFUL and hold < 0:
+            if verdict == _IMPLAUSIBLE and hold < 0:
                 hold = here
             elif verdict == _UNKNOWN and hold < 0 and unknown < 0:
                 unknown, unknown_end = here, end
         keep = size if hold < 0 else hold
-        self._pass(begin, keep, bad_crcs)
+        self._skip(begin, keep, bad_crcs)
         self._rest = data[keep:]
-        self._known = (
+        self._scan = (
             reached - keep,
             [(here - keep, verdict, end - keep) for here, verdict, end in pending if here >= keep],
             [here - keep for here in bad_crcs if here >= keep],
         )
         return None
 
-    def _unknown_passed(self, data: bytes, begin: int, end: int) -> None:
-        """A frame of an unknown message was here: its sender, if we know it, has not lost it."""
+    def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
+        # The sender sent this frame, so its sequence number is not lost.
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -271,38 +264,42 @@ class Framer:
         if source is not None and source.expected & 0xFF == sequence:
             source.skip(1)
 
-    def _pass(self, begin: int, end: int, bad_crcs: list[int]) -> None:
-        """Bytes that are in no frame are behind us; those that are kept will be looked at, and counted, again."""
+    def _skip(self, begin: int, end: int, bad_crcs: list[int]) -> None:
+        # Count bytes outside frames. Bytes that are kept are examined, and counted, later.
         self.statistics.bad_bytes += end - begin
         if bad_crcs:
             self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _Found | None]:
-        """(verdict, end, frame when good) of the place ``begin``, where a magic byte is."""
+        """Return (verdict, end, frame if valid) for the magic byte at ``begin``."""
         size = len(data)
         if data[begin] == MAGIC_V2:
-            if size - begin < _SHORTEST_V2:
-                whole = size - begin < 3 or data[begin + 2] <= SIGNED
-                return (_WAIT if whole else _NOISE), begin + (3 if size - begin < 3 else _SHORTEST_V2), None
+            if size - begin < _MIN_LENGTH_V2:
+                plausible = size - begin < 3 or data[begin + 2] <= SIGNED
+                return (
+                    (_WAIT if plausible else _NOISE),
+                    begin + (3 if size - begin < 3 else _MIN_LENGTH_V2),
+                    None,
+                )
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None
             message_id, body = message_id & 0xFFFFFF, begin + 10
             end = body + length + 2 + (SIGNATURE_LENGTH if flags else 0)
         else:
-            if size - begin < _SHORTEST_V1:
-                return _WAIT, begin + _SHORTEST_V1, None
+            if size - begin < _MIN_LENGTH_V1:
+                return _WAIT, begin + _MIN_LENGTH_V1, None
             length, sequence, key, message_id = _HEADER_V1(data, begin)
             body, flags = begin + 6, 0
             end = body + length + 2
         row = self._rows.get(message_id)
         if row is None:
-            return (_UNKNOWN if end <= size else _DOUBTFUL), end, None
+            return (_UNKNOWN if end <= size else _IMPLAUSIBLE), end, None
         extra, base_length, full_length = row
         if body - begin == 6 and not base_length <= length <= full_length:
-            return _NOISE, size, None  # version 1 neither trims nor knows extensions that are newer than ours
+            return _NOISE, size, None  # MAVLink 1 neither truncates payloads nor allows unknown extensions
         if end > size:
-            return (_WAIT if length <= full_length else _DOUBTFUL), end, None
+            return (_WAIT if length <= full_length else _IMPLAUSIBLE), end, None
         upto = body + length
         if x25(data[begin + 1 : upto] + bytes((extra,))) != _CHECKSUM(data, upto)[0]:
             return _BAD_CRC, end, None
@@ -310,7 +307,7 @@ class Framer:
 
 
 def _earliest(hold: int, unknown: int, here: int) -> int:
-    """Where what is kept begins when something likely begins here: at what began before, if that is not settled."""
-    if unknown >= 0:  # before `hold`: it is none when something is held already
+    """Return where the data to keep begins if a plausible frame begins at ``here``: at any earlier candidate."""
+    if unknown >= 0:  # earlier than `hold`, because it is only set if nothing is held
         return unknown
     return here if hold < 0 else hold

@@ -1,14 +1,13 @@
-"""What the standard has beyond pymavlink's XML, worked into the definitions that were read from there.
+"""Generates the modules of messages and enums from pymavlink's XML and additions.
 
-pymavlink carries ArduPilot's fork of the standard. The folder ``additions`` has the difference, in the same XML; where
-both say something of units, enums, values and what is superseded, the standard's word counts. Texts are pymavlink's
-where it has any. What ArduPilot alone has stays.
+pymavlink has ArduPilot's fork of the standard. The folder ``additions`` has what the standard defines beyond it, as
+XML. Where they differ in units, enums, values or deprecation, the standard takes precedence; descriptions are
+pymavlink's if it has any. ArduPilot's own definitions are kept.
 
-python -m aerokit.mavlink.generator            # write them
-    python -m aerokit.mavlink.generator --check    # compare: 0 the same, or skipped for other XML; 1 different
+    python -m aerokit.mavlink.generator            # write the modules
+    python -m aerokit.mavlink.generator --check    # compare: 0 same, or skipped for other XML; 1 different
 
-The output depends on the XML alone, so that a difference is a change of the standard, of our additions to it or of the
-generator.
+The output depends only on the XML, so a difference is a change of the standard, the additions or the generator.
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ from aerokit.mavlink.rendering import render_enum_row, render_enum_stub, render_
 
 UNION_FOLDER = Path(__file__).parent / "additions"
 
-FLOORS = ("minimal", "standard", "common")
-"""The standard's files from below; what two of them name is at home in the lower one."""
+# The standard's files, each including the one before. Definitions in several of them belong to the first.
+STANDARD_FILES = ("minimal", "standard", "common")
 
 DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
 
 
 def read_additions() -> list[DialectDefinition]:
-    """The definitions of the folder, each file by itself."""
+    """Read the additions, each file separately."""
     return [read_xml(UNION_FOLDER / f"{stem}.xml") for stem in ("minimal", "common", "development")]
 
 
 def with_added_messages(
     messages: Sequence[MessageDefinition], additions: Sequence[DialectDefinition]
 ) -> list[MessageDefinition]:
-    """Messages of pymavlink in their order, then those that are new."""
+    """Return pymavlink's messages with the additions, in order, then new messages."""
     merged = {message.id: message for message in messages}
     for added in (message for dialect in additions for message in dialect.messages):
         known = merged.get(added.id)
@@ -61,10 +60,8 @@ def with_added_messages(
     return list(merged.values())
 
 
-def with_added_enums(
-    enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]
-) -> list[EnumDefinition]:
-    """Enums of pymavlink in their order, then those that are new. Of two names for a value the standard's is first.
+def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
+    """Return pymavlink's enums with the additions, in order, then new ones. A value's standard name comes first.
 
     New entries do not change the names that the others have in Python.
     """
@@ -79,9 +76,10 @@ def with_added_enums(
 
 
 def _settled(known: DefinedT, added: DefinedT) -> DefinedT:
-    """With the remarks and the home of both."""
     home = min(
-        known.origin, added.origin, key=lambda stem: FLOORS.index(stem) if stem in FLOORS else len(FLOORS)
+        known.origin,
+        added.origin,
+        key=lambda stem: STANDARD_FILES.index(stem) if stem in STANDARD_FILES else len(STANDARD_FILES),
     )
     return replace(known, origin=home, remarks=added.remarks or known.remarks)
 
@@ -112,6 +110,7 @@ def _entry(known: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
     )
 
 
+# Module → XML files whose definitions it has.
 MODULES: dict[str, tuple[str, ...]] = {
     "minimal": ("minimal",),
     "standard": ("standard",),
@@ -119,8 +118,9 @@ MODULES: dict[str, tuple[str, ...]] = {
     "ardupilotmega": ("ardupilotmega", "uAvionix", "icarous", "loweheiser", "cubepilot", "csAirLink"),
     "development": ("development",),
 }
-"""Committed module → the XML files whose definitions it holds."""
 
+# Messages of ``common.xml`` that every flight uses, in ``common.py``. Two hundred others, which would take most of the
+# time of an import, are in ``common_more.py``.
 EVERYDAY = """
     Attitude AttitudeQuaternion AvailableModes BatteryStatus CommandAck CommandInt CommandLong CurrentMode
     DistanceSensor EstimatorStatus ExtendedSysState FileTransferProtocol Gps2Raw GpsGlobalOrigin GpsRawInt
@@ -131,8 +131,6 @@ EVERYDAY = """
     SetPositionTargetGlobalInt SetPositionTargetLocalNed Statustext SysStatus SystemTime Timesync VfrHud Vibration
     WindCov
 """
-"""The messages of ``common.xml`` that ``common.py`` holds: those of every flight. Two hundred others, which would take
-most of the time of an import, are in ``common_more.py``."""
 
 COMMON_MORE = "common_more"
 
@@ -141,12 +139,10 @@ FOLDER = Path(__file__).parent
 _MARK = "XML fingerprint: "
 
 _HEADER = (
-    "# Generated by aerokit.mavlink.generator from pymavlink's XML and additions/: do not edit.\n# "
-    + _MARK
-    + "{}\n"
+    "# Generated by aerokit.mavlink.generator from pymavlink's XML and additions/: do not edit.\n# " + _MARK + "{}\n"
 )
 
-_MESSAGES_HEAD = '''# The classes are immutable for whoever uses them; only the code in this file assigns their fields.
+_MESSAGES_HEAD = '''# Treat the classes as immutable; only the code in this file assigns their fields.
 # mypy: disable-error-code="misc, assignment, override, method-assign"
 # pyright: reportAttributeAccessIssue=false, reportIncompatibleMethodOverride=false
 # pyright: reportIncompatibleVariableOverride=false, reportGeneralTypeIssues=false
@@ -171,13 +167,13 @@ _new = object.__new__
 _ENUMS_HEAD = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of ``{name}.xml``{more}: https://mavlink.io/en/messages/{name}.html.
 
-Each is made when it is first asked for: two thousand members at once would double the time an import takes.
-What type checkers and editors read is the stub file beside this one.
+Enums are created on first access, because creating all of their two thousand members would double the import time.
+Type checkers and editors read the stub file beside this one.
 """
 
 from __future__ import annotations
 
-from aerokit.mavlink.enumeration import make_enum
+from aerokit.mavlink.message import make_enum
 
 _TABLE: dict[str, tuple[bool, str, tuple[tuple[str, int], ...]]] = {{
 '''
@@ -201,8 +197,8 @@ def __dir__() -> list[str]:
 _ENUMS_INIT = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
-Each is an ``IntEnum``, or an ``IntFlag`` when the standard calls it a bitmask. Fields of messages are plain ``int``;
-members compare equal to them. https://mavlink.io/en/messages/
+Each is an ``IntEnum``, or an ``IntFlag`` if the standard marks it as a bitmask. Fields of messages are plain ``int``,
+which compare equal to members. https://mavlink.io/en/messages/
 """
 
 from __future__ import annotations
@@ -229,9 +225,9 @@ def __dir__() -> list[str]:
 _MESSAGES_INIT = '''# pyright: reportUnsupportedDunderAll=false
 """Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
-Names of fields, order and raw units are the standard's: https://mavlink.io/en/messages/
+Names, order and raw units of fields are those of the standard: https://mavlink.io/en/messages/
 
-A module is imported when the first of its messages is asked for. `INDEX` is what checking a frame takes, without the
+A module is imported when one of its messages is first used. `INDEX` has what is needed to verify frames without the
 class: message id → (class, module, CRC_EXTRA, base length, length).
 """
 
@@ -260,7 +256,7 @@ def __dir__() -> list[str]:
 
 
 def xml_folder() -> Path:
-    """Where the installed pymavlink keeps its XML."""
+    """Return the folder with the XML files of the installed pymavlink."""
     spec = importlib.util.find_spec("pymavlink")
     if spec is None or not spec.submodule_search_locations:
         raise InvalidArgument("pymavlink is not installed, and the XML is in its package")
@@ -268,7 +264,7 @@ def xml_folder() -> Path:
 
 
 def fingerprint(folder: Path | None = None) -> str:
-    """Tells one set of XML files from another."""
+    """Return a hash of the XML files."""
     folder = folder or xml_folder()
     digest = hashlib.sha256()
     for stem in _stems():
@@ -277,15 +273,13 @@ def fingerprint(folder: Path | None = None) -> str:
 
 
 def generated_fingerprint() -> str:
-    """The fingerprint of the XML that the committed modules were made from."""
-    found = re.search(
-        _MARK + "([0-9a-f]+)", (FOLDER / "messages" / "__init__.py").read_text(encoding="utf-8")
-    )
+    """Return the hash of the XML files from which the committed modules were generated."""
+    found = re.search(_MARK + "([0-9a-f]+)", (FOLDER / "messages" / "__init__.py").read_text(encoding="utf-8"))
     return found[1] if found else ""
 
 
 def definitions(folder: Path | None = None) -> tuple[list[MessageDefinition], list[EnumDefinition]]:
-    """All messages and enums that are generated: pymavlink's, with the additions."""
+    """Return all messages and enums to generate."""
     folder = folder or xml_folder()
     dialects = [read_xml(folder / f"{stem}.xml") for stem in _stems()]
     additions = read_additions()
@@ -294,15 +288,15 @@ def definitions(folder: Path | None = None) -> tuple[list[MessageDefinition], li
 
 
 def generate(folder: Path | None = None) -> dict[str, str]:
-    """All generated files: path below `aerokit.mavlink` → text."""
+    """Return all generated files, as a mapping of paths below `aerokit.mavlink` to text."""
     messages, enums = definitions(folder)
-    _refuse_doubles(message.class_name for message in messages)
-    _refuse_doubles(enum.class_name for enum in enums)
+    _check_unique(message.class_name for message in messages)
+    _check_unique(enum.class_name for enum in enums)
     files: dict[str, str] = {}
     files["messages/__init__.py"], files["messages/__init__.pyi"] = _messages_init(messages)
     files["enums/__init__.py"], files["enums/__init__.pyi"] = _enums_init(enums)
     for module in (*MODULES, COMMON_MORE):
-        own_messages = [each for each in messages if _module_of(each) == module]
+        own_messages = [message for message in messages if _module_of(message) == module]
         files[f"messages/{module}.py"] = _messages_module(module, own_messages)
     for module, stems in MODULES.items():
         own = [enum for enum in enums if enum.origin in stems]
@@ -313,7 +307,7 @@ def generate(folder: Path | None = None) -> dict[str, str]:
 
 
 def differences(folder: Path | None = None) -> list[str]:
-    """Committed files that are not what would be generated now; empty when all is well."""
+    """Return the committed files that differ from the generated ones."""
     files = generate(folder)
     present = {
         path.relative_to(FOLDER).as_posix()
@@ -325,13 +319,11 @@ def differences(folder: Path | None = None) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit code."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m aerokit.mavlink.generator", description=(__doc__ or "").partition("\n")[0]
     )
-    parser.add_argument(
-        "--check", action="store_true", help="compare with the committed modules, write nothing"
-    )
+    parser.add_argument("--check", action="store_true", help="compare with the committed modules, write nothing")
     options = parser.parse_args(arguments)
     if not options.check:
         for path, text in generate().items():
@@ -339,14 +331,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (FOLDER / path).write_text(text, encoding="utf-8", newline="\n")
         return 0
     if fingerprint() != generated_fingerprint():
-        sys.stdout.write(
-            "skipped: the installed pymavlink carries other XML than the modules were made from\n"
-        )
+        sys.stdout.write("skipped: the installed pymavlink has other XML than the modules were generated from\n")
         return 0
     wrong = differences()
-    sys.stdout.write(
-        "".join(f"differs: {path}\n" for path in wrong) or "the committed modules are up to date\n"
-    )
+    texts = [f"differs: {path}\n" for path in wrong] or ["the committed modules are up to date\n"]
+    sys.stdout.writelines(texts)
     return 1 if wrong else 0
 
 
@@ -419,11 +408,11 @@ def _all(names: Iterable[str]) -> str:
     return "__all__ = [\n" + "".join(f'    "{name}",\n' for name in names) + "]\n"
 
 
-def _refuse_doubles(names: Iterable[str]) -> None:
+def _check_unique(names: Iterable[str]) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise InvalidArgument(f"two definitions would both be called {name}")
+            raise InvalidArgument(f"two definitions would both have the name {name}")
         seen.add(name)
 
 

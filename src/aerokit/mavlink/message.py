@@ -1,7 +1,8 @@
-"""What every MAVLink message class has: `Message`, and `Field`, which says what the standard says of one field."""
+"""`Message`, the base class of all message classes, and `Field`, the description of a field."""
 
 from __future__ import annotations
 
+import enum
 import struct
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -9,29 +10,27 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.frame import HEADER_LENGTH
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from typing_extensions import Self, dataclass_transform
 
     from aerokit.mavlink.frame import Frame
-else:  # importing typing_extensions would cost more than everything else here
+else:  # typing_extensions takes longer to import than this package
 
     def dataclass_transform(**_: object) -> Any:
-        """Only the type checker cares."""
         return lambda cls: cls
 
 
+# Errors of packing a wrong value. Generated classes convert them to InvalidArgument.
 PACK_ERRORS = (struct.error, OverflowError, TypeError, ValueError, AttributeError)
-"""What packing a wrong value can raise; the generated classes turn it into InvalidArgument."""
 
 _ANY_HEADER = bytes(HEADER_LENGTH)
-BYTES_IN_CHARS = frozenset(
-    (name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK")
-)
-"""Message and field of those ``char`` arrays that carry bytes: a number as C keeps it in memory, or a text, as another
-field says. As texts, which end at the first NUL, the numbers would be lost."""
+# Message and field of ``char`` arrays that carry bytes, a number or a text depending on another field. As strings,
+# which end at the first NUL, numbers would be truncated.
+BYTES_IN_CHARS = frozenset((name, "param_value") for name in ("PARAM_EXT_VALUE", "PARAM_EXT_SET", "PARAM_EXT_ACK"))
+# Fields whose values never appear in texts.
 SECRET_FIELDS = frozenset(("secret_key", "passkey", "password"))
-"""Fields that are shown to nobody."""
+# Size in bytes of each type of the standard.
 SIZES = {
     "char": 1,
     "int8_t": 1,
@@ -45,7 +44,7 @@ SIZES = {
     "float": 4,
     "double": 8,
 }
-"""Bytes on the wire of each type the standard knows."""
+# Minimum and maximum of each integer type.
 INTEGER_RANGES = {
     "int8_t": (-(1 << 7), (1 << 7) - 1),
     "uint8_t": (0, (1 << 8) - 1),
@@ -56,20 +55,17 @@ INTEGER_RANGES = {
     "int64_t": (-(1 << 63), (1 << 63) - 1),
     "uint64_t": (0, (1 << 64) - 1),
 }
-"""Lowest and highest number of each integer type."""
 
 
 class Field:
-    """One field of a message, as the standard describes it."""
+    """Description of one field of a message in the standard."""
 
-    __slots__ = (
-        *("array_length", "description", "enum", "extension", "invalid", "is_text", "name", "type", "units"),
-    )
+    __slots__ = (*("array_length", "description", "enum", "extension", "invalid", "is_text", "name", "type", "units"),)
 
     def __init__(
         self,
         name: str,
-        type: str,  # noqa: A002 - the standard's word
+        type: str,  # noqa: A002 - the name in the standard
         array_length: int,
         units: str,
         enum: str,
@@ -79,35 +75,35 @@ class Field:
         carries_bytes: bool = False,
     ) -> None:
         self.name = name
-        """The attribute's name, and the standard's, but for an underscore behind a Python keyword."""
+        """Name of the attribute: that in the standard, with a trailing underscore if it is a Python keyword."""
         self.type = type
-        """The standard's type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
+        """Type without brackets: ``"uint16_t"``, ``"float"``, ``"char"`` …"""
         self.array_length = array_length
-        """Number of elements, 0 when it is no array."""
+        """Number of elements; 0 if it is not an array."""
         self.units = units
-        """The standard's unit, ``"cm/s"`` for example, or empty."""
+        """Unit, for example ``"cm/s"``, or empty."""
         self.enum = enum
-        """The standard's name of the enum its values come from, or empty."""
+        """Name of the enum of the values, or empty."""
         self.invalid = invalid
-        """The standard's text for the value that means "not known", ``"UINT16_MAX"`` for example, or empty."""
+        """Value that means "unknown", as in the XML: for example ``"UINT16_MAX"``, or empty."""
         self.description = description
-        """The standard's description."""
+        """Description in the standard."""
         self.extension = extension
-        """Whether it is absent in MAVLink 1."""
+        """True if MAVLink 1 does not have the field."""
         self.is_text: bool = type == "char" and not carries_bytes
-        """Whether its value is a ``str``; a few ``char`` arrays are ``bytes``, because they carry numbers."""
+        """True if the value is a ``str``. A few ``char`` arrays are ``bytes``, because they carry numbers."""
 
     def __repr__(self) -> str:
         brackets = f"[{self.array_length}]" if self.array_length else ""
         unit = f" [{self.units}]" if self.units else ""
         return f"<Field {self.type}{brackets} {self.name}{unit}>"
 
-    def complaint(self, value: Any) -> str | None:
-        """What is wrong with ``value`` for this field, or None."""
+    def problem(self, value: Any) -> str | None:
+        """Explain why ``value`` is invalid for this field, or return None."""
         if self.is_text:
-            return _text_complaint(value, self.array_length or 1)
+            return _text_problem(value, self.array_length or 1)
         if not self.array_length:
-            return _number_complaint(value, self.type)
+            return _number_problem(value, self.type)
         if self.type in ("uint8_t", "char") and not isinstance(value, (bytes, bytearray)):
             return f"must be bytes, at most {self.array_length}"
         try:
@@ -116,11 +112,11 @@ class Field:
             return f"must be a sequence of at most {self.array_length} numbers"
         if size > self.array_length:
             return f"has {size} elements, at most {self.array_length} fit"
-        return next((c for c in (_number_complaint(item, self.type) for item in value) if c), None)
+        return next((p for p in (_number_problem(item, self.type) for item in value) if p), None)
 
 
 class _Fields:
-    """``Message.FIELDS``: made when first asked for, because most programs never ask."""
+    """Descriptor of ``Message.FIELDS``, which are created on first access, because most programs do not need them."""
 
     def __get__(self, instance: object, owner: type[Message]) -> tuple[Field, ...]:
         fields = tuple(Field(*row) for row in owner._FIELDS)
@@ -129,75 +125,75 @@ class _Fields:
 
 
 def offset_of(message_type: type[Message], field: str) -> int:
-    """Where in the payload this field begins: large types first, extensions behind them in their order.
+    """Return the offset of a field in the payload.
 
     https://mavlink.io/en/guide/serialization.html#field_reordering
     """
-    fields = [each for each in message_type.FIELDS if not each.extension]
-    fields.sort(key=lambda each: -SIZES[each.type])
+    fields = [f for f in message_type.FIELDS if not f.extension]
+    fields.sort(key=lambda f: -SIZES[f.type])
     offset = 0
-    for each in (*fields, *(each for each in message_type.FIELDS if each.extension)):
-        if each.name == field:
+    for f in (*fields, *(f for f in message_type.FIELDS if f.extension)):
+        if f.name == field:
             return offset
-        offset += SIZES[each.type] * (each.array_length or 1)
+        offset += SIZES[f.type] * (f.array_length or 1)
     raise InvalidArgument(f"{message_type.NAME} has no field {field!r}")
 
 
 def field_names(message: Message) -> tuple[str, ...]:
-    """The names of its fields, in the order of the standard's definition."""
+    """Return the names of the fields, in the order of the XML."""
     return message.__match_args__  # type: ignore[attr-defined,no-any-return]
 
 
 @dataclass_transform(frozen_default=True)
 class Message:
-    """Base of all message classes; immutable by agreement, which the type checker enforces.
+    """Base class of all messages. Treat messages as immutable; type checkers enforce it.
 
-    Messages are equal when they are of one class and their fields are equal (NaN counts as equal to NaN).
+    Messages are equal if their classes and fields are; NaN equals NaN.
     """
 
-    if not TYPE_CHECKING:  # a type checker would take the slot for a class attribute of the same name
+    if not TYPE_CHECKING:  # type checkers take a slot for a class attribute of the same name
         __slots__ = ("received_frame",)
-        __match_args__ = ()  # each class has its own: what a checker infers there is its names, for `match`
+        __match_args__ = ()  # overridden by each class, and inferred by type checkers, for `match`
     __hash__: ClassVar[None]  # type: ignore[assignment]
 
     ID: ClassVar[int]
-    """The standard's number of the message."""
+    """Message id."""
     NAME: ClassVar[str] = ""
-    """The standard's name of the message, ``"GLOBAL_POSITION_INT"``."""
+    """Name in the standard, ``"GLOBAL_POSITION_INT"``."""
     CRC_EXTRA: ClassVar[int]
-    """Goes into the checksum, so that frames of another definition are refused."""
+    """Byte added to the checksum, so that frames of a different definition are invalid."""
     LENGTH: ClassVar[int]
-    """Bytes of the whole payload."""
+    """Payload length."""
     BASE_LENGTH: ClassVar[int]
-    """Bytes of the payload without extensions, as MAVLink 1 sends it."""
+    """Payload length without extensions, as in MAVLink 1."""
     if TYPE_CHECKING:
         FIELDS: ClassVar[tuple[Field, ...]]
-        """The fields in the standard's order, extensions last."""
+        """The fields in the order of the XML, extensions last."""
     else:
         FIELDS = _Fields()
     _FIELDS: ClassVar[tuple[tuple[Any, ...], ...]] = ()
 
     received_frame: Frame | None
-    """The frame this was decoded from: who sent it and when it came. None when the program built it."""
+    """The frame this message was decoded from; None if the program created the message."""
 
     @classmethod
     def decode(cls, payload: bytes, frame: Frame | None = None) -> Self:
-        """Make a message of a payload off the wire; trimmed zeros are restored, unknown extensions ignored."""
+        """Decode a payload. Truncated zeros are restored, unknown extensions ignored."""
         return cls.decode_body(_ANY_HEADER + payload, frame)
 
     if TYPE_CHECKING:
 
         @classmethod
         def decode_body(cls, body: bytes, frame: Frame | None = None) -> Self:
-            """The same of `Frame.body`, where a header is before the payload; a frame is decoded this way."""
+            """Decode a `Frame.body`, which has a header before the payload."""
             raise NotImplementedError
 
         def encode(self) -> bytes:
-            """The whole payload; InvalidArgument names the field, the value and the allowed range."""
+            """Encode the whole payload. InvalidArgument names the field, the value and the allowed range."""
             raise NotImplementedError
 
     def to_dict(self) -> dict[str, Any]:
-        """Field names and values, in the standard's order."""
+        """Return the fields as a dictionary, in the order of the XML."""
         return {name: getattr(self, name) for name in field_names(self)}
 
     def __eq__(self, other: object) -> bool:
@@ -206,21 +202,21 @@ class Message:
         return all(_same(getattr(self, name), getattr(other, name)) for name in field_names(self))
 
     def __repr__(self) -> str:
-        fields = ", ".join(f"{name}={_shown(name, getattr(self, name))}" for name in field_names(self))
+        fields = ", ".join(f"{name}={_format_field(name, getattr(self, name))}" for name in field_names(self))
         return f"{type(self).__name__}({fields})"
 
     def _encode_error(self) -> InvalidArgument:
         for field in self.FIELDS:
             value = getattr(self, field.name, None)
-            complaint = field.complaint(value)
-            if complaint:
-                shown = _shown(field.name, value)
-                return InvalidArgument(f"{self.NAME}.{field.name} = {shown} cannot be sent: {complaint}")
+            problem = field.problem(value)
+            if problem:
+                shown = _format_field(field.name, value)
+                return InvalidArgument(f"{self.NAME}.{field.name} = {shown} cannot be sent: {problem}")
         return InvalidArgument(f"{self!r} cannot be sent")
 
 
-def _shown(name: str, value: object) -> str:
-    """A value as text; logs and error messages are no place for keys."""
+def _format_field(name: str, value: object) -> str:
+    # Keys do not belong into logs and error messages.
     return "<not shown>" if name in SECRET_FIELDS else repr(value)
 
 
@@ -228,7 +224,7 @@ def _shown(name: str, value: object) -> str:
 
 
 def pack_text(value: str, size: int) -> bytes:
-    """UTF-8 of a text, ValueError when it is longer than ``size``; struct adds the zeros."""
+    """Encode a text as UTF-8. ValueError if it exceeds ``size``; struct appends zeros."""
     data = value.encode()
     if len(data) > size:
         raise ValueError(value)
@@ -236,30 +232,30 @@ def pack_text(value: str, size: int) -> bytes:
 
 
 def pack_bytes(value: bytes, size: int) -> bytes:
-    """The bytes, ValueError when there are more than ``size``; struct adds the zeros."""
+    """Return the bytes. ValueError if they exceed ``size``; struct appends zeros."""
     if len(value) > size:
         raise ValueError(value)
     return value
 
 
 def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
-    """The numbers, with zeros added; more than ``size`` are left for struct to refuse."""
+    """Append zeros. If there are more than ``size`` numbers, struct raises."""
     missing = size - len(value)
     return (*value, *(0,) * missing) if missing else value
 
 
-# ------------------------------------------------------------------------------------- complaints
+# --------------------------------------------------------------------------------------- checks
 
 
-def _same(one: Any, other: Any) -> bool:
-    if one == other or (one != one and other != other):
+def _same(left: Any, right: Any) -> bool:
+    if left == right or (left != left and right != right):
         return True
-    if isinstance(one, tuple) and isinstance(other, tuple) and len(one) == len(other):
-        return all(_same(a, b) for a, b in zip(one, other))  # noqa: B905 - of one length
+    if isinstance(left, tuple) and isinstance(right, tuple) and len(left) == len(right):
+        return all(_same(a, b) for a, b in zip(left, right))  # noqa: B905 - same length
     return False
 
 
-def _number_complaint(value: Any, kind: str) -> str | None:
+def _number_problem(value: Any, kind: str) -> str | None:
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
         try:
@@ -277,7 +273,7 @@ def _number_complaint(value: Any, kind: str) -> str | None:
     return None
 
 
-def _text_complaint(value: Any, size: int) -> str | None:
+def _text_problem(value: Any, size: int) -> str | None:
     if not isinstance(value, str):
         return f"must be a str of at most {size} bytes"
     try:
@@ -285,3 +281,43 @@ def _text_complaint(value: Any, size: int) -> str | None:
     except UnicodeEncodeError:
         return "has characters that cannot be encoded"
     return f"has {length} bytes, at most {size} fit" if length > size else None
+
+
+# ------------------------------------------------------------------------------------------ enums
+
+# The standard library's decorator for its own long enums since Python 3.11: the same enum in half the time.
+_simple_enum: Any = getattr(enum, "_simple_enum", None)
+
+
+class _Flags(enum.IntFlag):
+    # Python caches every combination of flags. Received values would fill that cache without limit.
+    @classmethod
+    def _missing_(cls, value: object) -> Any:
+        made = super()._missing_(value)
+        cls._value2member_map_.pop(value, None)
+        return made
+
+
+def make_enum(
+    module: str,
+    name: str,
+    bitmask: bool,
+    doc: str,
+    members: Iterable[tuple[str, int]],
+    *,
+    is_external: bool = False,
+) -> type[Any]:
+    """Create an ``IntFlag`` for a bitmask, else an ``IntEnum``. Two names for one value are aliases.
+
+    Raises:
+        TypeError, ValueError: a name of an enum that ``is_external`` is a duplicate or reserved.
+    """
+    base: Any = _Flags if bitmask else enum.IntEnum
+    made: type[Any]
+    if _simple_enum is not None and not is_external:
+        body = {"__module__": module, "__qualname__": name, "__doc__": doc, **dict(members)}
+        made = _simple_enum(base)(type(name, (), body))
+    else:
+        made = base(name, list(members), module=module, qualname=name)
+        made.__doc__ = doc
+    return made

@@ -1,4 +1,4 @@
-"""``MessageFactory``: pymavlink's maker of messages, whose ``…_send`` send by whatever a program gives it."""
+"""``MessageFactory``: pymavlink's message factory with a configurable send function."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from aerokit.errors import InvalidArgument
 
-if TYPE_CHECKING:  # its own types are stricter than what is taken here
+if TYPE_CHECKING:  # pymavlink's annotations are stricter than its behaviour
 
     class _MAVLink:
         total_packets_sent: int
@@ -25,29 +25,27 @@ else:
 
 
 class MessageFactory(_MAVLink):
-    """Has ``<message>_encode(…)``, which returns a message of pymavlink, and ``<message>_send(…)`` for every message.
+    """Provides ``<message>_encode(…)``, which returns a pymavlink message, and ``<message>_send(…)`` for every message.
 
-    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; those that only the dialect of the
-    program has (``mavutil.mavlink``) are made by that. Values are checked when the message is sent, not before:
-    texts may be ``str`` or bytes, and numbers for integer fields are rounded, by :func:`from_pymavlink`:
+    The messages are those of pymavlink's ardupilotmega dialect for MAVLink 2; further ones of the program's dialect
+    (``mavutil.mavlink``) are created by that. Values are only checked on sending. Strings may be ``str`` or bytes. Use
+    :func:`from_pymavlink` to convert messages, which also rounds numbers for integer fields:
     ``MessageFactory(lambda message: vehicle.send(from_pymavlink(message, vehicle.system_id)), 255, 0)``.
     """
 
     seq: int
     total_packets_sent: int
-    """How many messages it has sent, 0..255, then from 0 again; the link counts by itself."""
+    """Number of messages sent, modulo 256. The link has its own sequence numbers."""
 
-    def __init__(
-        self, connection_send: Callable[[Any], object], source_system: int, source_component: int
-    ) -> None:
-        """Make one whose messages go to ``connection_send(message)``; the ids are for programs to read."""
+    def __init__(self, connection_send: Callable[[Any], object], source_system: int, source_component: int) -> None:
+        """Create a factory that passes messages to ``connection_send(message)``. Programs may read the ids."""
         super().__init__(None, source_system, source_component)
         self._connection_send = connection_send
 
     def send(self, mavmsg: Any, force_mavlink1: bool = False) -> None:
-        """Send a message; what cannot be sent raises what ``connection_send`` raises, and is not counted.
+        """Send a message. If ``connection_send`` raises, the message is not counted.
 
-        ``force_mavlink1`` means nothing: the link speaks the version that the vehicle understands.
+        ``force_mavlink1`` is ignored, because the link uses the version that the vehicle supports.
         """
         self._connection_send(mavmsg)
         self.seq = (self.seq + 1) % 256
@@ -64,15 +62,15 @@ class MessageFactory(_MAVLink):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
-def _taking_text(encode: Callable[..., Any]) -> Callable[..., Any]:
-    """Pymavlink takes bytes only."""
+def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
+    # pymavlink accepts only bytes.
 
     @wraps(encode)
     def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:
-        given = [_as_bytes(value) for value in args]
+        converted = [_as_bytes(value) for value in args]
         named = {name: _as_bytes(value) for name, value in kwargs.items()}
         try:
-            return encode(self, *given, **named)
+            return encode(self, *converted, **named)
         except AttributeError:
             raise InvalidArgument(f"{encode.__name__}: a text must be str or bytes") from None
 
@@ -85,11 +83,11 @@ def _as_bytes(value: Any) -> Any:
     return bytes(value) if isinstance(value, (bytearray, memoryview)) else value
 
 
-def _take_text_in(factory: Any) -> None:
+def _patch_text_encoders(factory: Any) -> None:
     for message_class in ardupilotmega.mavlink_map.values():
         if "char" in message_class.fieldtypes:
             name = f"{message_class.msgname.lower()}_encode"
-            setattr(factory, name, _taking_text(getattr(factory, name)))
+            setattr(factory, name, _accept_text(getattr(factory, name)))
 
 
-_take_text_in(MessageFactory)
+_patch_text_encoders(MessageFactory)

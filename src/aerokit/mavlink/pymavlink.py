@@ -1,4 +1,4 @@
-"""`from_pymavlink`: any message object of a program, pymavlink's above all, as one that a connection can send."""
+"""Conversion from and to pymavlink messages."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ REAL_TYPES = ("float", "double")
 
 
 def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
-    """A copy of a message, checked, for ``vehicle.send``; later changes to ``message`` do not change it.
+    """Convert a message to one of aerokit, for ``vehicle.send``. The result is a checked copy.
 
     Args:
-        message: of any pymavlink dialect, for MAVLink 1 or 2, a subclass of such a class, anything with ``get_type()``
-            and the fields of a standard message as attributes, or a message of aerokit. Numbers for integer fields
-            are rounded; texts may be ``str`` (sent in UTF-8) or bytes; missing extension fields are 0.
-        target_system: written into ``message.target_system``, if it has that field (aerokit's own messages do not
-            change: only the copy gets it). None and 0 leave what is there. ``target_component`` always stays.
+        message: a message of any pymavlink dialect, for MAVLink 1 or 2, or of a subclass; any object with
+        ``get_type()``
+            and the fields of a standard message as attributes; or a message of aerokit. Numbers for integer fields are
+            rounded; strings may be ``str`` (sent as UTF-8) or bytes; missing extension fields are 0.
+        target_system: assigned to ``message.target_system`` if there is such a field; for messages of aerokit, only in
+            the copy. None and 0 leave it unchanged. ``target_component`` is never changed.
 
     Raises:
-        InvalidArgument: a ValueError; a value does not fit its field, or this is no message.
+        InvalidArgument: a value does not fit its field, or the object is not a message.
     """
     if isinstance(message, Message):
         message_class: type[Message] = type(message)
@@ -63,14 +64,14 @@ def _class_of(message: Any) -> type[Message]:
     try:
         return STANDARD.by_name(message.get_type())
     except AttributeError:
-        raise InvalidArgument(f"{message!r} is no MAVLink message") from None
+        raise InvalidArgument(f"{message!r} is not a MAVLink message") from None
 
 
 @cache
 def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
-    """The standard's class when it is about the same bytes, else one like it made of pymavlink's."""
+    """Return the standard's class if it has the same wire format, else one created from pymavlink's."""
     if message_id < 0 or not given.ordered_fieldnames:
-        raise InvalidArgument(f"{given.__name__} is nothing that can be sent")
+        raise InvalidArgument(f"{given.__name__} is not a message that can be sent")
     standard = STANDARD.get(message_id)
     if standard is not None and crc_extra == standard.CRC_EXTRA:
         return standard
@@ -81,14 +82,14 @@ def _counterpart(message_id: int, crc_extra: int, given: Any) -> type[Message]:
 
 # ----------------------------------------------------------------------------------------- values
 def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
-    """The arguments of ``message_class``; extension fields that ``message`` does not have are left out."""
+    """Return the arguments for ``message_class``. Extension fields that ``message`` does not have are omitted."""
     values = {}
     for field in message_class.FIELDS:
         name = field.name.rstrip("_")
         if field.extension and not _has(message, name):
             continue
         try:
-            value = _text_given(message, name) if field.type == "char" else getattr(message, name)
+            value = _original_text(message, name) if field.type == "char" else getattr(message, name)
         except AttributeError:
             raise InvalidArgument(f"{message_class.NAME}.{name} cannot be sent: it is missing") from None
         values[field.name] = _converted(message_class, field, value)
@@ -96,7 +97,7 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 
 def _has(message: Any, name: str) -> bool:
-    """Whether it is a field of it: every class of pymavlink has an ``id`` of its own."""
+    # Not hasattr alone, because every class of pymavlink has an attribute ``id``.
     if name in getattr(message, "__dict__", ()):
         return True
     return hasattr(message, name) and not hasattr(type(message), "ordered_fieldnames")
@@ -113,9 +114,7 @@ def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
     if isinstance(value, (bytes, bytearray, memoryview)):
         return bytes(value)
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise _error(
-            message_class, field, value, f"must be a sequence of at most {field.array_length} numbers"
-        )
+        raise _error(message_class, field, value, f"must be a sequence of at most {field.array_length} numbers")
     items = [_real(item) if is_real else _integer(item) for item in value]
     return items if field.type != "uint8_t" else _packed(message_class, field, items)
 
@@ -133,7 +132,7 @@ def _is_byte(value: Any) -> bool:
 
 
 def _integer(value: Any) -> Any:
-    """An int, if it is any number; what is none is left for `Message.encode` to complain of."""
+    # Values that are not numbers are rejected by `Message.encode`.
     try:
         return operator.index(value)
     except TypeError:
@@ -142,7 +141,7 @@ def _integer(value: Any) -> Any:
 
 
 def _real(value: Any) -> Any:
-    """A number that ``struct`` packs: numpy's and decimals too; what is none stays as it is."""
+    # Also numbers of numpy and decimals. Values that are not numbers are rejected by `Message.encode`.
     if isinstance(value, (int, float)) or not hasattr(value, "__float__"):
         return value
     try:
@@ -151,13 +150,13 @@ def _real(value: Any) -> Any:
         return value
 
 
-def _error(message_class: type[Message], field: Field, value: Any, complaint: str) -> InvalidArgument:
-    return InvalidArgument(f"{message_class.NAME}.{field.name} = {value!r} cannot be sent: {complaint}")
+def _error(message_class: type[Message], field: Field, value: Any, problem: str) -> InvalidArgument:
+    return InvalidArgument(f"{message_class.NAME}.{field.name} = {value!r} cannot be sent: {problem}")
 
 
 # ------------------------------------------------------------------------------------------ texts
-def _text_given(message: Any, name: str) -> Any:
-    """What the program gave: pymavlink keeps the bytes beside a text that has lost what is not ASCII."""
+def _original_text(message: Any, name: str) -> Any:
+    # pymavlink keeps the original bytes in addition to a text without non-ASCII characters.
     text, raw = getattr(message, name), getattr(message, f"_{name}_raw", None)
     if isinstance(raw, bytes) and text == raw.partition(b"\0")[0].decode("ascii", "replace"):
         return raw
@@ -177,7 +176,7 @@ def _text(value: Any) -> Any:
 
 
 class _RawText(str):
-    """Bytes that are no UTF-8, in a message whose texts are str: they are sent as they are."""
+    """Bytes that are not UTF-8, in a field of type str. They are sent unchanged."""
 
     _data: bytes
 
@@ -190,33 +189,32 @@ class _RawText(str):
         return self._data
 
 
+# Sources of pymavlink's classes if the program's own dialect has none. Together they cover all of STANDARD.
 DIALECTS = ("ardupilotmega", "development")
-"""Where pymavlink's classes come from when the program's own dialect has none; together they know all of STANDARD."""
 
 CHECKSUM_LENGTH = 2
 
-LATE = ("_header", "_msgbuf", "_payload", "_crc")
-"""What most listeners never ask for."""
+# Attributes that are created on first access, because few programs use them.
+LAZY_ATTRIBUTES = ("_header", "_msgbuf", "_payload", "_crc")
 
 Decoder = Callable[["Frame", float], Any]
 
 
 def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: float = 0.0) -> Any:
-    """The frame's message as pymavlink decodes it: fields, header, buffers and ``str()`` are the same; never raises.
+    """Decode a frame to the pymavlink message, with the same fields, header, buffers and ``str()``. Never raises.
 
     Args:
-        frame: as received: ``message.received_frame``, or what a tap of the connection is given.
-        dialect: pymavlink's module whose classes are preferred, if it is one for MAVLink 2 and has the message.
-            Otherwise they are those of pymavlink's ardupilotmega or development for MAVLink 2, which have the extension
-            fields as well. A message that none of them knows is pymavlink's ``MAVLink_unknown``, type ``UNKNOWN_<id>``.
-        timestamp: becomes the message's ``_timestamp``: seconds since 1970 by pymavlink's convention.
+        frame: a received frame: ``message.received_frame``, or the argument of a frame observer.
+        dialect: preferred pymavlink module, used if it is for MAVLink 2 and has the message. The fallbacks are
+            pymavlink's ardupilotmega and development for MAVLink 2, with extension fields. A message that none of them
+            has becomes pymavlink's ``MAVLink_unknown``, with type ``UNKNOWN_<id>``.
+        timestamp: ``_timestamp`` of the message: in pymavlink, seconds since 1970.
     """
     return _decoder(frame.message_id, dialect)(frame, timestamp)
 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
-    """How to decode a message for a program that prefers this dialect."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)
@@ -253,7 +251,7 @@ def _decoder_for(message_class: Any) -> Decoder:
         fields["_timestamp"] = timestamp
         if arrays:
             values = [values[at] if width == 1 else list(values[at : at + width]) for at, width in arrays]
-        fields.update(zip(names, values))  # noqa: B905 - of one length
+        fields.update(zip(names, values))  # noqa: B905 - same length
         for name, raw_name in texts:
             raw = fields[raw_name] = fields[raw_name].rstrip(b"\0")
             fields[name] = (raw.partition(b"\0")[0] if b"\0" in raw else raw).decode("ascii", "replace")
@@ -263,16 +261,13 @@ def _decoder_for(message_class: Any) -> Decoder:
 
 
 class _Layout:
-    """Where pymavlink's attributes are among the unpacked values."""
+    """Positions of pymavlink's attributes among the unpacked values."""
 
     def __init__(self, message_class: Any) -> None:
         zeros = message_class.unpacker.unpack(bytes(message_class.unpacker.size))
-        self.names: list[str] = []
-        """In the wire's order; texts are first stored under the name for their bytes."""
-        self.arrays: list[tuple[int, int]] = []
-        """Place and width of every field; empty when there are no arrays."""
-        self.texts: list[tuple[str, str]] = []
-        """Names of texts, and of their bytes."""
+        self.names: list[str] = []  # in wire order; texts are first stored under the name of their bytes
+        self.arrays: list[tuple[int, int]] = []  # position and width of each field; empty without arrays
+        self.texts: list[tuple[str, str]] = []  # names of texts and of their bytes
         at = 0
         for name, width in zip(message_class.ordered_fieldnames, message_class.lengths):  # noqa: B905
             if isinstance(zeros[at], bytes):
@@ -284,52 +279,52 @@ class _Layout:
             self.arrays = []
 
 
-# ------------------------------------------------------------------- what most listeners never ask for
+# -------------------------------------------------------------------------------- lazy attributes
 class _Received:
-    """Header and buffers, made of the frame when somebody asks for them: making them costs more than the fields."""
+    """Mixin that creates header and buffers on first access, because they cost more than decoding the fields."""
 
     _frame: Frame
     _header_class: Any
     _decoded_class: Any
-    _signed = False  # nobody has checked a signature here
+    _signed = False  # signatures are not verified here
     _link_id = None
     _instances = None
 
     def __getattr__(self, name: str) -> Any:
-        if name not in LATE:
+        if name not in LAZY_ATTRIBUTES:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        value = self.__dict__[name] = getattr(self, f"made{name}")()
+        value = self.__dict__[name] = getattr(self, f"create{name}")()
         return value
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Copies, also those of ``pickle``, are plain objects of pymavlink's class."""
-        names = (*LATE, "_type", "_fieldnames", "_instance_field", "_instance_offset")
+        """Pickles and copies are objects of pymavlink's own class."""
+        names = (*LAZY_ATTRIBUTES, "_type", "_fieldnames", "_instance_field", "_instance_offset")
         state = {name: getattr(self, name) for name in (*names, "_signed", "_link_id", "_instances")}
         state.update((name, value) for name, value in self.__dict__.items() if name != "_frame")
         return _restored, (self._decoded_class, state)
 
-    def made_header(self) -> Any:
+    def create_header(self) -> Any:
         frame, body = self._frame, self._frame.body
         source = frame.system_id, frame.component_id
         return self._header_class(frame.message_id, body[1], body[2], body[0], body[3], *source)
 
-    def made_msgbuf(self) -> bytearray:
+    def create_msgbuf(self) -> bytearray:
         return bytearray(self._frame.raw)
 
-    def made_payload(self) -> bytearray:
-        """Pymavlink has it begin there in MAVLink 2, too."""
-        return bytearray(self._frame.raw)[6 : -_behind_the_payload(self._frame)]
+    def create_payload(self) -> bytearray:
+        # In pymavlink it begins at offset 6 for MAVLink 2, too.
+        return bytearray(self._frame.raw)[6 : -_length_after_payload(self._frame)]
 
-    def made_crc(self) -> int:
+    def create_crc(self) -> int:
         return self._frame.checksum
 
 
-def _behind_the_payload(frame: Frame) -> int:
+def _length_after_payload(frame: Frame) -> int:
     return CHECKSUM_LENGTH + (SIGNATURE_LENGTH if frame.incompat_flags & SIGNED else 0)
 
 
 def _received_class(message_class: Any) -> Any:
-    """A subclass that looks like the class itself."""
+    """Create a subclass that has the name and attributes of the class itself."""
     return type(
         message_class.__name__,
         (_Received, message_class),
@@ -354,13 +349,11 @@ def _restored(message_class: Any, state: dict[str, Any]) -> Any:
 
 # -------------------------------------------------------------------------------- unknown messages
 def _checked(message_class: Any, decode: Decoder) -> Decoder:
-    """Nobody has checked a message that the standard does not have; the program's dialect says how."""
+    # The framer could not verify a message that the standard does not have, but the program's dialect can.
 
     def decode_if_right(frame: Frame, timestamp: float) -> Any:
         raw = frame.raw
-        is_right = (
-            x25(raw[1 : -_behind_the_payload(frame)] + bytes((message_class.crc_extra,))) == frame.checksum
-        )
+        is_right = x25(raw[1 : -_length_after_payload(frame)] + bytes((message_class.crc_extra,))) == frame.checksum
         return (decode if is_right else _unknown)(frame, timestamp)
 
     return decode_if_right

@@ -1,7 +1,6 @@
-"""Python source for message classes and enums, out of definitions; pure text in, text out.
+"""Renders definitions as Python source of message classes and enums.
 
-`generator` writes it to the committed modules, `dialect` compiles it for dialects that are loaded at run time, so both
-kinds of classes are the same.
+`generator` writes it to modules, `runtime_dialect` compiles it, so that both kinds of classes are the same.
 """
 
 from __future__ import annotations
@@ -26,13 +25,12 @@ _CODES = {
     "float": "f",
     "double": "d",
 }
-_UNPACKED_ONE_BY_ONE = (
-    4  # arrays up to this length are unpacked into names of their own, longer ones are sliced
-)
+# Arrays up to this length are unpacked into separate names, longer ones are sliced.
+_MAX_UNPACKED_LENGTH = 4
 
 
 def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
-    """The class of one message, with its Struct; ``docs=False`` leaves all texts out but the first line."""
+    """Render the class of one message with its Struct. ``docs=False`` omits all texts but the first line."""
     lines = [
         f"_S{message.id} = Struct({_format(message)!r})",
         "",
@@ -60,7 +58,7 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
 
 
 def render_enum_row(enum: EnumDefinition) -> str:
-    """One entry of the table an enum module makes its enums of: name → (bitmask, docstring, members)."""
+    """Render an entry of an enum module's table: name → (bitmask, docstring, members)."""
     members = "".join(f"            ({_quoted(name)}, {entry.value}),\n" for name, entry in enum.members())
     doc = "\n\n".join(_enum_doc(enum))
     head = f"    {_quoted(enum.class_name)}: (\n        {enum.bitmask},\n        {doc!r},\n"
@@ -68,7 +66,7 @@ def render_enum_row(enum: EnumDefinition) -> str:
 
 
 def render_enum_stub(enum: EnumDefinition) -> str:
-    """The class of one enum for type checkers and editors, with the standard's text on every member."""
+    """Render the class of one enum for type checkers and editors, with a docstring for each member."""
     lines = [f"class {enum.class_name}({'IntFlag' if enum.bitmask else 'IntEnum'}):"]
     lines += _docstring(_enum_doc(enum), "    ")
     for name, entry in enum.members():
@@ -133,9 +131,7 @@ def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
     wrapped: list[str] = []
     for number, text in enumerate(texts):
         wrapped += [""] if number else []
-        wrapped += textwrap.wrap(
-            text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False
-        )
+        wrapped += textwrap.wrap(text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False)
     if len(wrapped) == 1:
         return [f'{indent}"""{wrapped[0]}"""']
     body = [f"{indent}{line}" if line else "" for line in wrapped[1:]]
@@ -154,7 +150,7 @@ def _tuple(name: str, items: list[str]) -> list[str]:
 
 
 def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
-    """Items between brackets: on one line when they fit, else as many to a line as fit."""
+    """Format items in brackets: on one line if they fit, else filling lines."""
     single = f"{head}{', '.join(items)}{',' if len(items) == 1 else ''}{tail}"
     if len(single) <= _WIDTH:
         return [single]
@@ -210,7 +206,7 @@ def _default(f: FieldDefinition) -> str:
 
 
 def _init(message: MessageDefinition) -> list[str]:
-    # A field with a default may stand before one without: then those behind it must be given by name.
+    # Parameters after one with a default need defaults too, so those without one become keyword-only.
     arguments: list[str] = []
     optional = False
     for f in message.fields:
@@ -237,7 +233,7 @@ def _decode(message: MessageDefinition) -> list[str]:
     if not message.fields:
         return [*lines, "        return self"]
     fields = message.wire_fields
-    if any(_is_tuple(f) and f.array_length > _UNPACKED_ONE_BY_ONE for f in fields):
+    if any(_is_tuple(f) and f.array_length > _MAX_UNPACKED_LENGTH for f in fields):
         return [*lines, *_decode_by_index(fields, unpacked), "        return self"]
     targets: list[str] = []
     after: list[str] = []

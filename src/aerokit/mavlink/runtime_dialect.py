@@ -1,6 +1,6 @@
-"""Dialects that are not committed: read from XML or from a pymavlink module, and compiled to classes.
+"""Dialects that are loaded at run time from XML or a pymavlink module, and compiled to classes.
 
-Imported only when a program reads one: the reader of the XML and the renderer of the sources come with it.
+Imported on first use, because it needs the XML parser and the code renderer.
 """
 
 from __future__ import annotations
@@ -24,55 +24,55 @@ from aerokit.mavlink.definitions import (
     merged_enums,
     read_dialect,
 )
-from aerokit.mavlink.enumeration import make_enum
 from aerokit.mavlink.generator import xml_folder
-from aerokit.mavlink.message import Message
+from aerokit.mavlink.message import Message, make_enum
 from aerokit.mavlink.rendering import render_message
 
-Read = tuple[str, list[type[Message]], dict[str, type[Any]]]
-"""Name, classes, and enums by the standard's spelling."""
+# Name, classes, and enums by their names in the standard.
+LoadedDialect = tuple[str, list[type[Message]], dict[str, type[Any]]]
 
 
 class Standard(Protocol):
-    """The committed messages, of which those that say the same are taken."""
+    """The generated messages, which are reused where definitions are the same."""
 
     rows: dict[int, tuple[int, int, int]]
 
     def __getitem__(self, message_id: int, /) -> type[Message]: ...
 
 
-def read_xml_dialect(path: str | Path, standard: Standard) -> Read:
-    """Name, classes and enums of an XML file and of all that it includes; see `Dialect.from_xml`."""
+def read_xml_dialect(path: str | Path, standard: Standard) -> LoadedDialect:
+    """Load an XML file with its includes; see `Dialect.from_xml`."""
     path = Path(path)
     dialects = read_dialect(path, [xml_folder()])
     definitions = [message for dialect in dialects for message in dialect.messages]
-    return _read(path.stem, definitions, merged_enums(dialects), standard)
+    return _load(path.stem, definitions, merged_enums(dialects), standard)
 
 
-def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Read:
-    """Name, classes and enums of a dialect of pymavlink; see `Dialect.from_pymavlink`."""
+def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> LoadedDialect:
+    """Load a pymavlink dialect; see `Dialect.from_pymavlink`."""
     if isinstance(module, str):
         module = _import(module)
     known: dict[int, Any] | None = getattr(module, "mavlink_map", None)
     if known is None:
-        raise InvalidArgument(f"{module.__name__} is no pymavlink dialect: it has no mavlink_map")
+        raise InvalidArgument(f"{module.__name__} is not a pymavlink dialect: it has no mavlink_map")
     definitions = [_message(cls) for _, cls in sorted(known.items()) if cls.id >= 0]
     enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     name = module.__name__.rpartition(".")[2]
-    return _read(name, definitions, [enum for enum in enums if enum.entries], standard)
+    return _load(name, definitions, [enum for enum in enums if enum.entries], standard)
 
 
 def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message]:
-    """The class for one of pymavlink's message classes: the committed one, if that says the same about the bytes.
+    """Return the class for one of pymavlink's message classes: the generated one, if the wire formats are the same.
 
-    Raises InvalidArgument when pymavlink's class does not agree with its own CRC_EXTRA.
+    Raises:
+        InvalidArgument: pymavlink's class does not match its own CRC_EXTRA.
     """
     definition = _message(message_class)
     return _standard_class(definition, standard) or compile_message(definition)
 
 
 def compile_message(definition: MessageDefinition) -> type[Message]:
-    """A class like the generated ones; it cannot be pickled, because no module holds it."""
+    """Create a class like the generated ones. It cannot be pickled, because it is in no module."""
     source = "from __future__ import annotations\n" + render_message(definition, docs=False)
     namespace: dict[str, Any] = {
         "__name__": f"{__name__}.{definition.origin}",
@@ -90,9 +90,9 @@ def compile_message(definition: MessageDefinition) -> type[Message]:
     return message_class
 
 
-def _read(
+def _load(
     name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
-) -> Read:
+) -> LoadedDialect:
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
         other = by_id.setdefault(definition.id, definition)
@@ -101,9 +101,7 @@ def _read(
                 f"message id {definition.id} is defined twice in {name}: {other.name} in {other.origin},"
                 f" {definition.name} in {definition.origin}"
             )
-    classes = [
-        _standard_class(definition, standard) or compile_message(definition) for definition in by_id.values()
-    ]
+    classes = [_standard_class(definition, standard) or compile_message(definition) for definition in by_id.values()]
     return name, classes, {enum.name: _enum_type(name, enum) for enum in enums}
 
 
@@ -116,21 +114,21 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
             enum.bitmask,
             enum.description,
             members,
-            is_from_outside=True,
+            is_external=True,
         )
-    except (TypeError, ValueError) as error:  # two of a name, names that Python keeps for itself
+    except (TypeError, ValueError) as error:  # a duplicate or reserved name
         raise InvalidArgument(f"enum {enum.name} of {enum.origin or dialect}: {error}") from error
 
 
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
-    """The committed class, when it says the same about the bytes, or knows more extension fields behind them."""
+    """Return the generated class if it has the same wire format, perhaps with further extension fields."""
     row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
-    committed = standard[definition.id]
+    generated = standard[definition.id]
     fields = [(f.attribute, f.type, f.array_length) for f in definition.fields]
-    known = [(f.name, f.type, f.array_length) for f in committed.FIELDS[: len(fields)]]
-    return committed if definition.name == committed.NAME and known == fields else None
+    known = [(f.name, f.type, f.array_length) for f in generated.FIELDS[: len(fields)]]
+    return generated if definition.name == generated.NAME and known == fields else None
 
 
 # -------------------------------------------------------------------------------- pymavlink modules
@@ -149,15 +147,13 @@ def _message(cls: Any) -> MessageDefinition:
     order = list(cls.ordered_fieldnames)
     message_name = getattr(cls, "msgname", None) or cls.name
     fields = []
-    for name, kind in zip(cls.fieldnames, cls.fieldtypes):  # noqa: B905 - of one length
+    for name, kind in zip(cls.fieldnames, cls.fieldtypes):  # noqa: B905 - same length
         array_length = int(cls.array_lengths[order.index(name)])
         units = getattr(cls, "fieldunits_by_name", {}).get(name, "")
         enum = getattr(cls, "fieldenums_by_name", {}).get(name, "")
         default = 3 if name == "mavlink_version" else None
         is_bytes = carries_bytes(message_name, name, kind)
-        fields.append(
-            FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes)
-        )
+        fields.append(FieldDefinition(name, kind, array_length, units, enum, default=default, carries_bytes=is_bytes))
     description = " ".join((cls.__doc__ or "").split())
     definition = MessageDefinition(
         int(cls.id), message_name, tuple(fields), description, cls.__module__.rpartition(".")[2]
@@ -166,7 +162,7 @@ def _message(cls: Any) -> MessageDefinition:
 
 
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
-    """Pymavlink's classes do not say where the extensions begin; CRC_EXTRA and the order on the wire do."""
+    # pymavlink's classes do not mark extensions, but CRC_EXTRA and the wire order determine them.
     fields = definition.fields
     for base in range(len(fields), -1, -1):
         guess = MessageDefinition(
@@ -178,12 +174,10 @@ def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra:
         )
         if guess.crc_extra == crc_extra and [f.name for f in guess.wire_fields] == order:
             return guess
-    raise InvalidArgument(f"{definition.name}: CRC_EXTRA {crc_extra} fits none of its field orders")
+    raise InvalidArgument(f"{definition.name}: CRC_EXTRA {crc_extra} matches none of its field orders")
 
 
 def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
     end_marker = f"{name}_ENUM_END"
-    kept = [
-        EntryDefinition(e.name, value, e.description) for value, e in entries.items() if e.name != end_marker
-    ]
+    kept = [EntryDefinition(e.name, value, e.description) for value, e in entries.items() if e.name != end_marker]
     return EnumDefinition(name, tuple(kept))

@@ -1,6 +1,7 @@
-"""Telemetry logs (``.tlog``): before each frame eight bytes, big-endian, microseconds since 1970.
+"""Telemetry logs (``.tlog``): each frame is preceded by eight bytes, big-endian, with microseconds since 1970.
 
-The format of QGroundControl, Mission Planner, MAVProxy and pymavlink. No clock here: the caller brings the time.
+The format of QGroundControl, Mission Planner, MAVProxy and pymavlink. Times are arguments, because there is no clock
+here.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ from aerokit.mavlink.frame import MAGIC_V1, MAGIC_V2, SIGNATURE_LENGTH, SIGNED
 _TIME = Struct(">Q")
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
-_LONGEST = 8 + 280
-# While a record is searched for: a clock that was never set is believed only where a record must be, because the
-# zeros of a frame's header look like one.
+_MAX_RECORD = 8 + 280
+# While searching for the next record after garbage, earlier times are ignored, because the zeros in a frame's header
+# look like one. Where a record is expected, any time is accepted, because the clock may never have been set.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
-_LAST_TIME = 4_102_444_800_000_000  # the year 2100: what claims to be later is no time stamp
-_LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # the beginning of times that are surely before that
+_LAST_TIME = 4_102_444_800_000_000  # the year 2100; later ones are not timestamps
+_LAST = (_LAST_TIME - (1 << 48)).to_bytes(8, "big")[:2]  # the first bytes of times that are certainly earlier
 
 
 def read_tlog(source: str | PathLike[str] | BinaryIO) -> Iterator[tuple[float, bytes]]:
-    """The records of a log: (seconds since 1970, whole frame), as they are, nothing checked but their shape.
+    """Yield the records of a log as (seconds since 1970, whole frame). Checksums are not verified.
 
-    A record that was cut off at the end is left out, and bytes that are no record are passed over. A file given by its
-    path is closed when the iterator ends or is closed. OSError when it cannot be read.
+    Bytes that are not a record, and a truncated record at the end, are skipped. A file opened by path is closed with
+    the iterator. OSError if the file cannot be read.
     """
     if isinstance(source, (str, PathLike)):
         with open(source, "rb") as file:
@@ -41,12 +42,12 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
     data, begin, ended, earliest = b"", 0, False, 0
     end: int | None
     while True:
-        if not ended and len(data) - begin < 2 * _LONGEST:  # a record and the head of the next, to tell both
+        if not ended and len(data) - begin < 2 * _MAX_RECORD:  # a record and the header of the next
             block = file.read(_BLOCK)
             ended = not block
             data, begin = data[begin:] + block, 0
             continue
-        # Almost every record is MAVLink 2 and unsigned, and so is the next: `_record_end` in half the time.
+        # Fast path for unsigned MAVLink 2: takes half the time of `_record_end`.
         try:
             end = begin + 20 + data[begin + 9]
             if (
@@ -71,7 +72,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
 
 
 def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
-    """Where the record at ``begin`` ends; None when there is none, or not all of it, or it is too early."""
+    """Return the end of the record at ``begin``, or None if there is none, it is incomplete, or too early."""
     end = _frame_end(data, begin)
     if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < earliest:
         return None
@@ -81,7 +82,7 @@ def _record_end(data: bytes, begin: int, earliest: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Whether a record begins inside what seems to be one, and is followed by another: then that is the true one."""
+    """Return True if a record inside this one is followed by another: then that is the real one."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -90,7 +91,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """The end a record's header claims, which may be behind the data's; None when it is no such header."""
+    """Return the end according to the record's header, which may be beyond the data, or None if it is not a header."""
     at = begin + 8
     if len(data) - at < 3 or data[at] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None
@@ -102,27 +103,27 @@ def _frame_end(data: bytes, begin: int) -> int | None:
 
 
 class TlogWriter:
-    """Writes a log; a context manager. Each record goes to the file in one piece."""
+    """Writes a log. Can be used as a context manager. Each record is written in one piece."""
 
     def __init__(self, target: str | PathLike[str] | BinaryIO) -> None:
-        """Begin a new file at a path, or go on in a binary file, which stays the caller's to close."""
+        """Create a new file at a path, or append to a binary file, which the caller closes."""
         self._owned = isinstance(target, (str, PathLike))
         self._file: BinaryIO = open(target, "wb") if isinstance(target, (str, PathLike)) else target  # noqa: SIM115
         self._closed = False
 
     def write(self, raw: bytes, timestamp_s: float) -> None:
-        """Add one frame as it was sent or received; ``timestamp_s`` is seconds since 1970, kept to the microsecond."""
+        """Write one frame. ``timestamp_s`` is in seconds since 1970, stored with microseconds."""
         microseconds = round(timestamp_s * 1e6)
         if not 0 <= microseconds < 1 << 64:
             raise InvalidArgument(f"timestamp_s = {timestamp_s!r} must be seconds since 1970")
         self._file.write(_TIME.pack(microseconds) + raw)
 
     def flush(self) -> None:
-        """Hand everything to the operating system, so that a crash of the program loses nothing."""
+        """Pass all data to the operating system, so that it survives a crash of the program."""
         self._file.flush()
 
     def close(self) -> None:
-        """Flush, and close the file if it was opened here; idempotent."""
+        """Flush, and close the file if it was opened here. Idempotent."""
         if self._closed:
             return
         self._closed = True

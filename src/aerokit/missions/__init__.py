@@ -1,4 +1,4 @@
-"""Missions, fences and rally points as values: made, checked, compared, and read from and written to files.
+"""Missions, fences and rally points: build, check and compare them, read and write their files.
 
 ```python
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
     from aerokit.missions.actions import take_photos as take_photos
     from aerokit.missions.actions import trigger_camera as trigger_camera
     from aerokit.missions.actions import vtol_transition as vtol_transition
-    from aerokit.missions.compare import Storage as Storage
-    from aerokit.missions.fence import Fence as Fence
-    from aerokit.missions.fence import FenceCircle as FenceCircle
-    from aerokit.missions.fence import FencePolygon as FencePolygon
-    from aerokit.missions.fence import RallyPoints as RallyPoints
+    from aerokit.missions.compare import ItemStorage as ItemStorage
     from aerokit.missions.item import MissionItem as MissionItem
+    from aerokit.missions.mission import Fence as Fence
+    from aerokit.missions.mission import FenceCircle as FenceCircle
+    from aerokit.missions.mission import FencePolygon as FencePolygon
     from aerokit.missions.mission import Mission as Mission
     from aerokit.missions.mission import Plan as Plan
+    from aerokit.missions.mission import RallyPoints as RallyPoints
     from aerokit.missions.navigation import land as land
     from aerokit.missions.navigation import loiter_time as loiter_time
     from aerokit.missions.navigation import loiter_to_altitude as loiter_to_altitude
@@ -104,10 +104,16 @@ __getattr__, __dir__, __all__ = lazy_exports(
             "trigger_camera",
             "vtol_transition",
         ),
-        "aerokit.missions.compare": ("Storage",),
-        "aerokit.missions.fence": ("Fence", "FenceCircle", "FencePolygon", "RallyPoints"),
+        "aerokit.missions.compare": ("ItemStorage",),
         "aerokit.missions.item": ("MissionItem",),
-        "aerokit.missions.mission": ("Mission", "Plan"),
+        "aerokit.missions.mission": (
+            "Fence",
+            "FenceCircle",
+            "FencePolygon",
+            "Mission",
+            "Plan",
+            "RallyPoints",
+        ),
         "aerokit.missions.navigation": (
             "land",
             "loiter_time",

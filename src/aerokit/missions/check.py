@@ -1,4 +1,4 @@
-"""What can be said of items before a vehicle sees them: ranges, frames, NaN, jump targets, how many there are."""
+"""Checks of items before a vehicle sees them: ranges, frames, NaN, jump targets, number of items."""
 
 from __future__ import annotations
 
@@ -23,44 +23,47 @@ from aerokit.missions.item import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-MOST_ITEMS = 65_535
-"""MISSION_COUNT has 16 bits for the number of items."""
+MAX_ITEMS = 65_535  # MISSION_COUNT has 16 bits
 
 _FRAMES = frozenset(int(frame) for frame in MavFrame)
 _FRAME_TEXT = "a global frame (0, 3, 10, or 5, 6, 11) or a local one (1, 4, 7, 20, 21)"
 _GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
 
 
-def check_items(
-    items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None
-) -> None:
-    """Raise :class:`InvalidArgument`, which names item, field, value and what is allowed, unless all can be sent.
+def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None) -> None:
+    """Check that all items can be sent.
 
-    ``mission_type`` is the MAV_MISSION_TYPE. ``home_is_item_0`` is True for missions of ArduPilot: one item fewer
-    fits; False for those of others: 0°, 0° as "where the vehicle is" is ArduPilot's alone; None: not known.
+    Args:
+        items: the items, without home.
+        mission_type: the MAV_MISSION_TYPE.
+        home_is_item_0: True for ArduPilot missions, where one item fewer fits; False for other autopilots, where the
+            place 0°, 0° does not mean "the current position"; None if unknown.
+
+    Raises:
+        InvalidArgument: the text names item, field, value and what is allowed.
     """
     check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):
         check_item(item, f"item {index}", mission_type)
         if home_is_item_0 is False and item.command in DESTINATIONS and item.x == item.y == 0:
             raise InvalidArgument(
-                f"item {index} ({item.name}): x, y = 0, 0 is not allowed: only ArduPilot takes it for the place where"
-                " the vehicle is; give a latitude and a longitude"
+                f"item {index} ({item.name}): x, y = 0, 0 is not allowed: only ArduPilot understands it as the current"
+                " position; give a latitude and a longitude"
             )
     check_jumps(items)
 
 
 def check_count(count: int, *, home_is_item_0: bool = False) -> None:
-    """Raise :class:`InvalidArgument` when there are more items than the protocol can count."""
-    most = MOST_ITEMS - home_is_item_0
-    if count > most:
-        raise InvalidArgument(f"{count} items are too many: at most {most} fit")
+    """Raise :class:`InvalidArgument` if there are more items than the protocol can count."""
+    limit = MAX_ITEMS - home_is_item_0
+    if count > limit:
+        raise InvalidArgument(f"{count} items are too many: at most {limit} are possible")
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument`, which begins with ``where``, unless MISSION_ITEM_INT can carry the item."""
+    """Raise :class:`InvalidArgument`, which begins with ``where``, if MISSION_ITEM_INT cannot carry the item."""
     if not isinstance(item, MissionItem):
-        raise InvalidArgument(f"{where} = {item!r} is no MissionItem")
+        raise InvalidArgument(f"{where} = {item!r} is not a MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)
     where = f"{where} ({item.name})"
     _check_command(where, item.command, mission_type)
@@ -75,22 +78,20 @@ def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) ->
 
 
 def check_jumps(items: Sequence[MissionItem]) -> None:
-    """Raise :class:`InvalidArgument` when a DO_JUMP or DO_JUMP_TAG leads nowhere; items are counted from 0."""
+    """Raise :class:`InvalidArgument` if a DO_JUMP or DO_JUMP_TAG has no target. Items are counted from 0."""
     tags = {item.param1 for item in items if item.command == MavCmd.JUMP_TAG}
     for index, item in enumerate(items):
         where = f"item {index} ({item.name})" if item.command in (MavCmd.DO_JUMP, MavCmd.DO_JUMP_TAG) else ""
-        if item.command == MavCmd.DO_JUMP and not (
-            0 <= item.param1 < len(items) and float(item.param1).is_integer()
-        ):
+        if item.command == MavCmd.DO_JUMP and not (0 <= item.param1 < len(items) and float(item.param1).is_integer()):
             allowed = f"an item of this mission: 0 to {len(items) - 1}, the first item is 0"
             raise _wrong(where, "param1", item.param1, allowed)
         if item.command == MavCmd.DO_JUMP_TAG and item.param1 not in tags:
-            allowed = f"the tag of a JUMP_TAG of this mission: {sorted(tags) or 'it has none'}"
+            allowed = f"the tag of a JUMP_TAG in this mission: {sorted(tags) or 'it has none'}"
             raise _wrong(where, "param1", item.param1, allowed)
 
 
 def _wrong(where: str, field: str, value: object, allowed: str) -> InvalidArgument:
-    return InvalidArgument(f"{where}: {field} = {value!r} is not allowed, but {allowed}")
+    return InvalidArgument(f"{where}: {field} = {value!r} is not allowed: {allowed}")
 
 
 def _check_integer(where: str, field: str, value: object, high: int) -> None:
@@ -111,7 +112,7 @@ def _check_command(where: str, command: int, mission_type: int) -> None:
 def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
     _check_integer(where, "frame", item.frame, 0xFF)
     if item.frame not in _FRAMES:
-        raise _wrong(where, "frame", item.frame, "one of MAV_FRAME")
+        raise _wrong(where, "frame", item.frame, "a MAV_FRAME")
     if mission_type and item.frame not in GLOBAL_FRAMES:
         raise _wrong(where, "frame", item.frame, _GLOBAL_TEXT)
     if item.command in DESTINATIONS and item.frame not in GLOBAL_FRAMES | LOCAL_FRAMES:
@@ -139,11 +140,9 @@ def _check_place(where: str, item: MissionItem) -> None:
     for field, limit, name in (("x", 90, "latitude"), ("y", 180, "longitude")):
         value = getattr(item, field)
         if not isinstance(value, int) or isinstance(value, bool):
-            raise _wrong(where, field, value, "an integer: MISSION_ITEM_INT has no fraction there")
+            raise _wrong(where, field, value, "an integer, because MISSION_ITEM_INT has no fraction there")
         if scale == 10_000_000 and abs(value) > limit * scale and value != DEFAULT_XY:
-            allowed = (
-                f"a {name} from -{limit} to {limit} degrees in 1e-7 degrees, and this is {value / 1e7:g}"
-            )
+            allowed = f"a {name} of -{limit} to {limit} degrees in 1e-7 degrees; this is {value / 1e7:g} degrees"
             raise _wrong(where, field, value, allowed)
         if not -0x80000000 <= value <= 0x7FFFFFFF:
             raise _wrong(where, field, value, "an integer of 32 bits")

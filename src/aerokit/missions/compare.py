@@ -1,11 +1,13 @@
-"""Items compared with tolerance: what the wire and the vehicle's memory change is no difference.
+"""Comparison of items that tolerates what the protocol and the vehicle's storage change.
 
-Seen in the firmwares' own conversions (ArduPilot 4.7 AP_Mission, PX4 1.17 mavlink_mission) and on the vehicles. A
-letter for each of the seven numbers of an item, what is not mentioned comes back as 0:
-``f`` as it is, ``u`` ``b`` ``s`` ``i`` cut to an unsigned integer of 16 or 8 bits or to a signed one, ``c`` the same
-but at most 255, ``U`` 16 bits that wrap, ``?`` only whether it is above 0, ``g`` only the sign, ``r`` radius in whole
-metres with its sign, ``R`` that in 8 bits, tens of metres above 255, ``n`` turns in 8 bits, fractions below 1 in
-1/256, ``k`` whole centimetres, ``h`` 16-bit float, ``2`` always 2, ``y`` a heading, turned into 0 to 360.
+The tables follow the conversions in the firmware (ArduPilot 4.7 AP_Mission, PX4 1.17 mavlink_mission), verified on
+vehicles. A string has one letter for each of the seven numbers of an item; numbers without a letter are lost and read
+back as 0:
+``f`` unchanged, ``u`` ``b`` unsigned integer of 16 or 8 bits, ``s`` ``i`` signed integer of 16 or 8 bits, ``c`` integer
+up to 255, larger ones clipped, ``U`` 16 bits that wrap around, ``?`` whether it is above 0, ``g`` the sign, ``r``
+radius in whole metres with its sign, ``R`` the same in 8 bits, in tens of metres above 255, ``n`` turns in 8 bits,
+fractions below 1 in 1/256, ``k`` whole centimetres, ``h`` 16-bit float, ``2`` always 2, ``y`` heading, normalised to 0
+to 360.
 """
 
 from __future__ import annotations
@@ -33,15 +35,15 @@ if TYPE_CHECKING:
 FIELDS = ("param1", "param2", "param3", "param4", "x", "y", "z")
 
 
-class Storage(Enum):
-    """Through what items have gone before they are compared."""
+class ItemStorage(Enum):
+    """The conversions that items have gone through before they are compared."""
 
     WIRE = "wire"
-    """MISSION_ITEM_INT only: 32-bit floats, frames that are alike."""
+    """Only MISSION_ITEM_INT: 32-bit floats, equivalent frames."""
     ARDUPILOT = "ardupilot"
-    """And ArduPilot's 15 bytes for each item."""
+    """Also ArduPilot's storage of 15 bytes for each item."""
     PX4 = "px4"
-    """And PX4's structure of an item."""
+    """Also PX4's item structure."""
     ANY = "any"
     """Any of these."""
 
@@ -134,14 +136,14 @@ _PX4_OTHERS = ("fffffff",)
 _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000, 0x7FFF)}
 
 
-def kept(item: MissionItem, field: str, storage: Storage) -> Iterator[float]:
-    """What that field of the item may be when it comes back, besides what it is."""
+def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
+    """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
-    if storage in (Storage.ARDUPILOT, Storage.ANY):
+    if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         for letters in _ARDUPILOT.get(item.command, ("",)):
-            yield from _cut(letters[number : number + 1], value)
-    if storage in (Storage.PX4, Storage.ANY):
-        yield from _cut(_px4_letters(item)[number : number + 1], value)
+            yield from _convert(letters[number : number + 1], value)
+    if storage in (ItemStorage.PX4, ItemStorage.ANY):
+        yield from _convert(_px4_letters(item)[number : number + 1], value)
 
 
 def _px4_letters(item: MissionItem) -> str:
@@ -150,8 +152,8 @@ def _px4_letters(item: MissionItem) -> str:
     return (_PX4_JUMP if item.command == MavCmd.DO_JUMP else _PX4_OTHERS)[0]
 
 
-def _cut(letter: str, value: float) -> Iterator[float]:
-    """The value after that conversion; nothing when a C program could make anything of it."""
+def _convert(letter: str, value: float) -> Iterator[float]:
+    """Yield the converted value; nothing if the conversion overflows, which is undefined in C."""
     if letter in ("", "-"):
         yield 0.0
     elif letter == "2":
@@ -163,10 +165,10 @@ def _cut(letter: str, value: float) -> Iterator[float]:
         if low <= math.trunc(value) <= high:
             yield float(math.trunc(value))
     else:
-        yield from _cut_specially(letter, value)
+        yield from _convert_special(letter, value)
 
 
-def _cut_specially(letter: str, value: float) -> Iterator[float]:
+def _convert_special(letter: str, value: float) -> Iterator[float]:
     if letter == "f":
         yield struct.unpack("<f", struct.pack("<f", value))[0]
     elif letter == "c":
@@ -191,9 +193,9 @@ def _radius(metres: float, in_a_byte: bool) -> float:
     return float(math.trunc(metres) if metres <= 255 else 10 * min(255, math.trunc(metres / 10)))
 
 
-ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot cuts altitudes to whole centimetres
+ALTITUDE_TOLERANCE_M = 0.011  # ArduPilot stores altitudes in whole centimetres
 
-HEADING_TOLERANCE_DEG = 0.001  # PX4 keeps radians
+HEADING_TOLERANCE_DEG = 0.001  # PX4 stores radians
 
 _HEADING_IS_PARAM4 = frozenset(
     {
@@ -207,22 +209,22 @@ _HEADING_IS_PARAM4 = frozenset(
 )
 
 
-def items_differences(
-    wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: Storage = Storage.ANY
+def plan_differences(
+    wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: ItemStorage = ItemStorage.ANY
 ) -> tuple[str, ...]:
-    """One text for each difference: ``"item 3 (NAV_WAYPOINT): z is 20.0 instead of 30.0"``; empty: alike."""
+    """Describe each difference: ``"item 3 (NAV_WAYPOINT): z is 20.0 instead of 30.0"``. Empty if there is none."""
     texts = [f"there are {len(found)} items instead of {len(wanted)}"] if len(wanted) != len(found) else []
-    for index, (item, other) in enumerate(zip(wanted, found)):  # noqa: B905 - of different length, see above
+    for index, (item, other) in enumerate(zip(wanted, found)):  # noqa: B905 - lengths may differ, see above
         texts += [f"item {index} ({item.name}): {text}" for text in item_differences(item, other, storage)]
     return tuple(texts)
 
 
 def changed_items(
-    wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: Storage = Storage.WIRE
+    wanted: Sequence[MissionItem], found: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
 ) -> tuple[int, ...]:
-    """Which of the wanted items (from 0) the other plan does not have at the same index.
+    """Return the indices of the wanted items that ``found`` does not have at the same index.
 
-    What is to be sent in a partial change: with the default only what the wire itself loses counts as the same.
+    These must be sent in a partial update. By default only what the protocol itself loses counts as unchanged.
     """
     common = min(len(wanted), len(found))
     changed = [i for i in range(common) if item_differences(wanted[i], found[i], storage)]
@@ -232,13 +234,13 @@ def changed_items(
 def item_differences(
     wanted: MissionItem,
     found: MissionItem,
-    storage: Storage = Storage.ANY,
+    storage: ItemStorage = ItemStorage.ANY,
     *,
     single_precision: bool = False,
 ) -> tuple[str, ...]:
-    """One text for each field in which they differ: ``"z is 20.0 instead of 30.0"``.
+    """Describe each field that differs: ``"z is 20.0 instead of 30.0"``.
 
-    ``single_precision``: places went through 32-bit floats (MISSION_ITEM), which are up to 1.7 m apart.
+    ``single_precision``: places were sent as 32-bit floats (MISSION_ITEM), whose resolution is up to 1.7 m.
     """
     if wanted.command != found.command:
         return (f"the command is {found.name} instead of {wanted.name}",)
@@ -249,7 +251,7 @@ def item_differences(
 
 
 def _different_fields(
-    wanted: MissionItem, found: MissionItem, storage: Storage, single_precision: bool
+    wanted: MissionItem, found: MissionItem, storage: ItemStorage, single_precision: bool
 ) -> Iterator[str]:
     if not _frames_alike(wanted, found, storage):
         yield "frame"
@@ -261,68 +263,68 @@ def _different_fields(
             yield field
     if not _same_altitude(wanted, found, storage):
         yield "z"
-    if bool(wanted.autocontinue) != bool(found.autocontinue) and not _forgets_autocontinue(found, storage):
+    if bool(wanted.autocontinue) != bool(found.autocontinue) and not _drops_autocontinue(found, storage):
         yield "autocontinue"
 
 
-def _forgets_autocontinue(found: MissionItem, storage: Storage) -> bool:
-    """ArduPilot gives back True for items of missions, False for those of fences and rally points."""
+def _drops_autocontinue(found: MissionItem, storage: ItemStorage) -> bool:
+    # ArduPilot reports True for items of missions, False for those of fences and rally points.
     if found.command in FENCE_COMMANDS | RALLY_COMMANDS:
         return True
-    return storage in (Storage.ARDUPILOT, Storage.ANY) and found.autocontinue
+    return storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY) and found.autocontinue
 
 
-def _frames_alike(wanted: MissionItem, found: MissionItem, storage: Storage) -> bool:
-    one, other = canonical_frame(wanted.frame), canonical_frame(found.frame)
-    if one == other or (wanted.command in FENCE_COMMANDS and {wanted.frame, found.frame} <= GLOBAL_FRAMES):
+def _frames_alike(wanted: MissionItem, found: MissionItem, storage: ItemStorage) -> bool:
+    frame, other = canonical_frame(wanted.frame), canonical_frame(found.frame)
+    if frame == other or (wanted.command in FENCE_COMMANDS and {wanted.frame, found.frame} <= GLOBAL_FRAMES):
         return True
-    if storage not in (Storage.ARDUPILOT, Storage.ANY) or other != MavFrame.GLOBAL:
+    if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY) or other != MavFrame.GLOBAL:
         return False
-    return not has_place(wanted.command) or one == MavFrame.MISSION
+    return not has_place(wanted.command) or frame == MavFrame.MISSION
 
 
-def _same_number(wanted: MissionItem, found: MissionItem, field: str, storage: Storage) -> bool:
+def _same_number(wanted: MissionItem, found: MissionItem, field: str, storage: ItemStorage) -> bool:
     value, other = getattr(wanted, field), getattr(found, field)
     if _close(value, other):
         return True
-    if field == "param4" and wanted.command in _HEADING_IS_PARAM4 and storage in (Storage.PX4, Storage.ANY):
+    if field == "param4" and wanted.command in _HEADING_IS_PARAM4 and storage in (ItemStorage.PX4, ItemStorage.ANY):
         turn = abs(value - other) % 360.0
         if min(turn, 360.0 - turn) <= HEADING_TOLERANCE_DEG:
             return True
-    return any(_close(one, other) for one in kept(wanted, field, storage))
+    return any(_close(stored, other) for stored in _stored_values(wanted, field, storage))
 
 
 def _same_place(
-    wanted: MissionItem, found: MissionItem, field: str, storage: Storage, single_precision: bool
+    wanted: MissionItem, found: MissionItem, field: str, storage: ItemStorage, single_precision: bool
 ) -> bool:
     value, other = getattr(wanted, field), getattr(found, field)
     scale = xy_scale(wanted.command, wanted.frame)
     if scale != 1:
         return bool(abs(value - other) <= 1 + (_float_step(value / scale) * scale if single_precision else 0))
-    if has_place(wanted.command):  # a place in the frame MISSION: no number of its own
+    if has_place(wanted.command):  # with the frame MISSION the coordinates are not scaled
         return bool(value == other)
-    return value == other or any(_close(one, other) for one in kept(wanted, field, storage))
+    return value == other or any(_close(stored, other) for stored in _stored_values(wanted, field, storage))
 
 
 def _float_step(value: float) -> float:
-    """How far the 32-bit floats around a number are apart."""
+    # The distance between neighbouring 32-bit floats.
     return math.ldexp(1.0, math.frexp(value)[1] - 24)
 
 
-def _same_altitude(wanted: MissionItem, found: MissionItem, storage: Storage) -> bool:
+def _same_altitude(wanted: MissionItem, found: MissionItem, storage: ItemStorage) -> bool:
     if wanted.command in FENCE_COMMANDS or _close(wanted.z, found.z):
         return True
     if not has_place(wanted.command):
-        return any(_close(one, found.z) for one in kept(wanted, "z", storage))
-    if storage not in (Storage.ARDUPILOT, Storage.ANY):
+        return any(_close(stored, found.z) for stored in _stored_values(wanted, "z", storage))
+    if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         return False
-    if wanted.command in RALLY_COMMANDS:  # ArduPilot keeps whole metres there
+    if wanted.command in RALLY_COMMANDS:  # ArduPilot stores whole metres
         return math.isfinite(wanted.z) and _close(math.trunc(wanted.z), found.z)
     return abs(wanted.z - found.z) <= ALTITUDE_TOLERANCE_M
 
 
-def _close(one: float, other: float) -> bool:
-    """Equal as 32-bit floats, and somewhat less than that after arithmetic with them."""
-    if one == other or (one != one and other != other):
+def _close(left: float, right: float) -> bool:
+    # Equal as 32-bit floats, with some margin for arithmetic on them.
+    if left == right or (left != left and right != right):
         return True
-    return abs(one - other) <= max(1e-6 * max(abs(one), abs(other)), 1e-9)
+    return abs(left - right) <= max(1e-6 * max(abs(left), abs(right)), 1e-9)

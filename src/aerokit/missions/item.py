@@ -1,4 +1,4 @@
-"""``MissionItem``: one line of a mission, a fence or rally points, as MISSION_ITEM_INT has it.
+"""``MissionItem``: one item of a mission, a fence or rally points, as in MISSION_ITEM_INT.
 
 https://mavlink.io/en/services/mission.html and https://mavlink.io/en/messages/common.html#mav_commands
 """
@@ -14,8 +14,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Position
 
-DEFAULT_XY = 0x7FFFFFFF
-"""INT32_MAX in x or y: "not given", as NaN is in the other parameters."""
+DEFAULT_XY = 0x7FFFFFFF  # in x or y: "not given", as NaN is in the other parameters
 
 FENCE_COMMANDS = frozenset(
     {
@@ -29,6 +28,7 @@ FENCE_COMMANDS = frozenset(
 
 RALLY_COMMANDS = frozenset({MavCmd.NAV_RALLY_POINT})
 
+# Commands whose altitude needs a frame that says what it is relative to.
 DESTINATIONS = frozenset(
     {
         MavCmd.NAV_WAYPOINT,
@@ -48,8 +48,8 @@ DESTINATIONS = frozenset(
         *RALLY_COMMANDS,
     }
 )
-"""Commands whose altitude means nothing without a frame that says what it is above."""
 
+# Commands whose x and y are latitude and longitude in a global frame.
 PLACES = frozenset(
     {
         *DESTINATIONS,
@@ -69,8 +69,8 @@ PLACES = frozenset(
         *range(MavCmd.WAYPOINT_USER_1, MavCmd.SPATIAL_USER_5 + 1),
     }
 )
-"""Commands whose x and y are latitude and longitude when the frame is a global one."""
 
+# Parameters 1 to 4 of common commands for which the standard defines no NaN.
 NUMBERS: dict[int, tuple[int, ...]] = {
     MavCmd.NAV_WAYPOINT: (1, 2, 3),
     MavCmd.NAV_LOITER_UNLIM: (3,),
@@ -123,15 +123,14 @@ NUMBERS: dict[int, tuple[int, ...]] = {
     MavCmd.DO_WINCH: (1, 2),
     MavCmd.NAV_SCRIPT_TIME: (1, 2),
 }
-"""The parameters 1 to 4 of common commands for which the standard gives NaN no meaning."""
 
-_ALIKE: dict[int, int] = {
+_FRAME_ALIASES: dict[int, int] = {
     MavFrame.GLOBAL_INT: MavFrame.GLOBAL,
     MavFrame.GLOBAL_RELATIVE_ALT_INT: MavFrame.GLOBAL_RELATIVE_ALT,
     MavFrame.GLOBAL_TERRAIN_ALT_INT: MavFrame.GLOBAL_TERRAIN_ALT,
 }
 
-GLOBAL_FRAMES = frozenset({*_ALIKE, *_ALIKE.values()})
+GLOBAL_FRAMES = frozenset({*_FRAME_ALIASES, *_FRAME_ALIASES.values()})
 
 LOCAL_FRAMES = frozenset(
     {
@@ -147,19 +146,19 @@ _STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
 
 
 def canonical_frame(frame: int) -> int:
-    """The frame without "_INT", which the standard deprecated: in MISSION_ITEM_INT both mean the same."""
-    return _ALIKE.get(frame, frame)
+    """Return the frame without the deprecated "_INT" suffix, which has no meaning in MISSION_ITEM_INT."""
+    return _FRAME_ALIASES.get(frame, frame)
 
 
 def has_place(command: int) -> bool:
-    """Whether x and y of this command are a latitude and a longitude; commands of other dialects count as such."""
+    """Return True if x and y of this command are coordinates. Commands of other dialects count as such."""
     return command in PLACES or command not in _STANDARD_COMMANDS
 
 
 def xy_scale(command: int, frame: int) -> int:
-    """By how much x and y are multiplied in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1.
+    """Return the scale of x and y in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1.
 
-    ArduPilot decides by the command, PX4 by the frame; where they would differ, PX4 refuses the item.
+    ArduPilot decides by command, PX4 by frame. Where they would differ, PX4 refuses the item.
     """
     if not has_place(command):
         return 1
@@ -169,20 +168,20 @@ def xy_scale(command: int, frame: int) -> int:
 
 
 def command_name(command: int) -> str:
-    """The standard's name without its MAV_CMD prefix, or the number as text."""
+    """Return the name in the standard without the MAV_CMD prefix, or ``command`` with the number."""
     return MavCmd(command).name if command in _STANDARD_COMMANDS else f"command {command}"
 
 
 class MissionItem(Snapshot):
-    """One item, raw: the numbers that go out, for commands that have no builder.
+    """One raw item, as sent to the vehicle. Use it for commands that have no builder.
 
-    ``command`` is a MAV_CMD, ``frame`` a MAV_FRAME, ``param1`` to ``param4`` are the command's, NaN where the standard
-    allows "not given". ``x`` and ``y`` are integers as in MISSION_ITEM_INT: latitude and longitude in 1e-7 degrees in
-    a global frame, 1e-4 m in a local one, for commands without a place their parameters 5 and 6 as they are (a
-    fraction there fits only into the float form of the item). ``z`` is in metres, above what the frame says.
+    ``command`` is a MAV_CMD, ``frame`` a MAV_FRAME. ``param1`` to ``param4`` belong to the command; NaN means "not
+    given" where the standard allows it. ``x`` and ``y`` are integers as in MISSION_ITEM_INT: latitude and longitude in
+    1e-7 degrees in a global frame, 1e-4 m in a local one; for commands without a place they are parameters 5 and 6,
+    unscaled (fractions can only be sent as MISSION_ITEM). ``z`` is in metres, relative to what the frame says.
 
-    Anything can be put in, because a vehicle or a file may hold anything; ``check`` of the whole plan refuses what
-    makes no sense. Items are equal when all their fields are, NaN and NaN included.
+    Values are not checked on construction, because vehicles and files may contain anything; ``check`` of the whole plan
+    does. Items are equal if all fields are, and NaN equals NaN.
     https://mavlink.io/en/messages/common.html#MISSION_ITEM_INT
     """
 
@@ -199,15 +198,15 @@ class MissionItem(Snapshot):
 
     @property
     def name(self) -> str:
-        """The command's name without its MAV_CMD prefix: ``"NAV_WAYPOINT"``."""
+        """Name of the command without the MAV_CMD prefix: ``"NAV_WAYPOINT"``."""
         return command_name(self.command)
 
     @property
     def position(self) -> Position | None:
-        """Where the item is, with the altitude above home or above the sea that its frame says.
+        """Position of the item, with the altitude above home or above mean sea level, depending on the frame.
 
-        None for commands without a place, for local frames, and for 0°, 0°, which means "where the vehicle is". An
-        altitude above the terrain is neither of the two: see ``z`` then.
+        None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". An
+        altitude above terrain is only in ``z``.
         """
         if xy_scale(self.command, self.frame) != 10_000_000 or (self.x, self.y) in (
             (0, 0),
@@ -237,13 +236,12 @@ class MissionItem(Snapshot):
         return hash(self._key())
 
 
-HIGHEST_M = 83_000.0
-"""ArduPilot stores no altitude beyond (its LOCATION_ALT_MAX_M)."""
+MAX_ALTITUDE_M = 83_000.0  # ArduPilot's LOCATION_ALT_MAX_M
 
 Altitudes = tuple["float | None", "float | None", "float | None"]
 
 
-def place(
+def place_item(
     command: int,
     latitude_deg: Position | float | None,
     longitude_deg: float | None,
@@ -251,14 +249,14 @@ def place(
     *parameters: float,
     is_needed: bool = False,
 ) -> MissionItem:
-    """An item at a place; ``altitudes`` are those relative to home, above the sea, above the terrain: one is given.
+    """Create an item at a place. ``altitudes`` are relative to home, to mean sea level and to terrain; one is given.
 
-    A Position stands for latitude and longitude, and for the altitude when none is given.
-    Without a place it is 0°, 0°, by which ArduPilot means where the vehicle is then, unless it ``is_needed``.
+    A Position supplies latitude, longitude, and the altitude if none is given. Without a place, unless it
+    ``is_needed``, the item has 0°, 0°, which ArduPilot understands as the current position.
     """
     if isinstance(latitude_deg, Position):
         if longitude_deg is not None:
-            raise InvalidArgument(f"longitude_deg = {longitude_deg!r} is not allowed beside a Position")
+            raise InvalidArgument(f"longitude_deg = {longitude_deg!r} is not allowed together with a Position")
         position = latitude_deg
         latitude_deg, longitude_deg = position.latitude_deg, position.longitude_deg
         altitudes = _altitudes_of(position) if altitudes == (None, None, None) else altitudes
@@ -267,9 +265,7 @@ def place(
         return MissionItem(command, frame, *_four(parameters), z=z)
     if latitude_deg is None or longitude_deg is None:
         none = "" if is_needed else " or none of them"
-        raise InvalidArgument(
-            f"latitude_deg and longitude_deg: give both{none}, or a Position in their place"
-        )
+        raise InvalidArgument(f"latitude_deg and longitude_deg: give both{none}, or a Position instead")
     in_range("latitude_deg", latitude_deg, -90, 90)
     in_range("longitude_deg", longitude_deg, -180, 180)
     check_place(latitude_deg, longitude_deg)
@@ -278,7 +274,7 @@ def place(
 
 
 def _altitudes_of(position: Position) -> Altitudes:
-    """Of the two that it may have, the one above home, as ``go_to`` takes it."""
+    # Like go_to, prefer the altitude above home.
     if position.altitude_relative_m is not None:
         return position.altitude_relative_m, None, None
     return None, position.altitude_amsl_m, None
@@ -287,7 +283,7 @@ def _altitudes_of(position: Position) -> Altitudes:
 def altitude_and_frame(
     relative_m: float | None, amsl_m: float | None, terrain_m: float | None
 ) -> tuple[float, MavFrame]:
-    """The one altitude that is given, and the frame that says what it is above."""
+    """Return the one altitude that is given, and its frame."""
     given = {
         name: (value, frame)
         for name, value, frame in (
@@ -303,36 +299,32 @@ def altitude_and_frame(
             f" altitude_terrain_m (above the ground), not {' and '.join(given) or 'none'}"
         )
     ((name, (value, frame)),) = given.items()
-    in_range(name, value, -HIGHEST_M, HIGHEST_M)
+    in_range(name, value, -MAX_ALTITUDE_M, MAX_ALTITUDE_M)
     return float(value), frame
 
 
-def action(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
-    """An item without a place, in the frame that PX4 wants for those: MISSION."""
+def action_item(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
+    """Create an item without a place, in the frame MISSION, which PX4 requires for these."""
     return MissionItem(command, MavFrame.MISSION, *_four(parameters), z=z)
 
 
 def in_range(name: str, value: object, low: float, high: float, *, or_: tuple[float, ...] = ()) -> float:
-    """The value; :class:`InvalidArgument` unless it is a number from low to high, or one of ``or_``."""
-    if (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and (low <= value <= high or value in or_)
-    ):
+    """Return the value as a float, or raise :class:`InvalidArgument` unless it is from low to high, or in ``or_``."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and (low <= value <= high or value in or_):
         return float(value)
     others = "".join(f", or {other:g}" for other in or_)
     raise InvalidArgument(f"{name} = {value!r} is not allowed: {low:g} to {high:g}{others}")
 
 
-def whole(name: str, value: object, low: int, high: int) -> float:
-    """The value; :class:`InvalidArgument` unless it is a whole number from low to high."""
+def whole_number(name: str, value: object, low: int, high: int) -> float:
+    """Return the value as a float, or raise :class:`InvalidArgument` unless it is a whole number from low to high."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
     raise InvalidArgument(f"{name} = {value!r} is not allowed: a whole number from {low} to {high}")
 
 
 def heading(name: str, value: float | None) -> float:
-    """The heading in degrees, NaN (the standard's "not given") for None."""
+    """Return the heading in degrees, or NaN, "not given" in the standard, for None."""
     return math.nan if value is None else in_range(name, value, -360, 360)
 
 

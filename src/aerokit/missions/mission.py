@@ -1,15 +1,19 @@
-"""``Mission``: what a vehicle is to fly, item by item, as a value."""
+"""``Mission``, ``Fence``, ``RallyPoints`` and ``Plan``: immutable values that describe what a vehicle flies.
+
+See https://mavlink.io/en/services/mission.html#mission-types.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, overload
 
 from aerokit._internal.values import Snapshot
-from aerokit.errors import InvalidArgument
+from aerokit.errors import InvalidArgument, RemoteProtocolError
+from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.check import check_items
-from aerokit.missions.compare import Storage, items_differences
-from aerokit.missions.fence import Fence, RallyPoints
+from aerokit.missions.compare import ItemStorage, plan_differences
 from aerokit.missions.item import MissionItem
 from aerokit.missions.wire import with_home, without_home
 from aerokit.position import Position
@@ -20,53 +24,41 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-class Mission(Snapshot):
-    """``Mission([take_off(20), waypoint(47.3, 8.5, altitude_relative_m=20), land()])``.
+class _ItemSequence(Snapshot):
+    """Base class of plans that are sequences of items."""
 
-    ``items`` are counted from 0 and never contain home, whatever the autopilot: jumps, progress and errors count the
-    same way. ``home`` is where the planner thought it to be, for files; a vehicle uses its own. Like a tuple of its
-    items it can be indexed, sliced and iterated; ``items`` becomes a tuple, whatever it is made of.
-    """
-
-    MISSION_TYPE: ClassVar[int] = 0
+    MISSION_TYPE: ClassVar[int]
 
     items: Sequence[MissionItem] = ()
-    home: Position | None = None
 
-    def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`InvalidArgument`, which names item, field, value and what is allowed, unless it can be sent.
+    def differences(self, found: Self, storage: ItemStorage = ItemStorage.ANY) -> tuple[str, ...]:
+        """Describe how ``found``, read from a vehicle, differs from this plan, with one text for each difference.
 
-        NaN passes where the standard gives it a meaning ("not given"): headings, reserved parameters. With
-        ``home_is_item_0``, which says whether it is for an ArduPilot, more can be said: one item fewer fits there,
-        and elsewhere 0°, 0° is not "where the vehicle is".
+        Ignores home, and what the protocol and the ``storage`` of the autopilot change. Empty if they are the same.
         """
-        check_items(self.items, self.MISSION_TYPE, home_is_item_0=home_is_item_0)
+        return plan_differences(self.items, found.items, storage)
 
-    def differences(self, found: Mission, storage: Storage = Storage.ANY) -> tuple[str, ...]:
-        """What ``found``, from a vehicle, has otherwise than this mission, one text each; empty when it is the same.
-
-        What the wire and the memory of the autopilot in ``storage`` change is no difference, nor is home.
-        """
-        return items_differences(self.items, found.items, storage)
-
-    def matches(self, found: Mission, storage: Storage = Storage.ANY) -> bool:
-        """Whether there are no differences."""
+    def matches(self, found: Self, storage: ItemStorage = ItemStorage.ANY) -> bool:
+        """Return True if there are no differences."""
         return not self.differences(found, storage)
 
-    def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
-        """The items as the vehicle counts them: for ArduPilot with home in front, and jumps counted accordingly."""
-        return with_home(self.items, self.home) if home_is_item_0 else tuple(self.items)
+    def check(self, *, home_is_item_0: bool | None = None) -> None:
+        """Check that all items can be sent.
 
-    @classmethod
-    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
-        """The inverse of :meth:`to_items`."""
-        return cls(*without_home(items)) if home_is_item_0 else cls(items)
+        NaN is accepted where the standard defines it as "not given": headings and reserved parameters. Pass
+        ``home_is_item_0``, True for missions of ArduPilot and False for those of others, to check more: ArduPilot has
+        room for one item fewer, and for others 0°, 0° does not mean "the current position".
+
+        Raises:
+            InvalidArgument: the text names item, field, value and what is allowed.
+        """
+        check_items(self.items, self.MISSION_TYPE, home_is_item_0=home_is_item_0)
 
     def _check(self) -> None:
         object.__setattr__(self, "items", tuple(self.items))
         for index, item in enumerate(self.items):
             if not isinstance(item, MissionItem):
-                raise InvalidArgument(f"item {index} = {item!r} is no MissionItem")
+                raise InvalidArgument(f"item {index} = {item!r} is not a MissionItem")
 
     def __len__(self) -> int:
         return len(self.items)
@@ -82,13 +74,214 @@ class Mission(Snapshot):
         return self.items[index]  # type: ignore[return-value]
 
 
-class Plan(Snapshot):
-    """A mission with its fence and its rally points, as QGroundControl keeps them in one ``.plan`` file.
+class Mission(_ItemSequence):
+    """A mission: ``Mission([take_off(20), waypoint(47.3, 8.5, altitude_relative_m=20), land()])``.
 
-    ``mission.home`` is the planned home position. ``firmware_type`` is a MAV_AUTOPILOT and ``vehicle_type`` a
-    MAV_TYPE, for which it was planned; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are what the
-    planner reckons with. ``source`` is the text of the file it was read from: writing changes in it only what has
-    become different, so that surveys and whatever else stands there stay. It is not compared.
+    ``items`` are counted from 0 and never include home, for any autopilot. Jumps, progress and errors use the same
+    indices. ``home`` is the planned home position, for files; a vehicle uses its own. A mission can be indexed, sliced
+    and iterated like a tuple of its items; ``items`` is converted to a tuple.
+    """
+
+    MISSION_TYPE: ClassVar[int] = 0
+
+    home: Position | None = None
+
+    def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
+        """Return the items as the vehicle counts them: for ArduPilot with home first, and jump targets adjusted."""
+        return with_home(self.items, self.home) if home_is_item_0 else tuple(self.items)
+
+    @classmethod
+    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
+        """Create a mission from the items of a vehicle; the inverse of :meth:`to_items`."""
+        return cls(*without_home(items)) if home_is_item_0 else cls(items)
+
+
+_POLYGON = {True: MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION, False: MavCmd.NAV_FENCE_POLYGON_VERTEX_EXCLUSION}
+
+_CIRCLE = {True: MavCmd.NAV_FENCE_CIRCLE_INCLUSION, False: MavCmd.NAV_FENCE_CIRCLE_EXCLUSION}
+
+
+class FencePolygon(Snapshot):
+    """A polygon of at least three vertices that the vehicle must stay inside, or outside if not ``inclusion``.
+
+    ``vertices`` is converted to a tuple; altitudes are ignored. ArduPilot stores at most 255 vertices.
+    """
+
+    vertices: Sequence[Position]
+    inclusion: bool = True
+
+    def _check(self) -> None:
+        object.__setattr__(self, "vertices", tuple(self.vertices))
+        for index, vertex in enumerate(self.vertices):
+            if not isinstance(vertex, Position):
+                raise InvalidArgument(f"vertices[{index}] = {vertex!r} is not a Position")
+        if len(self.vertices) < 3:
+            raise InvalidArgument(f"vertices has {len(self.vertices)} places; a polygon needs at least 3")
+
+
+class FenceCircle(Snapshot):
+    """A circle that the vehicle must stay inside, or outside if not ``inclusion``."""
+
+    center: Position
+    radius_m: float
+    inclusion: bool = True
+
+    def _check(self) -> None:
+        if not isinstance(self.center, Position):
+            raise InvalidArgument(f"center = {self.center!r} is not a Position")
+        if not isinstance(self.radius_m, (float, int, Real)) or not 0 < self.radius_m < 3e7:
+            raise InvalidArgument(f"radius_m = {self.radius_m!r} is not allowed: above 0 and below 3e7")
+
+
+class Fence(Snapshot):
+    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``; empty for no fence.
+
+    ``return_point`` is the destination after a breach (Plane, and PX4 if configured). Both sequences are converted to
+    tuples.
+    """
+
+    MISSION_TYPE: ClassVar[int] = 1
+
+    polygons: Sequence[FencePolygon] = ()
+    circles: Sequence[FenceCircle] = ()
+    return_point: Position | None = None
+
+    def check(self, *, home_is_item_0: bool | None = None) -> None:
+        """Raise :class:`InvalidArgument` if the fence cannot be sent. A fence never includes home."""
+        check_items(self.to_items(), self.MISSION_TYPE)
+
+    def differences(self, found: Fence, storage: ItemStorage = ItemStorage.ANY) -> tuple[str, ...]:
+        """Describe how ``found`` differs from this fence, item by item; see `Mission.differences`."""
+        return plan_differences(self.to_items(), found.to_items(), storage)
+
+    def matches(self, found: Fence, storage: ItemStorage = ItemStorage.ANY) -> bool:
+        """Return True if there are no differences."""
+        return not self.differences(found, storage)
+
+    def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
+        """Return the items: vertices, each with the size of its polygon, then circles, then the return point."""
+        items = [
+            _item(_POLYGON[polygon.inclusion], place, float(len(polygon.vertices)))
+            for polygon in self.polygons
+            for place in polygon.vertices
+        ]
+        items += [_item(_CIRCLE[circle.inclusion], circle.center, circle.radius_m) for circle in self.circles]
+        if self.return_point is not None:
+            items.append(_return_item(self.return_point))
+        return tuple(items)
+
+    @classmethod
+    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
+        """Create a fence from the items of a vehicle, in any order; the inverse of :meth:`to_items`.
+
+        Raises:
+            RemoteProtocolError: the items do not form a fence; the text names the item.
+        """
+        polygons: list[FencePolygon] = []
+        circles: list[FenceCircle] = []
+        return_point: Position | None = None
+        index = 0
+        while index < len(items):
+            item, taken = items[index], 1
+            if item.command in _POLYGON.values():
+                polygon = _read_polygon(items, index)
+                polygons.append(polygon)
+                taken = len(polygon.vertices)
+            elif item.command in _CIRCLE.values():
+                circles.append(_read_circle(item, index))
+            elif item.command == MavCmd.NAV_FENCE_RETURN_POINT:
+                return_point = _place(item, index)
+            else:
+                raise RemoteProtocolError(f"item {index} ({item.name}) does not belong to a fence")
+            index += taken
+        return cls(polygons, circles, return_point)
+
+    def _check(self) -> None:
+        for name, kind in (("polygons", FencePolygon), ("circles", FenceCircle)):
+            values = tuple(getattr(self, name))
+            object.__setattr__(self, name, values)
+            for index, value in enumerate(values):
+                if not isinstance(value, kind):
+                    raise InvalidArgument(f"{name}[{index}] = {value!r} is not a {kind.__name__}")
+
+
+def _item(command: MavCmd, place: Position, param1: float) -> MissionItem:
+    x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
+    return MissionItem(command, MavFrame.GLOBAL, param1, x=x, y=y)
+
+
+def _return_item(place: Position) -> MissionItem:
+    item = _item(MavCmd.NAV_FENCE_RETURN_POINT, place, 0.0)
+    if place.altitude_relative_m is not None:
+        return item.replace(frame=MavFrame.GLOBAL_RELATIVE_ALT, z=place.altitude_relative_m)
+    return item.replace(z=place.altitude_amsl_m or 0.0)
+
+
+def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
+    # Every vertex has the number of vertices of its polygon, on PX4 and ArduPilot.
+    item = items[first]
+    count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0
+    vertices = items[first : first + count]
+    if not count or len(vertices) < count or any(vertex.command != item.command for vertex in vertices):
+        raise RemoteProtocolError(
+            f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but some of them are missing"
+        )
+    places = [_place(vertex, first + number) for number, vertex in enumerate(vertices)]
+    return FencePolygon(places, item.command == _POLYGON[True])
+
+
+def _read_circle(item: MissionItem, index: int) -> FenceCircle:
+    center = _place(item, index)
+    try:
+        return FenceCircle(center, item.param1, item.command == _CIRCLE[True])
+    except InvalidArgument as error:
+        raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
+
+
+def _place(item: MissionItem, index: int) -> Position:
+    try:
+        place = Position(item.x / 1e7, item.y / 1e7)
+    except InvalidArgument as error:
+        raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
+    if item.command != MavCmd.NAV_FENCE_RETURN_POINT or (item.z == 0 and item.frame == MavFrame.GLOBAL):
+        return place
+    return item.position or place
+
+
+class RallyPoints(_ItemSequence):
+    """Rally points: ``RallyPoints([rally_point(47.3, 8.5, altitude_relative_m=30)])``. ``items`` becomes a tuple.
+
+    ArduPilot stores altitudes in whole metres, -32,768 to 32,767.
+    """
+
+    MISSION_TYPE: ClassVar[int] = 2
+
+    @property
+    def positions(self) -> tuple[Position, ...]:
+        """The positions of all items that have one."""
+        return tuple(item.position for item in self.items if item.position is not None)
+
+    def check(self, *, home_is_item_0: bool | None = None) -> None:
+        """Raise :class:`InvalidArgument` if the points cannot be sent; the text has item, field and what is allowed."""
+        super().check()
+
+    def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
+        """Return the items unchanged, because home is never among them."""
+        return tuple(self.items)
+
+    @classmethod
+    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
+        """Create rally points from the items of a vehicle."""
+        return cls(items)
+
+
+class Plan(Snapshot):
+    """A mission with its fence and rally points, as in one QGroundControl ``.plan`` file.
+
+    ``mission.home`` is the planned home position. ``firmware_type`` (MAV_AUTOPILOT) and ``vehicle_type`` (MAV_TYPE) are
+    those it was planned for; ``cruise_speed_m_s`` (planes) and ``hover_speed_m_s`` (copters) are assumptions of the
+    planner. ``source`` is the text of the file it was read from: writing changes only what differs from it, so that
+    surveys and unknown fields are kept. It is ignored when plans are compared.
     """
 
     mission: Mission = Mission()

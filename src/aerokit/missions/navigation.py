@@ -1,12 +1,12 @@
-"""Builders for items at a place: waypoints, take-off and landing, loitering, rally points.
+"""Builders for items with a place: waypoints, take-off and landing, loitering, rally points.
 
-A place is a :class:`~aerokit.Position`, or a latitude and a longitude in degrees (WGS 84). It has exactly one altitude
-in metres: ``altitude_relative_m`` above home, ``altitude_amsl_m`` above mean sea level, ``altitude_terrain_m`` above
-the ground below (ArduPilot with terrain data; PX4 refuses it). Without one of these the altitude of the Position
-counts, the one above home if it has both; except for landings, whose altitude is that of the ground. ``take_off``,
-``vtol_take_off`` and ``loiter_to_altitude`` take a number alone, too: the altitude above home, ``take_off(10)``.
-``yaw_deg`` is a heading in degrees from north, None: as the vehicle likes.
-What cannot be right raises :class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
+A place is a :class:`~aerokit.Position`, or a latitude and a longitude in degrees (WGS 84). It needs exactly one
+altitude in metres: ``altitude_relative_m`` above home, ``altitude_amsl_m`` above mean sea level, or
+``altitude_terrain_m`` above the terrain (ArduPilot with terrain data; PX4 refuses it). If none is given, the altitude
+of the Position is used, the one above home if it has both; for landings, the altitude is that of the ground.
+``take_off``, ``vtol_take_off`` and ``loiter_to_altitude`` also accept only an altitude above home: ``take_off(10)``.
+``yaw_deg`` is a heading in degrees from north; None leaves it to the vehicle. Invalid arguments raise
+:class:`~aerokit.errors.InvalidArgument` with the argument and what is allowed.
 https://mavlink.io/en/messages/common.html#mav_commands
 """
 
@@ -15,14 +15,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, overload
 
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions.item import action, heading, in_range, place
+from aerokit.missions.item import action_item, heading, in_range, place_item
 
 if TYPE_CHECKING:
     from aerokit.missions.item import Altitudes, MissionItem
     from aerokit.position import Position
 
-_LONGEST_S = 65_535.0  # ArduPilot has 16 bits for seconds
-_WIDEST_M = 65_535.0  # and for metres
+_MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
+_MAX_RADIUS_M = 65_535.0  # and metres, too
 
 
 @overload
@@ -63,20 +63,20 @@ def waypoint(
     pass_by_m: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Fly to a place and stay there for ``hold_s`` seconds (0 to 65,535; ArduPilot: whole ones, not Plane).
+    """Fly to a place and hold there for ``hold_s`` seconds (0 to 65,535; whole seconds on ArduPilot, not on Plane).
 
-    Within ``acceptance_radius_m`` it counts as reached (0: the vehicle's own; not ArduCopter); ``pass_by_m`` is by how
-    much a plane may pass beside it, negative on the other side (ArduPlane keeps whole metres to 255 of both).
-    https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
+    ``acceptance_radius_m`` is the distance at which it counts as reached (0: the vehicle's setting; not ArduCopter).
+    ``pass_by_m`` is the distance at which a plane may pass it, negative on the other side. ArduPlane stores whole
+    metres up to 255 of both. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
-    return place(
+    return place_item(
         MavCmd.NAV_WAYPOINT,
         latitude_deg,
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        in_range("hold_s", hold_s, 0, _LONGEST_S),
-        in_range("acceptance_radius_m", acceptance_radius_m, 0, _WIDEST_M),
-        in_range("pass_by_m", pass_by_m, -_WIDEST_M, _WIDEST_M),
+        in_range("hold_s", hold_s, 0, _MAX_DURATION_S),
+        in_range("acceptance_radius_m", acceptance_radius_m, 0, _MAX_RADIUS_M),
+        in_range("pass_by_m", pass_by_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         heading("yaw_deg", yaw_deg),
         is_needed=True,
     )
@@ -111,16 +111,16 @@ def spline_waypoint(
     altitude_terrain_m: float | None = None,
     hold_s: float = 0.0,
 ) -> MissionItem:
-    """Fly to a place in a curve (ArduPilot, not Plane), and stay there for ``hold_s`` seconds (0 to 65,535).
+    """Fly to a place along a spline (ArduPilot, not Plane) and hold there for ``hold_s`` seconds (0 to 65,535).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_SPLINE_WAYPOINT
     """
-    return place(
+    return place_item(
         MavCmd.NAV_SPLINE_WAYPOINT,
         latitude_deg,
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        in_range("hold_s", hold_s, 0, _LONGEST_S),
+        in_range("hold_s", hold_s, 0, _MAX_DURATION_S),
         is_needed=True,
     )
 
@@ -165,12 +165,12 @@ def take_off(
     pitch_deg: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Take off to an altitude; without a place where the vehicle is (ArduPilot; PX4 needs the place).
+    """Take off to an altitude, at the current position if no place is given (ArduPilot; PX4 needs the place).
 
-    ``pitch_deg`` is the least pitch of a plane, 0 to 90 degrees.
+    ``pitch_deg`` is the minimum pitch of a plane, 0 to 90 degrees.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_TAKEOFF
     """
-    return place(
+    return place_item(
         MavCmd.NAV_TAKEOFF,
         *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         in_range("pitch_deg", pitch_deg, 0, 90),
@@ -216,11 +216,11 @@ def vtol_take_off(
     altitude_terrain_m: float | None = None,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Take off like a multicopter (PX4: and go over to forward flight towards the place, which it needs).
+    """Take off vertically. PX4 then transitions to forward flight towards the place, which it needs.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_TAKEOFF
     """
-    return place(
+    return place_item(
         MavCmd.NAV_VTOL_TAKEOFF,
         *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         0.0,
@@ -265,19 +265,19 @@ def land(
     precision: int = 0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Land at a place, or where the vehicle is (ArduPilot; PX4 needs the place).
+    """Land at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground there, home's when none is given (a Position's does not count).
-    ``abort_altitude_m`` is where to climb when a plane's landing is given up (0 to 65,535 m, 0: its own); ``precision``
-    0, 1 (opportunistic) or 2 (required) asks PX4 for a precision landing.
+    The altitude is that of the ground there, by default that of home; the altitude of a Position is ignored.
+    ``abort_altitude_m`` is the altitude to climb to if a plane aborts the landing (0 to 65,535 m, 0: its setting).
+    ``precision`` requests a precision landing from PX4: 0 no, 1 opportunistic, 2 required.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LAND
     """
-    return place(
+    return place_item(
         MavCmd.NAV_LAND,
         latitude_deg,
         longitude_deg,
         _ground(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        in_range("abort_altitude_m", abort_altitude_m, 0, _WIDEST_M),
+        in_range("abort_altitude_m", abort_altitude_m, 0, _MAX_RADIUS_M),
         in_range("precision", precision, 0, 2),
         0.0,
         heading("yaw_deg", yaw_deg),
@@ -313,12 +313,12 @@ def vtol_land(
     altitude_terrain_m: float | None = None,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Land like a multicopter at a place, or where the vehicle is (ArduPilot; PX4 needs the place).
+    """Land vertically at a place, or at the current position if none is given (ArduPilot; PX4 needs the place).
 
-    The altitude is that of the ground there, home's when none is given (a Position's does not count).
+    The altitude is that of the ground there, by default that of home; the altitude of a Position is ignored.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_VTOL_LAND
     """
-    return place(
+    return place_item(
         MavCmd.NAV_VTOL_LAND,
         latitude_deg,
         longitude_deg,
@@ -362,18 +362,18 @@ def loiter_unlimited(
     radius_m: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Stay at a place for good; planes circle with ``radius_m`` (0: their own, negative: counter-clockwise).
+    """Stay at a place indefinitely. Planes circle with ``radius_m`` (0: their setting, negative: counter-clockwise).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_UNLIM
     """
-    return place(
+    return place_item(
         MavCmd.NAV_LOITER_UNLIM,
         latitude_deg,
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         0.0,
         0.0,
-        in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
+        in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         heading("yaw_deg", yaw_deg),
     )
 
@@ -413,19 +413,19 @@ def loiter_time(
     radius_m: float = 0.0,
     leave_tangentially: bool = False,
 ) -> MissionItem:
-    """Stay at a place for 0 to 65,535 seconds (ArduPilot: whole ones, and of the radius only its sign).
+    """Stay at a place for 0 to 65,535 seconds. ArduPilot stores whole seconds, and only the sign of the radius.
 
-    ``leave_tangentially`` lets a plane go on to the next place from the circle instead of from its centre.
+    ``leave_tangentially`` lets a plane leave from the circle instead of its centre.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
     """
-    return place(
+    return place_item(
         MavCmd.NAV_LOITER_TIME,
         latitude_deg,
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        in_range("duration_s", duration_s, 0, _LONGEST_S),
+        in_range("duration_s", duration_s, 0, _MAX_DURATION_S),
         0.0,
-        in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
+        in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         float(leave_tangentially),
     )
 
@@ -465,12 +465,12 @@ def loiter_turns(
     radius_m: float = 0.0,
     leave_tangentially: bool = False,
 ) -> MissionItem:
-    """Circle around a place, 0 to 255 times (ArduPilot; PX4 refuses it), with a radius up to 2,550 m.
+    """Circle around a place 0 to 255 times with a radius of up to 2,550 m (ArduPilot; PX4 refuses it).
 
-    ArduPilot keeps whole turns, or a fraction below 1, and tens of metres above 255 m; negative: counter-clockwise.
+    ArduPilot stores whole turns or a fraction below 1, and tens of metres above 255 m. Negative: counter-clockwise.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TURNS
     """
-    return place(
+    return place_item(
         MavCmd.NAV_LOITER_TURNS,
         latitude_deg,
         longitude_deg,
@@ -522,26 +522,26 @@ def loiter_to_altitude(
     radius_m: float = 0.0,
     leave_tangentially: bool = False,
 ) -> MissionItem:
-    """Circle at a place until the altitude is reached; ``radius_m`` negative: counter-clockwise.
+    """Circle at a place until the altitude is reached. A negative ``radius_m`` means counter-clockwise.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TO_ALT
     """
-    return place(
+    return place_item(
         MavCmd.NAV_LOITER_TO_ALT,
         *_up(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         0.0,
-        in_range("radius_m", radius_m, -_WIDEST_M, _WIDEST_M),
+        in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
         0.0,
         float(leave_tangentially),
     )
 
 
 def return_to_launch() -> MissionItem:
-    """Return to home, or to a rally point, as the vehicle is set up.
+    """Return to home, or to a rally point, depending on the vehicle's settings.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_RETURN_TO_LAUNCH
     """
-    return action(MavCmd.NAV_RETURN_TO_LAUNCH)
+    return action_item(MavCmd.NAV_RETURN_TO_LAUNCH)
 
 
 @overload
@@ -570,12 +570,12 @@ def rally_point(
     altitude_amsl_m: float | None = None,
     altitude_terrain_m: float | None = None,
 ) -> MissionItem:
-    """A place for :class:`RallyPoints`; ArduPilot keeps whole metres of altitude, -32,768 to 32,767.
+    """A rally point for :class:`RallyPoints`. ArduPilot stores whole metres of altitude, -32,768 to 32,767.
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_RALLY_POINT
     """
     altitudes = (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)
-    item = place(MavCmd.NAV_RALLY_POINT, latitude_deg, longitude_deg, altitudes, is_needed=True)
+    item = place_item(MavCmd.NAV_RALLY_POINT, latitude_deg, longitude_deg, altitudes, is_needed=True)
     in_range("altitude", item.z, -32_768, 32_767)
     return item
 
@@ -583,7 +583,7 @@ def rally_point(
 def _up(
     latitude_deg: Position | float | None, longitude_deg: float | None, altitudes: Altitudes
 ) -> tuple[Position | float | None, float | None, Altitudes]:
-    """A place and its altitudes, as they are given or by an altitude alone."""
+    # A number alone is an altitude above home.
     if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
         return None, None, (latitude_deg, None, None)
     return latitude_deg, longitude_deg, altitudes

@@ -1,4 +1,4 @@
-"""QGroundControl's ``.plan`` files, read and written.
+"""QGroundControl ``.plan`` files.
 
 https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/plan.html
 """
@@ -10,12 +10,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.files import read_text, write_whole
+from aerokit._internal.files import read_text, write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.fence import Fence, FenceCircle, FencePolygon, RallyPoints
 from aerokit.missions.item import MissionItem, canonical_frame
-from aerokit.missions.mission import Mission, Plan
+from aerokit.missions.mission import Fence, FenceCircle, FencePolygon, Mission, Plan, RallyPoints
 from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries
 from aerokit.missions.wire import in_degrees
 from aerokit.position import Position
@@ -32,21 +31,25 @@ _NUMBERS = {
 
 
 def read_plan_file(path: str | os.PathLike[str]) -> Plan:
-    """The plan in a file; :class:`FileFormatError` names the file, the place in it and what is expected there.
+    """Read a plan from a file.
 
-    Surveys, corridor scans and landing patterns become the items they stand for; other complex items say only how they
-    were planned, so they are refused. Ranges of parameters are left to ``check`` and the vehicle.
+    Surveys, corridor scans and landing patterns are converted to simple items. Other complex items are refused, because
+    the file has only their settings. Parameter ranges are not checked here; ``check`` does.
+
+    Raises:
+        FileFormatError: the text names the file, the position in it and what was expected there.
+        OSError: the file cannot be read.
     """
     return parse_plan(read_text(path), Path(path).name)
 
 
 def write_plan_file(path: str | os.PathLike[str], plan: Plan) -> None:
-    """Write the plan to a file; see :func:`format_plan`."""
-    write_whole(path, format_plan(plan))
+    """Write a plan to a file; see :func:`format_plan`."""
+    write_atomically(path, format_plan(plan))
 
 
 def parse_plan(text: str, name: str = "plan") -> Plan:
-    """The plan of the text of a file; ``name`` is what errors call it."""
+    """Parse the text of a file. Errors begin with ``name``."""
     document = load_json(text, name)
     document["fileType"].one_of("Plan")
     document["version"].one_of(1)
@@ -64,21 +67,22 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
 
 
 def format_plan(plan: Plan) -> str:
-    """The text of a file. A plan that was read keeps all that stood there, but for what has become different.
+    """Format a plan as the text of a file. For a plan that was read from a file, only changes are applied to its text.
 
-    Raises :class:`InvalidArgument` for what such a file cannot keep: rally points and a return point of the fence
-    with altitudes other than above home, numbers that are infinite.
+    Raises:
+        InvalidArgument: a .plan file cannot store a value: rally points or a fence return point with altitudes that
+            are not relative to home, or infinite numbers.
     """
     try:
         return json.dumps(_document(plan), indent=4, allow_nan=False) + "\n"
     except RecursionError:
-        raise InvalidArgument("the plan was read from a file that is nested too deep to be written") from None
+        raise InvalidArgument("the plan was read from a file that is nested too deeply to be written") from None
     except InvalidArgument:
         raise
-    except FileFormatError as error:  # of the file that it was read from: what else stood there is kept
-        raise InvalidArgument(f"the plan cannot be written again: {error}") from error
+    except FileFormatError as error:  # in the text that the plan was read from
+        raise InvalidArgument(f"the plan cannot be written: {error}") from error
     except ValueError as error:
-        raise InvalidArgument("a number of the plan is not finite: a .plan file cannot keep it") from error
+        raise InvalidArgument("a number of the plan is not finite, and a .plan file cannot store it") from error
 
 
 def _document(plan: Plan) -> dict[str, Any]:
@@ -129,14 +133,14 @@ def _read_fence(value: JsonValue) -> Fence:
     polygons, circles = (value.child(key) for key in ("polygons", "circles"))
     point = value.child("breachReturn")
     return Fence(
-        [_read_polygon(one) for one in (polygons.elements() if polygons else ())],
-        [_read_circle(one) for one in (circles.elements() if circles else ())],
+        [_read_polygon(polygon) for polygon in (polygons.elements() if polygons else ())],
+        [_read_circle(circle) for circle in (circles.elements() if circles else ())],
         None if point is None else _read_place(point, altitude="relative"),
     )
 
 
 def _is_empty_and_old(value: JsonValue, *keys: str) -> bool:
-    """Of version 1, which had other contents, and without any; QGroundControl itself has written such."""
+    # Version 1 had other contents. QGroundControl itself has written it for empty fences and rally points.
     is_empty = not any(value.members().get(key) for key in keys)
     value["version"].one_of(*((1, 2) if is_empty else (2,)))
     return bool(value["version"].value == 1)
@@ -146,7 +150,7 @@ def _read_polygon(value: JsonValue) -> FencePolygon:
     corners = value["polygon"]
     places = [_required_place(corner) for corner in corners.elements()]
     if len(places) < 3:
-        raise corners.error(f"an array of at least 3 places, and it has {len(places)}")
+        raise corners.error(f"an array of at least 3 places; it has {len(places)}")
     return FencePolygon(places, value["inclusion"].boolean())
 
 
@@ -181,7 +185,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    """Latitude, longitude, and altitude, where it is given; all null: no place."""
+    # Null coordinates mean no position.
     elements = value.elements(2, 3)
     latitude, longitude = elements[0].number(-90, 90, null=True), elements[1].number(-180, 180, null=True)
     if math.isnan(latitude) or math.isnan(longitude):
@@ -240,7 +244,7 @@ def _fence_members(fence: Fence) -> dict[str, Any]:
         "polygons": [
             {
                 "inclusion": polygon.inclusion,
-                "polygon": [_place(one) for one in polygon.vertices],
+                "polygon": [_place(vertex) for vertex in polygon.vertices],
                 "version": 1,
             }
             for polygon in fence.polygons
@@ -249,18 +253,15 @@ def _fence_members(fence: Fence) -> dict[str, Any]:
     point = fence.return_point
     if point is not None:
         if point.altitude_amsl_m is not None:
-            raise InvalidArgument(
-                f"return_point.altitude_amsl_m = {point.altitude_amsl_m!r}: a .plan file keeps it above home only"
-            )
+            altitude = f"return_point.altitude_amsl_m = {point.altitude_amsl_m!r}"
+            raise InvalidArgument(f"{altitude}: a .plan file stores only altitudes above home")
         members["breachReturn"] = _place_members(point, point.altitude_relative_m)
     return members
 
 
 def _rally_point(item: MissionItem, index: int) -> list[int | float | None]:
     if canonical_frame(item.frame) != MavFrame.GLOBAL_RELATIVE_ALT:
-        raise InvalidArgument(
-            f"rally[{index}]: frame = {item.frame!r}: a .plan file keeps rally points above home only"
-        )
+        raise InvalidArgument(f"rally[{index}]: frame = {item.frame!r}: a .plan file stores only altitudes above home")
     return [*map(json_number, (*in_degrees(item), item.z))]
 
 

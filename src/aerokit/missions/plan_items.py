@@ -1,13 +1,13 @@
-"""The items of a ``.plan`` file: simple ones, and complex ones (surveys, landings), which stand for several.
+"""Items of a ``.plan`` file: simple items, and complex ones (surveys, landings) that consist of several.
 
 https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/plan.html
 
-Altitudes: ``frame`` and the last of ``params`` are what is flown. ``AltitudeMode``, ``Altitude`` and
-``AMSLAltAboveTerrain`` are what the planner shows; they count where the last of ``params`` is null.
-Jumps lead to the ``doJumpId`` of an item, which QGroundControl counts from 1.
+Altitudes: ``frame`` and the last of ``params`` are flown. ``AltitudeMode``, ``Altitude`` and ``AMSLAltAboveTerrain``
+are for display, and only count if the last of ``params`` is null. Jump targets are the ``doJumpId`` of an item, which
+QGroundControl counts from 1.
 
-The file does not keep these items; this makes the ones that QGroundControl sends: the mark where the landing begins,
-then what is switched off (speed, photos, video), the approach, the landing.
+A landing pattern in the file has settings instead of items. This module generates the items that QGroundControl sends:
+DO_LAND_START, then commands that reset speed, photos and video, the approach, and the landing.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": M
 
 
 def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
-    """The items of a ComplexItem that is one of :data:`LANDING_PATTERNS`."""
+    """Generate the items of a ComplexItem of a type in :data:`LANDING_PATTERNS`."""
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
     relative = pattern["altitudesAreRelative"].boolean()
     frame = MavFrame.GLOBAL_RELATIVE_ALT if relative else MavFrame.GLOBAL
@@ -38,13 +38,13 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     heading = 0.0 if command == MavCmd.NAV_LAND else math.nan
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
-        *_switched_off(pattern),
+        *_reset_items(pattern),
         _approach(pattern, frame, approach),
         MissionItem(command, frame, 0.0, 0.0, 0.0, heading, *_place(pattern["landCoordinate"])),
     )
 
 
-def _switched_off(pattern: JsonValue) -> list[MissionItem]:
+def _reset_items(pattern: JsonValue) -> list[MissionItem]:
     items = []
     if _flag(pattern, "useDoChangeSpeed"):
         speed = pattern["finalApproachSpeed"].number(0)
@@ -58,7 +58,7 @@ def _switched_off(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    """Circling down, and then on from the circle's edge; or a mere waypoint. Older files have circles only."""
+    # Descend in a circle and leave it tangentially, or fly to a waypoint. Older files have circles only.
     if not _flag(pattern, "useLoiterToAlt", default=True):
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
     radius = pattern["loiterRadius"].number(0)
@@ -92,35 +92,35 @@ _MODE_OF_FRAME: dict[int, int] = {
 
 
 def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
-    """The items of each entry of ``mission.items``, jumps counted from 0 through all of them."""
+    """Return the items of each entry of ``mission.items``. Jump targets are counted from 0 over all entries."""
     values = [_simple_values(entry) for entry in entries]
-    made = [landing_items(entry) if group is None else () for entry, group in zip(entries, values)]  # noqa: B905
-    sizes = [len(items) if group is None else len(group) for items, group in zip(made, values)]  # noqa: B905
+    generated = [landing_items(entry) if group is None else () for entry, group in zip(entries, values)]  # noqa: B905
+    sizes = [len(items) if group is None else len(group) for items, group in zip(generated, values)]  # noqa: B905
     ids = _jump_ids(entries, values, sizes)
     return [
         items if group is None else tuple(_read_item(value, ids) for value in group)
-        for items, group in zip(made, values)  # noqa: B905 - of one length, all of them
+        for items, group in zip(generated, values)  # noqa: B905 - same length
     ]
 
 
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Entries for these items: those old ones at the beginning and the end which still stand for them, then new ones.
+    """Return entries for ``items``. Old entries at the beginning and the end that still match are kept.
 
-    ``groups`` are the items that each old entry stands for.
+    ``groups`` are the items of each old entry.
     """
     head, used = 0, 0
-    while head < len(groups) and _alike(groups[head], items[used : used + len(groups[head])]):
+    while head < len(groups) and _matches(groups[head], items[used : used + len(groups[head])]):
         used += len(groups[head])
         head += 1
-    tail, left = len(groups), len(items)
-    while tail > head and left - len(groups[tail - 1]) >= used:
-        begin = left - len(groups[tail - 1])
-        if not _alike(groups[tail - 1], items[begin:left]):
+    tail, end = len(groups), len(items)
+    while tail > head and end - len(groups[tail - 1]) >= used:
+        begin = end - len(groups[tail - 1])
+        if not _matches(groups[tail - 1], items[begin:end]):
             break
-        tail, left = tail - 1, begin
-    middle = [simple_entry(item) for item in items[used:left]]
+        tail, end = tail - 1, begin
+    middle = [simple_entry(item) for item in items[used:end]]
     merged = [*copy.deepcopy(list(entries[:head])), *middle, *copy.deepcopy(list(entries[tail:]))]
     sizes = [*map(len, groups[:head]), *(1,) * len(middle), *map(len, groups[tail:])]
     _number(merged, sizes, items)
@@ -128,7 +128,7 @@ def merged_entries(
 
 
 def simple_entry(item: MissionItem) -> dict[str, Any]:
-    """A SimpleItem; its doJumpId and the target of a jump are still to be set."""
+    """Create a SimpleItem. The caller sets its doJumpId and the target of a jump."""
     x, y = in_degrees(item)
     numbers = (item.param1, item.param2, item.param3, item.param4, x, y, item.z)
     entry: dict[str, Any] = {}
@@ -140,14 +140,14 @@ def simple_entry(item: MissionItem) -> dict[str, Any]:
 
 
 def json_number(value: float) -> int | float | None:
-    """As QGroundControl writes it: null for NaN, no point behind a whole number."""
+    """Convert a number as QGroundControl does: null for NaN, whole numbers without a decimal point."""
     if math.isnan(value):
         return None
     return int(value) if math.isfinite(value) and value == int(value) and abs(value) < 2**53 else value
 
 
 def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
-    """The simple items that an entry consists of; None for landing patterns, whose items are made."""
+    """Return the simple items in an entry, or None for a landing pattern, whose items are generated."""
     kind = entry["type"]
     kind.one_of("SimpleItem", "ComplexItem")
     if kind.value == "SimpleItem":
@@ -159,8 +159,8 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
     items = body.child("Items") if body is not None else None
     if items is None or not items.elements():
         raise entry.error(
-            f"a complex item with TransectStyleComplexItem.Items; this is a {complex_type!r}, of which the file says"
-            " how it was planned, and not which items it consists of"
+            f"a complex item with TransectStyleComplexItem.Items; this is a {complex_type!r}, for which the file has"
+            " only settings and no items"
         )
     return items.elements()
 
@@ -168,11 +168,11 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 def _jump_ids(
     entries: Sequence[JsonValue], values: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
-    """From doJumpId to index; those of simple items win over those within surveys."""
+    """Map doJumpId to index. Simple items take precedence over those inside surveys."""
     found: dict[int, int] = {}
     inner: dict[int, int] = {}
     first = 0
-    for entry, group, size in zip(entries, values, sizes):  # noqa: B905 - of one length
+    for entry, group, size in zip(entries, values, sizes):  # noqa: B905 - same length
         for index, value in enumerate(group or (), first):
             number = value.child("doJumpId")
             key = index + 1 if number is None else number.integer(-1, 2**31)
@@ -211,21 +211,19 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
     return _FRAME_OF_MODE.get(number, frame), math.nan if altitude is None else altitude.number(null=True)
 
 
-def _alike(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
-    """Equal, but for the target of a single jump, which is written anew anyway."""
+def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
+    """Return True if they are equal, ignoring the target of a jump, which is always rewritten."""
     if len(group) == len(items) == 1 and group[0].command == items[0].command == MavCmd.DO_JUMP:
         return group[0].replace(param1=0.0) == items[0].replace(param1=0.0)
     return tuple(group) == tuple(items)
 
 
 def _number(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
-    """Count the items from 1, and let jumps lead to these numbers."""
+    """Number the items from 1, and set jump targets to these numbers."""
     first = 0
-    for entry, size in zip(entries, sizes):  # noqa: B905 - of one length
+    for entry, size in zip(entries, sizes):  # noqa: B905 - same length
         body = entry.get("TransectStyleComplexItem", {})
-        for index, simple in enumerate(
-            [entry] if entry["type"] == "SimpleItem" else body.get("Items", []), first
-        ):
+        for index, simple in enumerate([entry] if entry["type"] == "SimpleItem" else body.get("Items", []), first):
             simple["doJumpId"] = index + 1
             if simple["command"] == MavCmd.DO_JUMP:
                 simple["params"][0] = json_number(items[index].param1 + 1)
@@ -233,22 +231,22 @@ def _number(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[Missio
 
 
 def load_json(text: str, name: str) -> JsonValue:
-    """The document in ``text``; :class:`FileFormatError` names the line when it is no JSON."""
+    """Parse a JSON document, or raise :class:`FileFormatError`, which names the line."""
     try:
         return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise FileFormatError(f"{name}: {where}: no JSON: {error.msg}") from error
+        raise FileFormatError(f"{name}: {where}: not valid JSON: {error.msg}") from error
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{name}: no JSON: {error}") from error
+        raise FileFormatError(f"{name}: not valid JSON: {error}") from error
 
 
 def _no_constant(text: str) -> None:
-    raise ValueError(f"{text} is none of its numbers")
+    raise ValueError(f"{text} is not allowed")
 
 
 class JsonValue:
-    """One value of a document; every reading method raises :class:`FileFormatError` when it is of another kind."""
+    """A value in a JSON document. Its methods raise :class:`FileFormatError` if it has another type."""
 
     __slots__ = ("name", "path", "value")
 
@@ -258,14 +256,14 @@ class JsonValue:
         self.path: str = path
 
     def error(self, expected: str) -> FileFormatError:
-        """The complaint that this value is not what was expected."""
-        # Piece by piece, so that a large value is not written out to be cut off.
+        """Create an error for a value that is not as expected."""
+        # Encoded incrementally, so that a large value is not formatted only to be truncated.
         found = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
         found = found if len(found) <= 40 else f"{found[:37]}..."
         return FileFormatError(f"{self.name}: {self.path or 'the document'} = {found}: expected {expected}")
 
     def child(self, key: str) -> JsonValue | None:
-        """The value of a key of an object, None when there is no such key."""
+        """Return the value of a key of an object, or None if there is no such key."""
         members = self.members()
         path = f"{self.path}.{key}" if self.path else key
         return JsonValue(members[key], self.name, path) if key in members else None
@@ -278,19 +276,17 @@ class JsonValue:
         return child
 
     def members(self) -> dict[str, Any]:
-        """An object."""
+        """Return the value as an object."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
         return self.value
 
     def elements(self, *sizes: int) -> list[JsonValue]:
-        """The elements of an array, which has one of these sizes."""
+        """Return the elements of an array, which must have one of these sizes, if any are given."""
         if not isinstance(self.value, list):
             raise self.error("an array")
         if sizes and len(self.value) not in sizes:
-            raise self.error(
-                f"an array of {' or '.join(map(str, sizes))} values, and it has {len(self.value)}"
-            )
+            raise self.error(f"an array of {' or '.join(map(str, sizes))} values; it has {len(self.value)}")
         return list(self._elements())
 
     def _elements(self) -> Iterator[JsonValue]:
@@ -298,41 +294,35 @@ class JsonValue:
             yield JsonValue(value, self.name, f"{self.path}[{index}]")
 
     def number(self, low: float = -math.inf, high: float = math.inf, *, null: bool = False) -> float:
-        """A finite number in that range, NaN for null where it is allowed."""
+        """Return a finite number in the range; with ``null``, NaN for null."""
         if self.value is None and null:
             return math.nan
         value = self._as_float()
         if not math.isfinite(value) or not low <= value <= high:
-            bounds = (
-                f" from {low:g} to {high:g}"
-                if math.isfinite(high)
-                else f" from {low:g} on"
-                if low == 0
-                else ""
-            )
+            bounds = f" from {low:g} to {high:g}" if math.isfinite(high) else f" from {low:g} on" if low == 0 else ""
             raise self.error(f"a number{bounds}" + ", or null" * null)
         return value
 
     def integer(self, low: int, high: int) -> int:
-        """A whole number in that range; 3.0 counts as one."""
+        """Return a whole number in the range. 3.0 counts as one."""
         value = self.number()
         if not value.is_integer() or not low <= value <= high:
             raise self.error(f"a whole number from {low} to {high}")
         return int(value)
 
     def boolean(self) -> bool:
-        """True or false."""
+        """Return true or false."""
         if not isinstance(self.value, bool):
             raise self.error("true or false")
         return self.value
 
     def one_of(self, *choices: object) -> None:
-        """Raise unless it is one of these values."""
+        """Raise unless the value is one of ``choices``."""
         if self.value not in choices or isinstance(self.value, bool):
             raise self.error(" or ".join(json.dumps(choice) for choice in choices))
 
     def _as_float(self) -> float:
-        """The number, infinity for what is none."""
+        # Infinity, which every caller rejects, if it is not a number.
         if not isinstance(self.value, (int, float)) or isinstance(self.value, bool):
             return math.inf
         try:

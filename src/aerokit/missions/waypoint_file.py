@@ -1,10 +1,8 @@
-"""``QGC WPL`` files (.waypoints, .txt), as Mission Planner, MAVProxy and QGroundControl have them.
+"""``QGC WPL`` files (.waypoints, .txt) of Mission Planner, MAVProxy and QGroundControl.
 
-https://mavlink.io/en/file_formats/#mission_plain_text_file
-
-A line for each item: index, whether it is the current one, frame, command, parameters 1 to 4, latitude (or x, or
-parameter 5), longitude, altitude, autocontinue, with tabs between them. In version 110 item 0 is home, and jumps count
-it; in version 120 there is none.
+See https://mavlink.io/en/file_formats/#mission_plain_text_file. Each line is an item, separated by tabs: index, current
+flag, frame, command, parameters 1 to 4, latitude (or x, or parameter 5), longitude, altitude, autocontinue. In version
+110 item 0 is home, and jumps count it; version 120 has no home.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit._internal.files import read_text, write_whole
+from aerokit._internal.files import read_text, write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import MissionItem, canonical_frame, xy_scale
@@ -41,30 +39,32 @@ _COLUMNS = (
 
 
 def read_waypoint_file(path: str | os.PathLike[str]) -> Mission:
-    """The mission in a file; :class:`FileFormatError` names the file, the line and what is expected there.
+    """Read a mission from a file.
 
-    Spaces will do for tabs, lines that are empty or begin with ``#`` are passed over. The home line becomes
-    ``mission.home``. Files of MAVProxy have places rounded to 1e-6 degrees.
+    Spaces are accepted instead of tabs; empty lines and lines that begin with ``#`` are skipped. The home line becomes
+    ``mission.home``. Places in MAVProxy's files are rounded to 1e-6 degrees.
+
+    Raises:
+        FileFormatError: the text names the file, the line and what was expected there.
+        OSError: the file cannot be read.
     """
     return parse_waypoints(read_text(path), Path(path).name)
 
 
 def write_waypoint_file(path: str | os.PathLike[str], mission: Mission, *, version: int = 110) -> None:
-    """Write the mission to a file; see :func:`format_waypoints`."""
-    write_whole(path, format_waypoints(mission, version=version))
+    """Write a mission to a file; see :func:`format_waypoints`."""
+    write_atomically(path, format_waypoints(mission, version=version))
 
 
 def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
-    """The mission of the text of a file; ``name`` is what errors call it."""
+    """Parse the text of a file. Errors begin with ``name``."""
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
     version = lines[0][1].split() if lines else []
     if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
         found = lines[0][1][:40] if lines else "nothing"
         raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {found!r}")
-    rows = [
-        _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(lines[1:])
-    ]
+    rows = [_Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(lines[1:])]
     home = rows[0].home() if rows and version[2] == "110" and rows[0].is_home() else None
     if home is None:
         return Mission([row.item() for row in rows])
@@ -72,9 +72,10 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
-    """The text of a file, in Mission Planner's form; more digits where those would not do.
+    """Format a mission as the text of a file, in Mission Planner's precision or more where a number needs it.
 
-    Raises :class:`InvalidArgument` for numbers that are infinite.
+    Raises:
+        InvalidArgument: a number is infinite, or the version is neither 110 nor 120.
     """
     if version not in (110, 120):
         raise InvalidArgument(f"version = {version!r} is not allowed: 110 (home is item 0) or 120 (no home)")
@@ -88,35 +89,30 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
 
 
 class _Row:
-    """One line, split into its columns."""
+    # One line, split into its columns.
 
     def __init__(self, where: str, texts: list[str], index: int) -> None:
         self.where, self.texts = where, texts
         if len(texts) != len(_COLUMNS):
             raise FileFormatError(f"{where}: expected {len(_COLUMNS)} columns, found {len(texts)}")
         if self._integer("index", 0xFFFF) != index:
-            raise FileFormatError(
-                f"{where}: index = {texts[0]}: expected {index}, lines are missing or in disorder"
-            )
+            raise FileFormatError(f"{where}: index = {texts[0]}: expected {index}; lines are missing or not in order")
         self.frame, self.command = self._integer("frame", 0xFF), self._integer("command", 0xFFFF)
         self._integer("current", 0xFF)
 
     def is_home(self) -> bool:
-        """A waypoint above the sea; Mission Planner has written command 0 there."""
+        """Return True for a waypoint above mean sea level. Mission Planner used to write command 0 for home."""
         return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
 
     def home(self) -> tuple[Position | None]:
-        """Home, None when it is 0°, 0°."""
+        # Wrapped in a tuple, because None means that home is at 0°, 0°, which is unknown.
         latitude, longitude = self._number("latitude", 90), self._number("longitude", 180)
         return (Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None,)
 
     def item(self) -> MissionItem:
-        """The item, as the file counts items."""
         in_degrees = xy_scale(self.command, self.frame) == 10_000_000
         x, y = (
-            from_degrees(
-                self._number(column, limit if in_degrees else math.inf, nan=True), self.command, self.frame
-            )
+            from_degrees(self._number(column, limit if in_degrees else math.inf, nan=True), self.command, self.frame)
             for column, limit in (("latitude", 90.0), ("longitude", 180.0))
         )
         one, two, three, four = (self._number(f"param{number}", nan=True) for number in (1, 2, 3, 4))
@@ -137,9 +133,7 @@ class _Row:
     def _integer(self, column: str, high: int) -> int:
         text = self.texts[_COLUMNS.index(column)]
         if not (text.isascii() and text.isdigit() and int(text[:9]) <= high and len(text) < 9):
-            raise FileFormatError(
-                f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}"
-            )
+            raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}")
         return int(text)
 
     def _number(self, column: str, limit: float = math.inf, *, nan: bool = False) -> float:
@@ -166,12 +160,12 @@ def _item_row(item: MissionItem, index: int) -> str:
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
-        raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot keep")
+        raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot store")
     texts = (*map(str, integers), *(_text(number, 8) for number in numbers), _text(item.z, 6))
     return "\t".join((*texts, str(int(item.autocontinue))))
 
 
 def _text(value: float, digits: int) -> str:
-    """That many digits behind the point, or as many as it takes to read the same number again."""
+    """Format with that many decimal places, or as many as are needed to read the same number back."""
     text = f"{value:.{digits}f}"
     return text if float(text) == value or math.isnan(value) else repr(float(value))

@@ -1,12 +1,15 @@
-"""Items as messages and back, and items as the vehicle counts them: ArduPilot's item 0 is home."""
+"""Conversion of items to messages and packed plans, and between the item indices of programs and vehicles."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import struct
+from typing import TYPE_CHECKING, NamedTuple
 
+from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.missions.check import MAX_ITEMS
 from aerokit.missions.item import DEFAULT_XY, DESTINATIONS, GLOBAL_FRAMES, MissionItem, has_place, xy_scale
 from aerokit.position import Position
 
@@ -23,7 +26,7 @@ def to_wire(
     mission_type: int = 0,
     current: bool = False,
 ) -> messages.MissionItemInt:
-    """The item as MISSION_ITEM_INT; check it first, a fraction in x or y cannot be sent.
+    """Convert an item to MISSION_ITEM_INT. ``x`` and ``y`` must be integers, which ``check_items`` ensures.
 
     https://mavlink.io/en/messages/common.html#MISSION_ITEM_INT
     """
@@ -55,7 +58,7 @@ def to_wire_float(
     mission_type: int = 0,
     current: bool = False,
 ) -> messages.MissionItem:
-    """The item as MISSION_ITEM, for a vehicle that cannot do better: places are rounded to about a metre.
+    """Convert an item to MISSION_ITEM, for vehicles without MISSION_ITEM_INT. Places are rounded to about a metre.
 
     https://mavlink.io/en/messages/common.html#MISSION_ITEM
     """
@@ -80,7 +83,7 @@ def to_wire_float(
 
 
 def from_wire(message: messages.MissionItemInt | messages.MissionItem) -> MissionItem:
-    """The item of a message of either form; any numbers off the air are taken as they are."""
+    """Convert a message to an item, without checks."""
     x: int | float = message.x
     y: int | float = message.y
     if isinstance(message, messages.MissionItem):
@@ -100,14 +103,14 @@ def from_wire(message: messages.MissionItemInt | messages.MissionItem) -> Missio
 
 
 def in_degrees(item: MissionItem) -> tuple[float, float]:
-    """Return x and y as the float form and files have them: degrees or metres for places, NaN for "not given"."""
+    """Return x and y as MISSION_ITEM and files have them: degrees or metres for places, NaN for "not given"."""
     scale = xy_scale(item.command, item.frame)
     x, y = (math.nan if value == DEFAULT_XY else value / scale for value in (item.x, item.y))
     return x, y
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """The inverse of :func:`in_degrees` for one number: an integer unless it has a fraction and is no place."""
+    """Convert one coordinate back; the inverse of :func:`in_degrees`. Fractions remain only if it is not a position."""
     if math.isnan(value):
         return DEFAULT_XY
     scale = xy_scale(command, frame)
@@ -117,21 +120,21 @@ def from_degrees(value: float, command: int, frame: int) -> int | float:
 
 
 def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tuple[MissionItem, ...]:
-    """Items as ArduPilot counts them: home in front (0°, 0° when it is not known), jumps one further.
+    """Add home as item 0, as ArduPilot counts items, and adjust jump targets. Unknown home is 0°, 0°.
 
-    ArduPilot puts its own home there, whatever is sent.
+    ArduPilot ignores it and uses its own home.
     """
     return (home_item(home), *shift_jumps(items, 1))
 
 
 def without_home(items: Sequence[MissionItem]) -> tuple[tuple[MissionItem, ...], Position | None]:
-    """The inverse: the items without the one in front, and home, None when that is no place."""
+    """Remove item 0 and return the remaining items, and home, which is None if item 0 has no valid place."""
     home = items[0].position if items else None
     return shift_jumps(items[1:], -1), home
 
 
 def home_item(home: Position | None) -> MissionItem:
-    """Home as a waypoint with its altitude above the sea."""
+    """Create a waypoint at home, with its altitude above mean sea level."""
     if home is None:
         return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
     x, y = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)
@@ -139,18 +142,16 @@ def home_item(home: Position | None) -> MissionItem:
 
 
 def shift_jumps(items: Iterable[MissionItem], by: int) -> tuple[MissionItem, ...]:
-    """The items with that much added to the targets of DO_JUMP, the only number of an item that counts items."""
-    return tuple(
-        item.replace(param1=item.param1 + by) if item.command == MavCmd.DO_JUMP else item for item in items
-    )
+    """Add ``by`` to the targets of DO_JUMP, the only parameter that counts items."""
+    return tuple(item.replace(param1=item.param1 + by) if item.command == MavCmd.DO_JUMP else item for item in items)
 
 
-def written_out(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
-    """The items of a mission made for ArduPilot, for another autopilot.
+def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
+    """Convert the items of a mission made for ArduPilot for another autopilot.
 
-    Commands without a place, which ArduPilot takes in any frame, come in MAV_FRAME_MISSION, the only one that PX4 takes
-    them in. 0°, 0° is "where the vehicle is" for ArduPilot: it becomes where the item before leads, at first ``here``:
-    latitude and longitude in degrees, None: not known.
+    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot understands 0°, 0°
+    as the current position: it becomes the destination of the previous item, and for the first item ``here`` (latitude
+    and longitude in degrees, None if unknown).
     """
     place = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
     for item in items:
@@ -162,3 +163,91 @@ def written_out(items: Iterable[MissionItem], here: tuple[float, float] | None) 
             elif DEFAULT_XY not in (item.x, item.y):
                 place = round(item.x), round(item.y)
         yield item
+
+
+# ----------------------------------------------------------------------------------- packed plans
+
+# ArduPilot's ``@MISSION/mission.dat``, ``fence.dat`` and ``rally.dat``: a header of ten bytes (magic number,
+# MAV_MISSION_TYPE, options, first index, number of items; 16 bits each, little endian), then 38 bytes for each item: a
+# MISSION_ITEM_INT, not truncated. Missions have home as item 0.
+MAGIC = 0x763D
+HEADER = struct.Struct("<5H")
+NO_CLEAR = 1  # option: keep existing items, and replace only those in the file
+PACKED_PATHS = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
+
+_ITEM_LENGTH = messages.MissionItemInt.LENGTH
+
+
+class PlanHeader(NamedTuple):
+    """Header of a packed plan."""
+
+    mission_type: int
+    options: int
+    first: int
+    items: int
+
+    @property
+    def length(self) -> int:
+        return HEADER.size + self.items * _ITEM_LENGTH
+
+
+def pack_items(
+    items: Sequence[MissionItem],
+    mission_type: int = 0,
+    *,
+    first: int = 0,
+    options: int = 0,
+    target_system: int = 0,
+    target_component: int = 0,
+) -> bytes:
+    """Encode items, counted as the vehicle counts them, as a packed plan.
+
+    A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` for missions only: items from index
+    ``first`` on are replaced or appended, others are kept. Jump targets must then be below the number of items in the
+    file (4.7). ArduPilot processes the file when it is closed, and clears the old mission first, so that a file refused
+    half-way leaves half a mission.
+    """
+    if len(items) + first > MAX_ITEMS:
+        raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")
+    header = HEADER.pack(MAGIC, mission_type, options, first, len(items))
+    return header + b"".join(
+        to_wire(
+            item,
+            index,
+            target_system=target_system,
+            target_component=target_component,
+            mission_type=mission_type,
+        ).encode()
+        for index, item in enumerate(items, first)
+    )
+
+
+def read_header(data: bytes) -> PlanHeader:
+    """Decode the header of a packed plan.
+
+    Raises:
+        RemoteProtocolError: the data is not a packed plan.
+    """
+    if len(data) < HEADER.size:
+        raise RemoteProtocolError(f"packed plan: expected a header of {HEADER.size} bytes, received {len(data)} bytes")
+    magic, *numbers = HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise RemoteProtocolError(f"packed plan: expected the magic number 0x{MAGIC:04X}, found 0x{magic:04X}")
+    return PlanHeader(*numbers)
+
+
+def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
+    """Decode the items of a packed plan, counted as the vehicle counts them.
+
+    Raises:
+        RemoteProtocolError: the data is no packed plan, is truncated, or has another ``mission_type``.
+    """
+    header = read_header(data)
+    if mission_type is not None and header.mission_type != mission_type:
+        raise RemoteProtocolError(f"packed plan: expected MAV_MISSION_TYPE {mission_type}, found {header.mission_type}")
+    if len(data) != header.length:
+        raise RemoteProtocolError(
+            f"packed plan: expected {header.length} bytes for {header.items} items, received {len(data)} bytes"
+        )
+    starts = range(HEADER.size, header.length, _ITEM_LENGTH)
+    return tuple(from_wire(messages.MissionItemInt.decode(data[at : at + _ITEM_LENGTH])) for at in starts)

@@ -1,6 +1,6 @@
-"""Parameters as values: tables, how they travel, the files they are kept in, what is known about them.
+"""Parameters as values: tables, encoding, files and metadata.
 
-Nothing here talks to a vehicle. ``vehicle.parameters`` does, and takes and gives these values.
+Nothing here communicates with a vehicle; ``vehicle.parameters`` does, and uses these values.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from aerokit.parameters.pack import unpack_parameters as unpack_parameters
     from aerokit.parameters.parameter import Parameter as Parameter
     from aerokit.parameters.parameter import ParameterType as ParameterType
+    from aerokit.parameters.parameter import Setting as Setting
+    from aerokit.parameters.parameter import SettingValue as SettingValue
     from aerokit.parameters.parameter import check_name as check_name
     from aerokit.parameters.parameter import checked_value as checked_value
     from aerokit.parameters.renames import ParameterRenamedWarning as ParameterRenamedWarning
@@ -39,10 +41,8 @@ if TYPE_CHECKING:
     from aerokit.parameters.renames import find_rename as find_rename
     from aerokit.parameters.renames import other_names as other_names
     from aerokit.parameters.renames import replacement_of as replacement_of
-    from aerokit.parameters.renames import to_known as to_known
+    from aerokit.parameters.renames import resolve_rename as resolve_rename
     from aerokit.parameters.renames import translate_values as translate_values
-    from aerokit.parameters.setting import Setting as Setting
-    from aerokit.parameters.setting import SettingValue as SettingValue
     from aerokit.parameters.table import ParameterDifference as ParameterDifference
     from aerokit.parameters.table import ParameterTable as ParameterTable
     from aerokit.parameters.table import ParameterValues as ParameterValues
@@ -70,7 +70,14 @@ __getattr__, __dir__, __all__ = lazy_exports(
         ),
         "aerokit.parameters.metadata": ("Metadata", "ParameterMetadata", "load_metadata", "parse_metadata"),
         "aerokit.parameters.pack": ("pack_parameters", "unpack_parameters"),
-        "aerokit.parameters.parameter": ("Parameter", "ParameterType", "check_name", "checked_value"),
+        "aerokit.parameters.parameter": (
+            "Parameter",
+            "ParameterType",
+            "Setting",
+            "SettingValue",
+            "check_name",
+            "checked_value",
+        ),
         "aerokit.parameters.renames": (
             "ParameterRenamedWarning",
             "Rename",
@@ -78,10 +85,9 @@ __getattr__, __dir__, __all__ = lazy_exports(
             "find_rename",
             "other_names",
             "replacement_of",
-            "to_known",
+            "resolve_rename",
             "translate_values",
         ),
-        "aerokit.parameters.setting": ("Setting", "SettingValue"),
         "aerokit.parameters.table": ("ParameterDifference", "ParameterTable", "ParameterValues", "diff"),
     },
 )

@@ -1,4 +1,4 @@
-"""What a camera definition file says of a camera's settings: types, ranges, options, and what excludes what.
+"""Camera definition files: types, ranges and options of a camera's settings, and their dependencies.
 
 https://mavlink.io/en/services/camera_def.html
 """
@@ -12,20 +12,20 @@ from itertools import islice
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from aerokit._internal.files import LARGEST_FILE, read_bounded, too_large, unpacked
+from aerokit._internal.files import MAX_FILE_SIZE, decompress, file_too_large, read_bounded
+from aerokit._internal.formatting import did_you_mean, short_repr
 from aerokit._internal.values import Snapshot
-from aerokit._internal.wording import did_you_mean, shown
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
 from aerokit.parameters.encoding import parse_number
-from aerokit.parameters.setting import SettingValue, checked_setting, setting_key, settings_equal
+from aerokit.parameters.parameter import SettingValue, checked_setting, setting_key, settings_equal
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-Values = Mapping[str, SettingValue]
-"""What is known of a camera's settings, by name."""
+Values = Mapping[str, SettingValue]  # the known settings of a camera, by name
 
+# Type names in files. ``string`` is not in the standard, but cameras use it.
 TYPES = {
     "bool": MavParamExtType.UINT8,
     "uint8": MavParamExtType.UINT8,
@@ -41,19 +41,18 @@ TYPES = {
     "string": MavParamExtType.CUSTOM,
     "custom": MavParamExtType.CUSTOM,
 }
-"""The file's names; ``string`` is not in the standard, but in files of cameras."""
 OPERATORS = ("!=", ">=", "<=", "=", ">", "<")
-SHOWN_OPTIONS = 20
-LONGEST_NAME = 16
-"""Characters of a setting's name on the wire."""
-LARGEST_DEFINITION, MOST_ELEMENTS = 1 << 20, 20_000
-"""Bytes and elements of a file: real ones have some 50 kB and 1,000. Reading more would hold up the event loop."""
+MAX_SHOWN_OPTIONS = 20
+MAX_NAME_LENGTH = 16
+"""Maximum number of characters of a setting's name."""
+# Real files have about 50 kB and 1,000 elements. Parsing much more would block the event loop.
+MAX_DEFINITION_SIZE, MAX_ELEMENTS = 1 << 20, 20_000
 
 
 class SettingRange(Snapshot):
-    """While an option is chosen and ``condition`` holds, ``setting`` takes nothing but these ``options``.
+    """A restriction: while the option is selected and ``condition`` holds, ``setting`` accepts only ``options``.
 
-    ``condition`` are tests of settings, such as ``CAM_EXPMODE=1``, between AND and OR; empty is always.
+    ``condition`` has tests such as ``CAM_EXPMODE=1``, joined by AND and OR. An empty one always holds.
     """
 
     setting: str
@@ -62,7 +61,7 @@ class SettingRange(Snapshot):
 
 
 class SettingOption(Snapshot):
-    """One of the values that a setting can have. While it is chosen, the settings that it ``excludes`` mean nothing."""
+    """A value that a setting can have. While it is selected, the settings in ``excludes`` have no effect."""
 
     name: str
     value: SettingValue
@@ -71,11 +70,11 @@ class SettingOption(Snapshot):
 
 
 class SettingDefinition(Snapshot):
-    """What the file says of one setting; None and empty where it says nothing.
+    """Definition of one setting; None or empty for what the file does not define.
 
-    ``type`` is the file's word (``"bool"``, ``"uint32"``, ``"float"`` …), ``wire_type`` its MAV_PARAM_EXT_TYPE.
-    ``updates`` are settings that the camera may change when this one changes. Without ``is_control`` a program should
-    show no control for it: there is a better one. ``step`` binds whole numbers; of others it is advice.
+    ``type`` is the type name in the file (``"bool"``, ``"uint32"``, ``"float"`` …), ``wire_type`` the
+    MAV_PARAM_EXT_TYPE. ``updates`` are settings that the camera may change together with this one. If ``is_control`` is
+    False, a program should not display a control for it. ``step`` is enforced for whole numbers only.
     """
 
     name: str
@@ -92,17 +91,17 @@ class SettingDefinition(Snapshot):
     read_only: bool = False
     write_only: bool = False
 
-    def typed(self, value: SettingValue) -> SettingValue:
-        """A value that the camera told: ``True`` or ``False`` where the file says that it is one of them."""
+    def convert(self, value: SettingValue) -> SettingValue:
+        """Convert a value received from the camera: to ``bool`` if the setting has that type."""
         return bool(value) if self.type == "bool" and not isinstance(value, (str, bytes)) else value
 
     def option_of(self, value: SettingValue) -> SettingOption | None:
-        """The option that stands for a value."""
-        return next((each for each in self.options if settings_equal(each.value, value)), None)
+        """Return the option with this value, or None."""
+        return next((option for option in self.options if settings_equal(option.value, value)), None)
 
 
 class CameraDefinition(Snapshot):
-    """A definition file: who made the camera, its settings by name, and texts in other languages by locale."""
+    """A camera definition file: vendor and model, settings by name, and translations by locale."""
 
     vendor: str
     model: str
@@ -117,9 +116,9 @@ class CameraDefinition(Snapshot):
         return f"<CameraDefinition of {self.vendor} {self.model}: {len(self.settings)} settings>"
 
     def localized(self, locale: str) -> CameraDefinition:
-        """The same with descriptions and names of options in another language, ``"de_DE"`` or ``"de"``.
+        """Return a copy with translated descriptions and option names, for example in ``"de_DE"`` or ``"de"``.
 
-        What is not translated stays as it is; all of it when the file does not have the language.
+        Texts without a translation are unchanged.
         """
         found = self.translations.get(locale)
         if found is None:
@@ -128,56 +127,56 @@ class CameraDefinition(Snapshot):
             found = self.translations.get(next(alike, ""))
         if not found:
             return self
-        settings = {name: _translated(each, found) for name, each in self.settings.items()}
+        settings = {name: _translated(setting, found) for name, setting in self.settings.items()}
         return self.replace(settings=MappingProxyType(settings))
 
-    # ------------------------------------------------------------------------------ what excludes what
+    # ---------------------------------------------------------------------------------- dependencies
 
-    def rulers(self, name: str) -> tuple[str, ...]:
-        """The settings whose values decide what another one can be now."""
+    def dependencies(self, name: str) -> tuple[str, ...]:
+        """Return the settings whose values restrict or exclude this one."""
         found: dict[str, None] = {}
-        for ruler in self.settings.values():
-            for option in ruler.options:
+        for setting in self.settings.values():
+            for option in setting.options:
                 if name in option.excludes:
-                    found[ruler.name] = None
-                for each in option.ranges:
-                    if each.setting == name:
-                        found[ruler.name] = None
-                        found.update(
-                            (test[0], None) for test in _tests(each.condition) if test[0] in self.settings
-                        )
-        return tuple(each for each in found if each != name)
+                    found[setting.name] = None
+                for restriction in option.ranges:
+                    if restriction.setting == name:
+                        found[setting.name] = None
+                        tests = _tests(restriction.condition)
+                        found.update((test[0], None) for test in tests if test[0] in self.settings)
+        return tuple(other for other in found if other != name)
 
     def excluded_by(self, name: str, values: Values) -> tuple[str, ...]:
-        """What makes a setting mean nothing now, as texts: ``CAM_EXPMODE = Auto``; empty when nothing does."""
+        """Return the selections that exclude a setting now, as texts such as ``CAM_EXPMODE = Auto``."""
         return tuple(
-            f"{ruler.name} = {option.name}"
-            for ruler, option in self._chosen(values)
-            if name in option.excludes and ruler.name != name
+            f"{other.name} = {option.name}"
+            for other, option in self._selected(values)
+            if name in option.excludes and other.name != name
         )
 
     def options(self, name: str, values: Values) -> tuple[SettingOption, ...]:
-        """The options that a setting has now; empty when any value in its range may be set."""
+        """Return the options that a setting has now; empty if any value in its range is allowed."""
         return self._options(name, values)[0]
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """The same, and what restricts them."""
+        """Return the options, and the selections that restrict them."""
         own = self.settings.get(name)
         options = () if own is None else own.options
         reasons: list[str] = []
-        left: frozenset[object] = frozenset()
-        for ruler, option in self._chosen(values):
-            for each in option.ranges:
-                if each.setting == name and ruler.name != name and _holds(each.condition, values):
-                    allowed = each.options
-                    if reasons:  # each of several has its say
-                        allowed = tuple(one for one in allowed if setting_key(one.value) in left)
-                    options, left = allowed, frozenset(setting_key(one.value) for one in allowed)
-                    reasons.append(f"{ruler.name} = {option.name}")
+        keys: frozenset[object] = frozenset()
+        for other, selected in self._selected(values):
+            for restriction in selected.ranges:
+                is_about_it = restriction.setting == name and other.name != name
+                if is_about_it and _evaluate(restriction.condition, values):
+                    allowed = restriction.options
+                    if reasons:  # several restrictions apply together
+                        allowed = tuple(option for option in allowed if setting_key(option.value) in keys)
+                    options, keys = allowed, frozenset(setting_key(option.value) for option in allowed)
+                    reasons.append(f"{other.name} = {selected.name}")
         return options, reasons
 
-    def _chosen(self, values: Values) -> Iterator[tuple[SettingDefinition, SettingOption]]:
-        """Each setting whose value is known with the option that it has."""
+    def _selected(self, values: Values) -> Iterator[tuple[SettingDefinition, SettingOption]]:
+        """Yield each setting with a known value, and its current option."""
         for name, definition in self.settings.items():
             option = definition.option_of(values[name]) if name in values else None
             if option is not None:
@@ -186,108 +185,105 @@ class CameraDefinition(Snapshot):
     # ----------------------------------------------------------------------------------------- checks
 
     def checked(self, name: str, value: object, values: Values) -> SettingValue:
-        """The value that is to be sent for a value, or for the name of an option, while the others are as told.
+        """Check a value, or the name of an option, given the other settings, and return the value to send.
 
-        Raises :class:`InvalidArgument` where the setting can only be read, is excluded now, or does not take it.
+        Raises:
+            InvalidArgument: the setting is read-only, excluded now, or does not accept the value.
         """
         own = self.settings[name]
         if own.read_only:
-            raise InvalidArgument(f"{name} = {shown(value)} is not allowed: it can only be read")
+            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it can only be read")
         reasons = self.excluded_by(name, values)
         if reasons:
-            raise InvalidArgument(
-                f"{name} = {shown(value)} is not allowed now: excluded by {', '.join(reasons)}"
-            )
+            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed now: excluded by {', '.join(reasons)}")
         options, restricted_by = self._options(name, values)
         if options or restricted_by:
-            return _among(own, value, options, restricted_by)
-        return _in_range(own, value)
+            return _check_option(own, value, options, restricted_by)
+        return _check_range(own, value)
 
 
 def load_definition(path: str | os.PathLike[str]) -> CameraDefinition:
-    """Read a definition file of a camera, compressed (``.xz``) or not.
+    """Read a camera definition file, compressed (``.xz``) or not.
 
-    Raises :class:`FileFormatError` when it is none, or has more than 1 MB (unpacked, too) or 20,000 elements, OSError
-    when it cannot be read. Of a setting that stands there twice the first counts; numbers and conditions that are none
-    are left out.
+    If a setting is defined twice, the first definition counts. Invalid numbers and conditions are ignored.
+
+    Raises:
+        FileFormatError: it is not a definition file, or has more than 1 MB (decompressed) or 20,000 elements.
+        OSError: it cannot be read.
     """
     return parse_definition(read_bounded(path), os.fspath(path))
 
 
 def parse_definition(data: bytes, source: str = "camera definition") -> CameraDefinition:
-    """The same of bytes; ``source`` is their name in errors."""
+    """Parse the content of a camera definition file. Errors begin with ``source``."""
     from xml.etree.ElementTree import ParseError
 
     from defusedxml import ElementTree as DefusedXml
 
     try:
-        if len(data) > LARGEST_FILE:
-            raise too_large(source)
-        content = unpacked(data, source)
-        if len(content) > LARGEST_DEFINITION:
-            raise FileFormatError(
-                f"{source} has more than {LARGEST_DEFINITION >> 10} kB: that is no camera definition"
-            )
+        if len(data) > MAX_FILE_SIZE:
+            raise file_too_large(source)
+        content = decompress(data, source)
+        if len(content) > MAX_DEFINITION_SIZE:
+            raise FileFormatError(f"{source} is too large: more than {MAX_DEFINITION_SIZE >> 10} kB")
         root = DefusedXml.fromstring(content, forbid_dtd=True)
     except FileFormatError:
         raise
     except (ParseError, LookupError, ValueError) as error:
-        raise FileFormatError(f"{source} is no camera definition: {error!r}") from None
+        raise FileFormatError(f"{source} is not a camera definition: {error!r}") from None
     if root.tag != "mavlinkcamera":
-        raise FileFormatError(
-            f"{source} is no camera definition: its outermost element is <{root.tag[:100]}>"
-        )
-    if next(islice(root.iter(), MOST_ELEMENTS, None), None) is not None:
-        raise FileFormatError(
-            f"{source} has more than {MOST_ELEMENTS} elements: that is no camera definition"
-        )
+        raise FileFormatError(f"{source} is not a camera definition: its root element is <{root.tag[:100]}>")
+    if next(islice(root.iter(), MAX_ELEMENTS, None), None) is not None:
+        raise FileFormatError(f"{source} is too large: more than {MAX_ELEMENTS} elements")
     found = _Reader(root).definition()
     if not found.settings:
-        raise FileFormatError(f"{source} describes no settings")
+        raise FileFormatError(f"{source} defines no settings")
     return found
 
 
 # ------------------------------------------------------------------------------------------ values
 
 
-def _among(
+def _check_option(
     own: SettingDefinition, value: object, options: tuple[SettingOption, ...], restricted_by: list[str]
 ) -> SettingValue:
-    by_name = {each.name: each.value for each in options}
+    by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
     if not isinstance(value, str) or own.wire_type == MavParamExtType.CUSTOM:
         wanted = checked_setting(own.name, value, own.wire_type)
-        for each in options:
-            if settings_equal(each.value, wanted):
-                return each.value
+        for option in options:
+            if settings_equal(option.value, wanted):
+                return option.value
     now = f" while {', '.join(restricted_by)}" if restricted_by else ""
-    names = ", ".join(f"{name!r} ({shown(known)})" for name, known in list(by_name.items())[:SHOWN_OPTIONS])
-    more = f" and {len(by_name) - SHOWN_OPTIONS} more" if len(by_name) > SHOWN_OPTIONS else ""
+    shown = list(by_name.items())[:MAX_SHOWN_OPTIONS]
+    names = ", ".join(f"{name!r} ({short_repr(known)})" for name, known in shown)
+    more = f" and {len(by_name) - MAX_SHOWN_OPTIONS} more" if len(by_name) > MAX_SHOWN_OPTIONS else ""
     raise InvalidArgument(
-        f"{own.name} = {shown(value)} is not allowed{now}: {names or 'nothing'}{more}{did_you_mean(value, by_name)}"
+        f"{own.name} = {short_repr(value)} is not allowed{now}: {names or 'nothing'}{more}"
+        + did_you_mean(value, by_name)
     )
 
 
-def _in_range(own: SettingDefinition, value: object) -> SettingValue:
+def _check_range(own: SettingDefinition, value: object) -> SettingValue:
     number = checked_setting(own.name, value, own.wire_type)
     if isinstance(number, (str, bytes)):
         return number
     if own.type == "bool":
         if number not in (0, 1):
-            raise InvalidArgument(f"{own.name} = {shown(value)} is not allowed: True or False")
+            raise InvalidArgument(f"{own.name} = {short_repr(value)} is not allowed: True or False")
         return bool(number)
     low, high, step = own.minimum, own.maximum, own.step
     is_below = low is not None and number < low and not settings_equal(number, low)
     is_above = high is not None and number > high and not settings_equal(number, high)
     if is_below or is_above:
         bounds = f"{'' if low is None else f'{low:g}'}..{'' if high is None else f'{high:g}'}"
-        raise InvalidArgument(f"{own.name} = {shown(value)} is not allowed: {bounds}")
+        raise InvalidArgument(f"{own.name} = {short_repr(value)} is not allowed: {bounds}")
     if isinstance(number, int) and isinstance(step, int) and step > 1:
         first = low if isinstance(low, int) else 0
         if (number - first) % step:
             raise InvalidArgument(
-                f"{own.name} = {shown(value)} is not allowed: {first}, {first + step}, {first + 2 * step} …"
+                f"{own.name} = {short_repr(value)} is not allowed: {first}, {first + step}, {first + 2 * step} …"
             )
     return number
 
@@ -296,7 +292,7 @@ def _in_range(own: SettingDefinition, value: object) -> SettingValue:
 
 
 def _tests(condition: str) -> list[tuple[str, str, str, str]]:
-    """Setting, operator, value, and whether it has to hold AND the tests before, or OR; ValueError when it is none."""
+    """Parse into (setting, operator, value, "AND" or "OR" with the tests before); ValueError if it is malformed."""
     tests = []
     joiner, words = "AND", list[str]()
     for word in (*condition.split(), "AND") if condition else ():
@@ -304,25 +300,25 @@ def _tests(condition: str) -> list[tuple[str, str, str, str]]:
             words.append(word)
             continue
         text = "".join(words)
-        operator = next((each for each in OPERATORS if each in text), None)
+        operator = next((candidate for candidate in OPERATORS if candidate in text), None)
         if operator is None:
-            raise ValueError(f"{condition!r} is no condition")
+            raise ValueError(f"{condition!r} is not a condition")
         name, _, value = text.partition(operator)
         tests.append((name, operator, value, joiner))
         joiner, words = word, []
     return tests
 
 
-def _holds(condition: str, values: Values) -> bool:
-    """From left to right; a test of a setting that is not known does not hold."""
+def _evaluate(condition: str, values: Values) -> bool:
+    """Evaluate from left to right. A test of an unknown setting is False."""
     result = True
     for name, operator, value, joiner in _tests(condition):
-        holds = name in values and _is_so(values[name], operator, value)
-        result = (result and holds) if joiner == "AND" else (result or holds)
+        is_true = name in values and _compare(values[name], operator, value)
+        result = (result and is_true) if joiner == "AND" else (result or is_true)
     return result
 
 
-def _is_so(value: SettingValue, operator: str, text: str) -> bool:
+def _compare(value: SettingValue, operator: str, text: str) -> bool:
     if isinstance(value, (str, bytes)):
         return settings_equal(value, text) == (operator == "=") if operator in ("=", "!=") else False
     wanted = _number(text)
@@ -339,7 +335,7 @@ def _is_so(value: SettingValue, operator: str, text: str) -> bool:
 
 
 class _Reader:
-    """What stands in the elements; what makes no sense is left out."""
+    """Reads the elements of a definition file, ignoring invalid ones."""
 
     def __init__(self, root: Element) -> None:
         self._root = root
@@ -347,7 +343,6 @@ class _Reader:
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:
-        """All of it."""
         root, head = self._root, self._root.find("definition")
         settings: dict[str, SettingDefinition] = {}
         for node in root.iterfind("parameters/parameter"):
@@ -357,15 +352,12 @@ class _Reader:
         return CameraDefinition(
             vendor=_text(None if head is None else head.find("vendor")),
             model=_text(None if head is None else head.find("model")),
-            version=_whole("" if head is None else head.get("version", "")),
+            version=_int_or_zero("" if head is None else head.get("version", "")),
             settings=MappingProxyType(settings),
             translations=MappingProxyType(
                 {
                     node.get("name", ""): MappingProxyType(
-                        {
-                            each.get("original", ""): each.get("translated", "")
-                            for each in node.iterfind("strings")
-                        }
+                        {text.get("original", ""): text.get("translated", "") for text in node.iterfind("strings")}
                     )
                     for node in root.iterfind("localization/locale")
                 }
@@ -411,13 +403,13 @@ class _Reader:
             wire_type = self._types.get(setting)
             condition = " ".join(node.get("condition", "").split())
             try:
-                _holds(condition, {})
+                _evaluate(condition, {})
             except ValueError:
                 continue
             if wire_type is not None:
                 found = (
-                    (each.get("name", ""), _value(each.get("value"), wire_type))
-                    for each in node.iterfind("roption")
+                    (option.get("name", ""), _value(option.get("value"), wire_type))
+                    for option in node.iterfind("roption")
                 )
                 options = tuple(SettingOption(name, value) for name, value in found if value is not None)
                 yield SettingRange(setting, condition, options)
@@ -432,19 +424,18 @@ def _texts(nodes: Iterable[Element]) -> Iterator[str]:
 
 
 def _is_name(name: str) -> bool:
-    """Whether a setting can be called so on the wire."""
-    return name.isascii() and name.isprintable() and 0 < len(name) <= LONGEST_NAME
+    return name.isascii() and name.isprintable() and 0 < len(name) <= MAX_NAME_LENGTH
 
 
 def _number(text: str | None) -> int | float | None:
     try:
         number = None if text is None else parse_number(text.strip())
         return None if number is None or not math.isfinite(number) else number
-    except (ValueError, OverflowError):  # of more digits than a float holds, too
+    except (ValueError, OverflowError):  # also for more digits than a float can hold
         return None
 
 
-def _whole(text: str) -> int:
+def _int_or_zero(text: str) -> int:
     number = _number(text)
     return number if isinstance(number, int) else 0
 
@@ -459,7 +450,7 @@ def _value(text: str | None, wire_type: int) -> SettingValue | None:
 
 def _translated(setting: SettingDefinition, texts: Mapping[str, str]) -> SettingDefinition:
     def translated(option: SettingOption) -> SettingOption:
-        ranges = tuple(each.replace(options=tuple(map(translated, each.options))) for each in option.ranges)
+        ranges = tuple(limit.replace(options=tuple(map(translated, limit.options))) for limit in option.ranges)
         return option.replace(name=texts.get(option.name, option.name), ranges=ranges)
 
     return setting.replace(

@@ -1,8 +1,8 @@
-"""How a value travels in the 32-bit float of PARAM_VALUE and PARAM_SET.
+"""Encoding of parameter values in the 32-bit float of PARAM_VALUE and PARAM_SET.
 
-ArduPilot casts: 5 becomes 5.0, so an INT32 beyond 2**24 loses its last bits. PX4 puts the bytes of the integer there
-(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). Those of -5,000,000 and others are signalling NaNs, which change a bit
-on their way through a Python float: :func:`parameter_of`, :func:`set_message` and :func:`value_message` keep it.
+ArduPilot casts: 5 becomes 5.0, so an INT32 beyond 2**24 loses its last bits. PX4 copies the bytes of the integer
+(MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE). The bytes of some integers, such as -5,000,000, are signalling NaNs, in
+which a Python float changes one bit. :func:`parameter_of`, :func:`set_message` and :func:`value_message` preserve it.
 
 https://mavlink.io/en/services/parameter.html#parameter-encoding
 """
@@ -19,8 +19,8 @@ from aerokit.mavlink.frame import HEADER_LENGTH
 from aerokit.mavlink.messages import ParamSet, ParamValue
 from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 
+# The ``param_index`` of a PARAM_VALUE outside the list, which ArduPilot and PX4 send after PARAM_SET.
 UNKNOWN_INDEX = 0xFFFF
-"""``param_index`` of a PARAM_VALUE that is not part of the list: ArduPilot and PX4 send it after PARAM_SET."""
 
 _FLOAT = Struct("<f")
 
@@ -37,7 +37,7 @@ _M = TypeVar("_M", ParamSet, ParamValue)
 
 
 def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa: A002
-    """The four bytes of ``param_value``. The value is one that :func:`checked_value` has let through."""
+    """Encode a value, which :func:`checked_value` has accepted, as the four bytes of ``param_value``."""
     if not bytewise or type is ParameterType.REAL32:
         return _FLOAT.pack(value)
     if type not in _FORMATS:
@@ -46,9 +46,9 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
 
 
 def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """The value of the four bytes of ``param_value``; an int for integer types.
+    """Decode the four bytes of ``param_value``; an int for integer types.
 
-    Never raises: a fraction or NaN that a vehicle sent for an integer is returned as it is.
+    Never raises: if a vehicle sends a fraction or NaN for an integer type, that float is returned.
     """
     if bytewise and type in _FORMATS:
         return int(_FORMATS[type].unpack_from(bits)[0])
@@ -56,19 +56,19 @@ def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float: 
 
 
 def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
-    """``param_value`` for a value; signalling NaNs change, see above."""
+    """Encode a value as ``param_value``. Signalling NaNs change, see above."""
     return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
 
 
 def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """The value of a ``param_value``; signalling NaNs have changed, see above."""
+    """Decode a ``param_value``. Signalling NaNs have changed, see above."""
     if bytewise and type in _FORMATS:
         return from_bits(_FLOAT.pack(param_value), type, bytewise)
     return _cast(param_value, type)
 
 
 def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
-    """The value in a message, exact to the bit when it came off the wire."""
+    """Return the value in a message, exact to the bit if it was received."""
     type_ = ParameterType.from_wire(message.param_type)
     if message.param_value == message.param_value or not bytewise:
         return from_wire(message.param_value, type_, bytewise)
@@ -76,7 +76,7 @@ def value_of(message: ParamSet | ParamValue, bytewise: bool) -> int | float:
 
 
 def parameter_of(message: ParamValue, bytewise: bool) -> Parameter:
-    """What a PARAM_VALUE tells; no default, and no index when it is not part of the list."""
+    """Convert a PARAM_VALUE. It has no default, and no index outside the list."""
     index = None if message.param_index == UNKNOWN_INDEX else message.param_index
     type_ = ParameterType.from_wire(message.param_type)
     return Parameter(message.param_id, value_of(message, bytewise), type_, None, index)
@@ -90,14 +90,14 @@ def set_message(
     type: ParameterType,  # noqa: A002
     bytewise: bool,
 ) -> ParamSet:
-    """PARAM_SET for a checked name and value."""
+    """Create a PARAM_SET for a checked name and value."""
     bits = to_bits(value, type, bytewise)
     message = ParamSet(target_system, target_component, name, _FLOAT.unpack(bits)[0], int(type))
     return _exact(message, _ExactParamSet, bits)
 
 
 def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValue:
-    """PARAM_VALUE, as a vehicle with ``count`` parameters sends it."""
+    """Create the PARAM_VALUE that a vehicle with ``count`` parameters sends."""
     bits = to_bits(parameter.value, parameter.type, bytewise)
     index = UNKNOWN_INDEX if parameter.index is None else parameter.index
     message = ParamValue(parameter.name, _FLOAT.unpack(bits)[0], int(parameter.type), count, index)
@@ -106,7 +106,7 @@ def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValu
 
 # ------------------------------------------------------------------------------------------ bits
 class _ExactParamSet(ParamSet):
-    """One whose ``param_value`` is a signalling NaN, which no Python float can carry."""
+    """A PARAM_SET whose ``param_value`` is a signalling NaN, which a Python float cannot hold."""
 
     bits: bytes
 
@@ -122,7 +122,7 @@ class _ExactParamValue(ParamValue):
 
 
 def _exact(message: _M, kind: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
-    """The same message, of a kind that keeps the bits when its own float does not."""
+    """Return the message, or a copy of a class that keeps the bits if a float cannot."""
     if _FLOAT.pack(message.param_value) == bits:
         return message
     exact = kind(**message.to_dict())
@@ -131,7 +131,7 @@ def _exact(message: _M, kind: type[_ExactParamSet] | type[_ExactParamValue], bit
 
 
 def _exact_bits(message: ParamSet | ParamValue) -> bytes:
-    """The first four bytes of the payload: the value comes first in both messages."""
+    # The value is the first field in both messages.
     if isinstance(message, (_ExactParamSet, _ExactParamValue)):
         return message.bits
     if message.received_frame is None:
@@ -152,9 +152,11 @@ _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def number_text(value: float) -> str:
-    """``0.1`` for the 32-bit number nearest to 0.1, ``3`` for 3.0; all digits of an int.
+    """Format with the fewest digits: ``0.1`` for the 32-bit float nearest to 0.1, ``3`` for 3.0; all digits of an int.
 
-    Raises OverflowError beyond 32-bit numbers, and ValueError for NaN.
+    Raises:
+        OverflowError: the number exceeds a 32-bit float.
+        ValueError: it is NaN.
     """
     if isinstance(value, int):
         return str(int(value))
@@ -166,7 +168,7 @@ def number_text(value: float) -> str:
 
 
 def parse_number(text: str) -> int | float:
-    """An int or a float; ValueError for anything else, NaN and infinities included."""
+    """Parse an int or a float. ValueError for anything else, including NaN and infinities."""
     if _INTEGER.fullmatch(text):
         return int(text)
     if _HEXADECIMAL.fullmatch(text):

@@ -1,9 +1,9 @@
-"""Parameter files of Mission Planner, MAVProxy and QGroundControl: read, told apart, written.
+"""Parameter files of Mission Planner, MAVProxy and QGroundControl.
 
-Mission Planner has ``NAME,VALUE`` lines, MAVProxy ``NAME    VALUE``, both with ``#`` comments and no types.
-QGroundControl has five columns with tabs between them: system, component, name, value, MAV_PARAM_TYPE
-(https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file that is not whole in
-every line is refused: half a set of parameters is worse than none.
+Mission Planner has lines with ``NAME,VALUE``, MAVProxy with ``NAME    VALUE``, both with ``#`` comments and without
+types. QGroundControl has five columns separated by tabs: system, component, name, value, MAV_PARAM_TYPE
+(https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html). A file with any damaged line is
+refused, because half a set of parameters is worse than none.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal
 
-from aerokit._internal.files import read_bounded, write_whole
+from aerokit._internal.files import read_bounded, write_atomically
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters.encoding import number_text, parse_number
 from aerokit.parameters.parameter import Parameter, ParameterType, check_name, checked_value
 from aerokit.parameters.table import ParameterTable, ParameterValues, plain_values
 
 FileFormat = Literal["missionplanner", "mavproxy", "qgroundcontrol"]
-"""Whose file it is."""
+"""The program that defines the format."""
 
 _AUTOPILOT = 1
 _COLUMNS = "system id, component id, name, value and type with tabs between them"
 
 
 class ParameterFile(Mapping[str, "int | float"]):
-    """What a parameter file says: name → value, and what else there is.
+    """Content of a parameter file: maps names to values.
 
-    A value is an int when it is written like one. ``types`` are those that the file tells (QGroundControl's do),
-    ``comments`` the texts behind ``#`` on lines of their own, ``component_id`` whose parameters they are.
+    A value is an int if it is written like one. ``types`` are those in the file (QGroundControl only), ``comments`` the
+    lines that begin with ``#``, and ``component_id`` the component that has these parameters.
     """
 
     def __init__(
@@ -60,28 +60,29 @@ class ParameterFile(Mapping[str, "int | float"]):
         return f"<ParameterFile: {len(self)} parameters ({self.format})>"
 
     def table(self) -> ParameterTable:
-        """As a table; what the file tells no type of becomes REAL32."""
+        """Convert to a table. Parameters without a type become REAL32."""
         return ParameterTable.from_values(self._values, self.types)
 
 
 def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | None = None) -> ParameterFile:
-    """Read a file of any of the three formats; which one is seen from its first parameter.
+    """Read a file in any of the three formats; the first parameter determines which.
 
-    Of a QGroundControl file with several components ``component_id`` chooses one; the autopilot's (1) otherwise. Raises
-    :class:`FileFormatError` naming the line for a damaged one, a name twice, NaN, a name over 16 characters, and for
-    more than 16 MB; OSError when the file cannot be read.
+    If a QGroundControl file has several components, ``component_id`` selects one, by default the autopilot (1).
+
+    Raises:
+        FileFormatError: a line is damaged, a name appears twice or has more than 16 characters, a value is NaN, or the
+            file has more than 16 MB. The text names the line.
+        OSError: the file cannot be read.
     """
     try:
         text = read_bounded(path).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise FileFormatError(f"{os.fspath(path)} is no parameter file: it is no text (UTF-8)") from None
+        raise FileFormatError(f"{os.fspath(path)} is not a parameter file: it is not text (UTF-8)") from None
     return parse_parameter_file(text, os.fspath(path), component_id=component_id)
 
 
-def parse_parameter_file(
-    text: str, source: str = "parameters", *, component_id: int | None = None
-) -> ParameterFile:
-    """The same of a text; ``source`` is its name in errors."""
+def parse_parameter_file(text: str, source: str = "parameters", *, component_id: int | None = None) -> ParameterFile:
+    """Parse the text of a file. Errors begin with ``source``."""
     comments: list[str] = []
     lines: list[tuple[str, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -91,7 +92,7 @@ def parse_parameter_file(
         elif mark:
             comments.append(comment.strip())
     if not lines:
-        raise FileFormatError(f"{source} has no parameters in it")
+        raise FileFormatError(f"{source} contains no parameters")
     if "\t" in lines[0][1] and len(lines[0][1].split()) > 2:
         return _parse_qgroundcontrol(lines, comments, source, component_id)
     return _parse_names_and_values(lines, comments)
@@ -106,15 +107,16 @@ def write_parameter_file(
     system_id: int = 1,
     component_id: int = _AUTOPILOT,
 ) -> None:
-    """Write a table, the values of another file, or a dict, sorted by name, with the digits that 32-bit numbers have.
+    """Write parameters to a file, sorted by name, with the digits that a 32-bit float needs. Atomic.
 
-    The file appears whole or not at all. Raises :class:`InvalidArgument` for names and values that cannot be sent,
-    before anything is written. ``system_id`` and ``component_id`` stand in QGroundControl's format only.
+    ``system_id`` and ``component_id`` are only used in QGroundControl's format.
+
+    Raises:
+        InvalidArgument: a name or value cannot be sent; nothing was written.
+        OSError: the file cannot be written.
     """
-    text = parameter_file_text(
-        values, format, comments=comments, system_id=system_id, component_id=component_id
-    )
-    write_whole(path, text)
+    text = parameter_file_text(values, format, comments=comments, system_id=system_id, component_id=component_id)
+    write_atomically(path, text)
 
 
 def parameter_file_text(
@@ -125,9 +127,9 @@ def parameter_file_text(
     system_id: int = 1,
     component_id: int = _AUTOPILOT,
 ) -> str:
-    """What :func:`write_parameter_file` writes."""
+    """Format parameters as the text of a file; see :func:`write_parameter_file`."""
     if format not in ("missionplanner", "mavproxy", "qgroundcontrol"):
-        raise InvalidArgument(f"format = {format!r} must be missionplanner, mavproxy or qgroundcontrol")
+        raise InvalidArgument(f"format = {format!r} is not allowed: missionplanner, mavproxy or qgroundcontrol")
     rows = sorted(_rows(values), key=lambda row: row[0])
     if not rows:
         raise InvalidArgument("there are no parameters to write")
@@ -149,7 +151,7 @@ def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -
     for place, line in lines:
         fields = line.replace(",", " ").split()
         if len(fields) != 2:
-            raise FileFormatError(f"{place}: {line.strip()!r} is no NAME,VALUE or NAME VALUE{_hint(fields)}")
+            raise FileFormatError(f"{place}: {line.strip()!r} is not NAME,VALUE or NAME VALUE{_hint(fields)}")
         _put(values, place, fields[0], fields[1], ParameterType.REAL32)
     is_planner = "," in lines[0][1]
     return ParameterFile(values, format="missionplanner" if is_planner else "mavproxy", comments=comments)
@@ -181,38 +183,38 @@ def _columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
         raise FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
     kind = int(numbers[2])
     if not 1 <= kind <= 10:
-        raise FileFormatError(f"{place}: type {kind} is no MAV_PARAM_TYPE (1 to 10)")
+        raise FileFormatError(f"{place}: type {kind} is not a MAV_PARAM_TYPE (1 to 10)")
     return int(numbers[1]), fields[2].strip(), fields[3].strip(), ParameterType(kind)
 
 
-def _component(asked: int | None, values: Mapping[int, object], source: str) -> int:
-    if asked is not None and asked in values:
-        return asked
-    if asked is None and (_AUTOPILOT in values or len(values) == 1):
+def _component(requested: int | None, values: Mapping[int, object], source: str) -> int:
+    if requested is not None and requested in values:
+        return requested
+    if requested is None and (_AUTOPILOT in values or len(values) == 1):
         return _AUTOPILOT if _AUTOPILOT in values else next(iter(values))
-    there = ", ".join(str(component) for component in sorted(values))
-    wanted = "which component is meant" if asked is None else f"nothing of component {asked}"
-    raise FileFormatError(f"{source} does not say {wanted}: it has the components {there}")
+    present = ", ".join(str(component) for component in sorted(values))
+    if requested is None:
+        raise FileFormatError(f"{source} has several components: {present}; select one with component_id")
+    raise FileFormatError(f"{source} has no parameters of component {requested}, only of: {present}")
 
 
 def _put(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
-    """Check a name and a value as for sending, and keep the value as it is written."""
     try:
         number = parse_number(text)
     except ValueError:
-        raise FileFormatError(f"{place}: {name} = {text!r} is no finite number") from None
+        raise FileFormatError(f"{place}: {name} = {text!r} is not a finite number") from None
     try:
         checked = checked_value(check_name(name), number, kind)
     except InvalidArgument as error:
         raise FileFormatError(f"{place}: {error}") from None
     if name in values:
-        raise FileFormatError(f"{place}: {name} stands in the file a second time")
+        raise FileFormatError(f"{place}: {name} appears a second time")
     values[name] = checked if kind.is_integer else number
 
 
 def _hint(fields: list[str]) -> str:
     if any(field.startswith("@") for field in (*fields[:1], *fields[2:])):
-        return " (@include and @READONLY of ArduPilot's files of defaults are not understood)"
+        return " (@include and @READONLY in ArduPilot's default files are not supported)"
     return ""
 
 
@@ -220,7 +222,7 @@ def _hint(fields: list[str]) -> str:
 
 
 def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
-    """Name, text of the value, type; all of it checked."""
+    """Yield name, formatted value and type, all checked."""
     types = values.types if isinstance(values, ParameterFile) else {}
     numbers = plain_values(values)
     for name, number in numbers.items():
@@ -231,9 +233,8 @@ def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
 
 
 def _writable(name: str) -> str:
-    """A name that its line can be read back with."""
     if any(character in check_name(name) for character in "#,"):
-        raise InvalidArgument(f"parameter name = {name!r} cannot stand in a file: it has a # or a comma")
+        raise InvalidArgument(f"parameter name = {name!r} cannot be written to a file: it has a # or a comma")
     return name
 
 

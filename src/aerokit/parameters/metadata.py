@@ -1,6 +1,6 @@
-"""What is known about parameters beside their values: descriptions, units, ranges, names of values and of bits.
+"""Parameter metadata: descriptions, units, ranges, names of values and bits.
 
-Vehicles tell little of it; it comes in files, and :func:`load_metadata` reads those of both autopilots:
+Vehicles send little of it. :func:`load_metadata` reads the files of both autopilots:
 
 - ArduPilot: ``apm.pdef.xml`` or ``apm.pdef.json`` from ``https://autotest.ardupilot.org/Parameters/ArduCopter/``
   (``ArduPlane``, ``Rover``, ``ArduSub``, ``AntennaTracker``, ``Blimp``); of each release from
@@ -11,8 +11,8 @@ Vehicles tell little of it; it comes in files, and :func:`load_metadata` reads t
 
 https://mavlink.io/en/services/component_information.html
 
-They are told apart by their first character and their outermost names. Numbers that are none are left out, as
-generators write "0 10" and "-1,1" by hand; a file of another kind raises ValueError, SyntaxError or KeyError.
+The format is detected by the first character and the outermost names. Invalid numbers are ignored, because generators
+copy hand-written ranges such as "0 10" and "-1,1".
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from defusedxml import ElementTree as DefusedXml
 
-from aerokit._internal.files import read_bounded, unpacked
+from aerokit._internal.files import decompress, read_bounded
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.parameters.encoding import parse_number
@@ -35,16 +35,16 @@ from aerokit.parameters.encoding import parse_number
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-_NOTHING: Mapping[float, str] = MappingProxyType({})
+_NO_VALUES: Mapping[float, str] = MappingProxyType({})
 
 _NO_BITS: Mapping[int, str] = MappingProxyType({})
 
 
 class ParameterMetadata(Snapshot):
-    """What is known about one parameter; None and empty where the file says nothing.
+    """Metadata of one parameter; None or empty for what the file does not define.
 
-    ``values`` names single values, ``bitmask`` bits (by number, from 0). ``minimum`` and ``maximum`` are what its
-    authors recommend; vehicles take other values, too. A ``volatile`` one is changed by the vehicle itself.
+    ``values`` names single values, ``bitmask`` bits (numbered from 0). ``minimum`` and ``maximum`` are recommendations;
+    vehicles also accept other values. A ``volatile`` parameter is changed by the vehicle itself.
     """
 
     name: str
@@ -55,7 +55,7 @@ class ParameterMetadata(Snapshot):
     maximum: float | None = None
     increment: float | None = None
     default: float | None = None
-    values: Mapping[float, str] = _NOTHING
+    values: Mapping[float, str] = _NO_VALUES
     bitmask: Mapping[int, str] = _NO_BITS
     reboot_required: bool = False
     decimal_places: int | None = None
@@ -65,7 +65,7 @@ class ParameterMetadata(Snapshot):
     volatile: bool = False
 
     def describe(self, value: float) -> str:
-        """A value in words: its name, the names of its bits, or the number with its unit."""
+        """Describe a value: by its name, the names of its bits, or as a number with unit."""
         if value in self.values:
             return self.values[value]
         if self.bitmask and 0 <= value < math.inf and value == int(value):
@@ -73,8 +73,8 @@ class ParameterMetadata(Snapshot):
             return ", ".join(self.bitmask.get(bit, f"bit {bit}") for bit in bits) or "none"
         return f"{value:g} {self.unit}".rstrip()
 
-    def complaint(self, value: float) -> str | None:
-        """Why the value is not one that the authors recommend, or None."""
+    def problem(self, value: float) -> str | None:
+        """Explain why a value is not recommended, or return None."""
         if self.read_only:
             return f"{self.name} can only be read"
         low, high = self.minimum, self.maximum
@@ -89,14 +89,14 @@ class ParameterMetadata(Snapshot):
 
 
 class Metadata(Mapping[str, ParameterMetadata]):
-    """Name → :class:`ParameterMetadata`, of one vehicle type and version; of several with a name the first counts."""
+    """Maps names to :class:`ParameterMetadata`, for one vehicle type and version. The first of equal names counts."""
 
     __slots__ = ("_by_name",)
 
     def __init__(self, parameters: Iterable[ParameterMetadata] = ()) -> None:
         self._by_name: dict[str, ParameterMetadata] = {}
-        for each in parameters:
-            self._by_name.setdefault(each.name, each)
+        for parameter in parameters:
+            self._by_name.setdefault(parameter.name, parameter)
 
     def __getitem__(self, name: str) -> ParameterMetadata:
         return self._by_name[name]
@@ -112,64 +112,63 @@ class Metadata(Mapping[str, ParameterMetadata]):
 
     @property
     def volatile(self) -> frozenset[str]:
-        """Names of the parameters that the vehicle changes by itself; PX4's hash leaves them out."""
-        return frozenset(each.name for each in self._by_name.values() if each.volatile)
+        """Names of the parameters that the vehicle changes itself. PX4's hash ignores them."""
+        return frozenset(parameter.name for parameter in self._by_name.values() if parameter.volatile)
 
     def reboot_required(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of the names whose change takes effect at the next start only."""
+        """Return those of the names whose changes take effect after a reboot."""
         return tuple(name for name in names if name in self and self[name].reboot_required)
 
     def check(self, name: str, value: float) -> None:
-        """Raise :class:`InvalidArgument` for a value outside the recommended range; unknown names pass."""
+        """Raise :class:`InvalidArgument` for a value outside the recommended range. Unknown names are accepted."""
         if math.isnan(value):
             raise InvalidArgument(f"{name} = {value!r} is not a number")
-        complaint = self[name].complaint(value) if name in self else None
-        if complaint:
-            raise InvalidArgument(complaint)
+        problem = self[name].problem(value) if name in self else None
+        if problem:
+            raise InvalidArgument(problem)
 
 
 def load_metadata(path: str | os.PathLike[str]) -> Metadata:
-    """Read a file of either autopilot, XML or JSON, compressed (``.xz``) or not; see above for where they are.
+    """Read a metadata file of either autopilot, XML or JSON, compressed (``.xz``) or not.
 
-    Raises :class:`FileFormatError` when it is none of these or has more than 16 MB (unpacked, too),
-    OSError when it cannot be read. Of a parameter that stands in the file several times, for frame types that do not
-    exist together, the first counts.
+    If a parameter is defined several times, for different frame types, the first definition counts.
+
+    Raises:
+        FileFormatError: it is not such a file, or has more than 16 MB (decompressed).
+        OSError: it cannot be read.
     """
     return parse_metadata(read_bounded(path), os.fspath(path))
 
 
 def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
-    """The same of bytes; ``source`` is their name in errors."""
-    from aerokit.parameters import metadata as metadata_formats
-
+    """Parse the content of a metadata file. Errors begin with ``source``."""
     try:
-        found = metadata_formats.parse(unpacked(data, source))
+        found = _parse(decompress(data, source))
     except FileFormatError:
         raise
     except (ValueError, SyntaxError, TypeError, AttributeError, LookupError, RecursionError) as error:
         raise FileFormatError(
-            f"{source} is no apm.pdef.xml, apm.pdef.json, parameters.xml or parameters.json: {error}"
+            f"{source} is not an apm.pdef.xml, apm.pdef.json, parameters.xml or parameters.json: {error}"
         ) from None
     if not found:
-        raise FileFormatError(f"{source} describes no parameters")
+        raise FileFormatError(f"{source} defines no parameters")
     return Metadata(found)
 
 
 _BITS = range(64)
 
 
-def parse(data: bytes) -> list[ParameterMetadata]:
-    """What the file says of each parameter, in its order."""
+def _parse(data: bytes) -> list[ParameterMetadata]:
     if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         root = DefusedXml.fromstring(data, forbid_dtd=True)
         if root.tag == "paramfile":
             return list(_ardupilot_xml(root))
         if root.tag == "parameters":
             return list(_px4_xml(root))
-        raise ValueError(f"its outermost element is <{root.tag}>")
+        raise ValueError(f"its root element is <{root.tag}>")
     content = json.loads(data.decode("utf-8-sig"))
     if not isinstance(content, dict):
-        raise ValueError("its outermost value is no object")
+        raise ValueError("it is not a JSON object")
     if isinstance(content.get("parameters"), list):
         return [_px4_entry(entry) for entry in content["parameters"]]
     return list(_ardupilot_json(content))
@@ -189,8 +188,8 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
                 minimum=low,
                 maximum=high,
                 increment=_number(fields.get("Increment")),
-                values=_named((each.get("code"), each.text) for each in param.iter("value")),
-                bitmask=_bits((each.get("code"), each.text) for each in param.iter("bit")),
+                values=_named((value.get("code"), value.text) for value in param.iter("value")),
+                bitmask=_bits((bit.get("code"), bit.text) for bit in param.iter("bit")),
                 reboot_required=_is_true(fields.get("RebootRequired")),
                 group=group.get("name", ""),
                 category=param.get("user", ""),
@@ -201,7 +200,7 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
     for group, parameters in content.items():
-        if group == "json":  # the version of the format
+        if group == "json":  # the format version
             continue
         for name, fields in parameters.items():
             limits = fields.get("Range", {})
@@ -233,7 +232,7 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
     for group in root.iter("group"):
         for param in group.iter("parameter"):
             is_boolean = _is_true(param.get("boolean"))
-            values = _named((each.get("code"), each.text) for each in param.iter("value"))
+            values = _named((value.get("code"), value.text) for value in param.iter("value"))
             yield ParameterMetadata(
                 param.attrib["name"],
                 short_description=param.findtext("short_desc", ""),
@@ -244,9 +243,9 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
                 increment=_number(param.findtext("increment")),
                 default=_number(param.get("default")),
                 values=values or ({0: "Disabled", 1: "Enabled"} if is_boolean else values),
-                bitmask=_bits((each.get("index"), each.text) for each in param.iter("bit")),
+                bitmask=_bits((bit.get("index"), bit.text) for bit in param.iter("bit")),
                 reboot_required=_is_true(param.findtext("reboot_required")),
-                decimal_places=_whole(param.findtext("decimal")),
+                decimal_places=_int_or_none(param.findtext("decimal")),
                 group=group.get("name", ""),
                 category=param.get("category", "Standard"),
                 volatile=_is_true(param.get("volatile")),
@@ -263,10 +262,10 @@ def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
         maximum=_number(entry.get("max")),
         increment=_number(entry.get("increment")),
         default=_number(entry.get("default")),
-        values=_named((each["value"], each["description"]) for each in entry.get("values", ())),
-        bitmask=_bits((each["index"], each["description"]) for each in entry.get("bitmask", ())),
+        values=_named((value["value"], value["description"]) for value in entry.get("values", ())),
+        bitmask=_bits((bit["index"], bit["description"]) for bit in entry.get("bitmask", ())),
         reboot_required=bool(entry.get("rebootRequired", False)),
-        decimal_places=_whole(entry.get("decimalPlaces")),
+        decimal_places=_int_or_none(entry.get("decimalPlaces")),
         group=_text(entry.get("group", "")),
         category=_text(entry.get("category", "")),
         volatile=bool(entry.get("volatile", False)),
@@ -276,11 +275,11 @@ def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
 # --------------------------------------------------------------------------------------- pieces
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"{reprlib.repr(value)} is no text")
+        raise ValueError(f"{reprlib.repr(value)} is not text")
     return value
 
 
-def _whole(value: Any) -> int | None:
+def _int_or_none(value: Any) -> int | None:
     number = _number(value)
     return int(number) if number is not None and number == int(number) else None
 

@@ -1,8 +1,9 @@
-"""``param.pck``: all parameters in one small file, which vehicles serve and take by MAVFTP.
+"""``param.pck``: all parameters in one compact file, read and written by MAVFTP.
 
-ArduPilot since 4.1, PX4 since August 2026 (PR 28435), at ``@PARAM/param.pck``; ``?withdefaults=1`` asks for defaults,
-``?start=50&count=10`` for a part. A read must use one block size to the end of the file, because values are padded so
-that none lies across two blocks. Downloaded and uploaded files differ in their header: see :func:`pack_parameters`.
+Vehicles serve it at ``@PARAM/param.pck``: ArduPilot since 4.1, PX4 since August 2026 (PR 28435). ``?withdefaults=1``
+requests defaults, ``?start=50&count=10`` a part. Use a single block size for the whole file, because padding depends on
+it: no value crosses a block boundary. Downloaded and uploaded files have different headers, see
+:func:`pack_parameters`.
 
 https://mavlink.io/en/services/parameter_ftp.html
 """
@@ -20,10 +21,10 @@ from aerokit.parameters.parameter import NAME_LENGTH, Parameter, ParameterType, 
 from aerokit.parameters.table import ParameterTable
 
 PACK_PATH = "@PARAM/param.pck"
-"""Where vehicles serve and take the file."""
+"""Path of the file on the vehicle, for reading and writing."""
 
 PACK_PATH_WITH_DEFAULTS = "@PARAM/param.pck?withdefaults=1"
-"""The same for reading, with the defaults of those parameters that have been changed."""
+"""Path for reading the file with the defaults of changed parameters."""
 
 MAGIC, _MAGIC_WITH_DEFAULTS = 0x671B, 0x671C
 
@@ -31,9 +32,9 @@ HEADER = Struct("<HHH")
 
 _HAS_DEFAULT = 0x10
 
-_LONGEST = 0xFFFF
+_MAX_SIZE = 0xFFFF
 
-# The file has codes of its own, those of ArduPilot's variables, not of MAV_PARAM_TYPE.
+# The type codes in the file are those of ArduPilot's AP_Param, not MAV_PARAM_TYPE.
 _CODES = {
     1: (ParameterType.INT8, Struct("<b")),
     2: (ParameterType.INT16, Struct("<h")),
@@ -53,7 +54,7 @@ _CODE_OF = {
 
 
 class PackHeader(NamedTuple):
-    """The first six bytes; ``total`` is the number of the vehicle's parameters, in an upload the length in bytes."""
+    """Header of the file. ``total`` is the number of the vehicle's parameters; in an upload, the file size in bytes."""
 
     magic: int
     parameters: int
@@ -61,7 +62,7 @@ class PackHeader(NamedTuple):
 
 
 class PackEntry(NamedTuple):
-    """One parameter as the file has it; ``default`` is None where it is not there."""
+    """One parameter in the file. ``default`` is None if it is not included."""
 
     name: bytes
     type: ParameterType
@@ -71,25 +72,30 @@ class PackEntry(NamedTuple):
 
 
 def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
-    """The table in a downloaded file; ``start`` is the index of its first parameter, as asked for in its path.
+    """Decode a downloaded file. ``start`` is the index of its first parameter, as requested in the path.
 
-    With defaults asked for, every parameter has its default: the file leaves out those that equal the value. Raises
-    :class:`RemoteProtocolError` when the file is damaged, or has another number of parameters than its header says
-    (ArduPilot does that once when its list has just changed: download it again).
+    If defaults were requested, every parameter has one: the file omits those that equal the value.
+
+    Raises:
+        RemoteProtocolError: the file is damaged, or has another number of parameters than its header. ArduPilot sends
+            such a file once after its list has changed; download it again.
     """
     magic, count, total = read_header(data)
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
-        raise RemoteProtocolError(f"this is no param.pck: its header is {magic:#06x}, {count} of {total}")
+        raise RemoteProtocolError(f"not a param.pck: its header is {magic:#06x}, {count} of {total}")
     found = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
     return ParameterTable(_checked(found, count))
 
 
 def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> bytes:
-    """A file to be written to ``@PARAM/param.pck``, in the order given.
+    """Encode a file to write to ``@PARAM/param.pck``, in the given order.
 
-    The vehicle puts the parameters in when the file is closed, and skips unknown and read-only ones without a word, so
-    read back what you wrote. The third number of its header is the length of the file, which thus ends at 65,535
-    bytes: :class:`InvalidArgument` beyond, and for names and values that do not fit (INT32 is the widest type).
+    The vehicle applies the parameters when the file is closed, and silently skips unknown and read-only ones, so read
+    back what you wrote.
+
+    Raises:
+        InvalidArgument: a name or value does not fit (INT32 is the widest type), or the file exceeds 65,535 bytes, the
+            maximum in its header.
     """
     rows = list(_rows(parameters))
     body = bytearray()
@@ -99,12 +105,12 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
         body += _entry(name, last, code, checked_value(parameter.name, parameter.value, _CODES[code][0]))
         last = name
     length = HEADER.size + len(body)
-    if length > _LONGEST:
-        raise InvalidArgument(f"{len(rows)} parameters make {length} bytes, at most {_LONGEST} are possible")
+    if length > _MAX_SIZE:
+        raise InvalidArgument(f"{len(rows)} parameters need {length} bytes, at most {_MAX_SIZE} are possible")
     return HEADER.pack(MAGIC, len(rows), length) + bytes(body)
 
 
-def pack_served(
+def pack_for_download(
     parameters: Mapping[str, Parameter] | Iterable[Parameter],
     *,
     start: int = 0,
@@ -113,10 +119,10 @@ def pack_served(
     block_size: int = 239,
     whole_defaults: bool = True,
 ) -> bytes:
-    """The file that a vehicle with these parameters serves when it is read in blocks of that size; nothing is checked.
+    """Encode the file that a vehicle with these parameters serves, for reads with that block size. Unchecked.
 
-    ``count`` 0 means all from ``start``. A value and its default lie in one block (PX4), or, without
-    ``whole_defaults``, the default alone (ArduPilot). InvalidArgument when ``start`` is beyond the list.
+    ``count`` 0 means all from ``start`` on. PX4 keeps a value and its default in one block; ArduPilot, and
+    ``whole_defaults=False``, only the default. InvalidArgument if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
@@ -130,34 +136,35 @@ def pack_served(
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, last, code, *values)
-        kept = _CODES[code][1].size * (len(values) if whole_defaults else 1)
+        unsplit = _CODES[code][1].size * (len(values) if whole_defaults else 1)
         beyond = (len(file) + len(entry)) % block_size
-        file += bytes(kept - beyond if 0 < beyond < kept else 0) + entry
+        file += bytes(unsplit - beyond if 0 < beyond < unsplit else 0) + entry
         last = name
     return bytes(file)
 
 
 # --------------------------------------------------------------------------------------- reading
 def read_header(data: bytes) -> PackHeader:
-    """The header of any file; RemoteProtocolError when it is shorter than that."""
+    """Decode the header of a downloaded or uploaded file."""
     if len(data) < HEADER.size:
-        raise RemoteProtocolError(f"param.pck has {len(data)} bytes, its header alone has {HEADER.size}")
+        raise RemoteProtocolError(f"param.pck has {len(data)} bytes, fewer than the {HEADER.size} of its header")
     return PackHeader(*HEADER.unpack_from(data))
 
 
 def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
-    """The entry at a position, behind the padding; ``last`` is the name before. None when the data end within it.
+    """Decode the entry at ``position``; ``last`` is the previous name. None if the data ends inside the entry.
 
-    RemoteProtocolError when there is none: a type or flags that do not exist, a name that is too long.
+    Raises:
+        RemoteProtocolError: there is no entry: the type or flags are undefined, or the name is too long.
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     if code not in _CODES or flags & ~_HAS_DEFAULT:
-        _damaged(position, f"type {code}, flags {flags >> 4}")
+        _damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
     common, own = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
     if common > len(last) or common + own > NAME_LENGTH:
-        _damaged(position, f"a name of {common} + {own} characters after {last!r}")
+        _damaged(position, f"invalid name length {common} + {own} after {last!r}")
     kind, format_ = _CODES[code]
     start = position + 2 + own
     end = start + format_.size * (2 if flags else 1)
@@ -170,17 +177,16 @@ def read_entry(data: bytes, position: int, last: bytes) -> PackEntry | None:
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
     position, last = HEADER.size, b""
-    while (position := _behind_padding(data, position)) < len(data):
+    while (position := _skip_padding(data, position)) < len(data):
         entry = read_entry(data, position, last)
         if entry is None:
-            _damaged(position, "ends within an entry")
+            _damaged(position, "it ends inside an entry")
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
         position, last, index = entry.end, entry.name, index + 1
 
 
-def _behind_padding(data: bytes, position: int) -> int:
-    """No entry begins with a zero."""
+def _skip_padding(data: bytes, position: int) -> int:
     while position < len(data) and data[position] == 0:
         position += 1
     return position
@@ -188,7 +194,7 @@ def _behind_padding(data: bytes, position: int) -> int:
 
 def _text(name: bytes, position: int) -> str:
     if not all(0x20 < byte < 0x7F for byte in name):
-        _damaged(position, f"the name {name!r}")
+        _damaged(position, f"invalid name {name!r}")
     return name.decode("ascii")
 
 
@@ -200,7 +206,7 @@ def _checked(found: list[Parameter], count: int) -> list[Parameter]:
     if len(found) != count:
         raise RemoteProtocolError(f"param.pck has {len(found)} parameters, its header says {count}")
     if len({parameter.name for parameter in found}) != count:
-        raise RemoteProtocolError("param.pck has a name twice")
+        raise RemoteProtocolError("param.pck contains a name twice")
     return found
 
 
@@ -211,7 +217,7 @@ def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator
 
 def _code_of(parameter: Parameter) -> int:
     if parameter.type not in _CODE_OF:
-        raise InvalidArgument(f"{parameter.name} is an {parameter.type.name}, which param.pck cannot carry")
+        raise InvalidArgument(f"{parameter.name} is an {parameter.type.name}, which param.pck cannot store")
     return _CODE_OF[parameter.type]
 
 
@@ -222,28 +228,28 @@ def _entry(name: bytes, last: bytes, code: int, *values: float) -> bytes:
 
 
 def _common_length(name: bytes, last: bytes) -> int:
-    """Characters shared with the name before; at least one is left, because an entry cannot have none of its own."""
+    # At least one character of its own is required.
     common = 0
-    for one, other in zip(name[:-1], last):  # noqa: B905 - the shorter one ends it
-        if one != other:
+    for char, last_char in zip(name[:-1], last):  # noqa: B905 - the shorter one ends it
+        if char != last_char:
             break
         common += 1
     return common
 
 
 HASH_NAME = "_HASH_CHECK"
-"""The name under which PX4 gives it, as a UINT32 with index 65535; asking for it by name costs one message."""
+"""Name of PX4's hash over all parameters, a UINT32 with index 65535."""
 
 _ALL_ONES = 0xFFFFFFFF
 
 
 def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
-    """What ``_HASH_CHECK`` would be for this table, sorted by name as PX4 has it.
+    """Compute the ``_HASH_CHECK`` that PX4 would report for this table.
 
-    CRC-32 (without the usual inversions) over each name and the four bytes of its value. PX4 leaves out *volatile*
-    parameters, those that it changes by itself; ``volatile`` are their names
+    CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name. PX4 ignores
+    volatile parameters, which it changes itself; pass their names as ``volatile``
     (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`). Without them the result differs, so a
-    cache keeps the vehicle's own number beside its table.
+    cache should store the vehicle's own hash with the table.
     """
     counted = (table[name] for name in sorted(table) if name not in volatile)
     data = b"".join(p.name.encode() + to_bits(p.value, p.type, bytewise=True) for p in counted)

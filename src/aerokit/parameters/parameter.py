@@ -1,30 +1,35 @@
-"""``Parameter`` and ``ParameterType``, and what a name and a value must be before they are sent."""
+"""``Parameter`` and ``Setting``, and checks and encoding of names and values.
+
+A setting is a parameter of a component in the extended protocol: https://mavlink.io/en/services/parameter_ext.html
+"""
 
 from __future__ import annotations
 
 import math
+import struct
 from enum import IntEnum
 from struct import Struct
 from typing import SupportsFloat, SupportsIndex
 
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
-from aerokit._internal.wording import shown
 from aerokit.errors import InvalidArgument
+from aerokit.mavlink.enums import MavParamExtType
 
-MOST_PARAMETERS = 8192
-"""Names beyond so many that come from the air are not taken for parameters; ArduPilot has 1,500, PX4 2,000."""
+# Limits the memory that a faulty vehicle can fill. ArduPilot has 1,500 parameters, PX4 2,000.
+MAX_PARAMETERS = 8192
 
 NAME_LENGTH = 16
-"""The longest name that the protocol can carry."""
+"""Maximum length of a parameter name in MAVLink."""
 
 _FLOAT32 = Struct("<f")
 _INTEGER_BITS = {1: 8, 2: 8, 3: 16, 4: 16, 5: 32, 6: 32, 7: 64, 8: 64}
 
 
 class ParameterType(IntEnum):
-    """MAV_PARAM_TYPE: https://mavlink.io/en/messages/common.html#MAV_PARAM_TYPE.
+    """MAV_PARAM_TYPE (https://mavlink.io/en/messages/common.html#MAV_PARAM_TYPE).
 
-    ArduPilot has INT8, INT16, INT32 and REAL32, PX4 has INT32 and REAL32; other components use all of them.
+    ArduPilot uses INT8, INT16, INT32 and REAL32, PX4 INT32 and REAL32; other components may use all of them.
     """
 
     UINT8 = 1
@@ -40,40 +45,40 @@ class ParameterType(IntEnum):
 
     @classmethod
     def from_wire(cls, number: int) -> ParameterType:
-        """The type that a message tells; REAL32, in which every value travels, when the number is not known."""
+        """Return the type of a message, or REAL32, in which all values are sent, if the number is unknown."""
         return cls(number) if 1 <= number <= 10 else cls.REAL32
 
     @property
     def is_integer(self) -> bool:
-        """Whether values are whole numbers, ``int`` in Python."""
+        """True if values are whole numbers, ``int`` in Python."""
         return self < ParameterType.REAL32
 
     @property
     def is_signed(self) -> bool:
-        """Whether values can be below zero."""
+        """True if values can be negative."""
         return self >= ParameterType.REAL32 or self % 2 == 0
 
     @property
-    def low(self) -> int | float:
-        """The lowest value of the type."""
+    def minimum(self) -> int | float:
+        """The minimum of the type."""
         if not self.is_integer:
-            return -self.high
+            return -self.maximum
         return -(1 << (_INTEGER_BITS[self] - 1)) if self.is_signed else 0
 
     @property
-    def high(self) -> int | float:
-        """The highest value of the type."""
+    def maximum(self) -> int | float:
+        """The maximum of the type."""
         if self.is_integer:
             return (1 << (_INTEGER_BITS[self] - self.is_signed)) - 1
         return 3.4028234663852886e38 if self is ParameterType.REAL32 else 1.7976931348623157e308
 
 
 class Parameter(Snapshot):
-    """One parameter of a vehicle, as it was last told.
+    """One parameter of a vehicle, as last reported.
 
-    ``value`` is an ``int`` for integer types, else a ``float``: the 32-bit number that the vehicle holds.
-    ``default`` is None when it is not known (only MAVFTP tells it), ``index`` is the place in the vehicle's list,
-    None when it has not been told. Nothing is checked: a vehicle may hold NaN.
+    ``value`` is an ``int`` for integer types, else a ``float`` with 32-bit precision. ``default`` is None if unknown
+    (only MAVFTP reports it); ``index`` is the index in the vehicle's list, or None if not reported. Nothing is checked:
+    a vehicle may report NaN.
     """
 
     name: str
@@ -84,42 +89,41 @@ class Parameter(Snapshot):
 
     @property
     def is_changed(self) -> bool | None:
-        """Whether the value is another than the default; None when the default is not known."""
+        """True if the value differs from the default; None if the default is unknown."""
         return None if self.default is None else not same_value(self.value, self.default)
 
 
 def check_name(name: str) -> str:
-    """The name, when a message can carry it.
+    """Check that a name can be sent, and return it.
 
-    Raises :class:`InvalidArgument` unless it is 1 to 16 printable ASCII characters without spaces.
+    Raises:
+        InvalidArgument: it is not 1 to 16 printable ASCII characters without spaces.
     """
     if not isinstance(name, str):
-        raise InvalidArgument(f"parameter name = {shown(name)} is no text")
+        raise InvalidArgument(f"parameter name = {short_repr(name)} is not a string")
     if not 0 < len(name) <= NAME_LENGTH:
         raise InvalidArgument(
-            f"parameter name = {shown(name)} has {len(name)} characters, 1 to {NAME_LENGTH} are possible"
+            f"parameter name = {short_repr(name)} has {len(name)} characters, 1 to {NAME_LENGTH} are possible"
         )
     if not all("!" <= character <= "~" for character in name):
-        raise InvalidArgument(f"parameter name = {shown(name)}: ASCII without spaces is possible only")
+        raise InvalidArgument(f"parameter name = {short_repr(name)}: only ASCII without spaces is possible")
     return name
 
 
 def checked_value(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
-    """The value as a vehicle holds it in that type: an int, or the nearest 32-bit number.
+    """Convert a value as the vehicle stores it in that type: to an int, or to the nearest 32-bit float.
 
-    Raises :class:`InvalidArgument` for what the type cannot hold: NaN, infinity, 300 as an INT8, 1.5 as an
-    integer. ``True`` is 1.
+    Raises:
+        InvalidArgument: the type cannot hold the value: NaN, infinity, 300 as an INT8, 1.5 as an integer.
     """
     number = number_of(name, value)
     if isinstance(number, float) and not math.isfinite(number):
-        raise InvalidArgument(f"{name} = {shown(value)}: a finite number is allowed only")
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a finite number")
     if type.is_integer and number != int(number):
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a whole number (it is an {type.name})")
+    if not type.minimum <= number <= type.maximum:
         raise InvalidArgument(
-            f"{name} = {shown(value)}: whole numbers are allowed only (it is an {type.name})"
-        )
-    if not type.low <= number <= type.high:
-        raise InvalidArgument(
-            f"{name} = {shown(value)} must be in {type.low}..{type.high} (it is an {type.name})"
+            f"{name} = {short_repr(value)} must be in {type.minimum}..{type.maximum} (it is an {type.name})"
         )
     if type.is_integer:
         return int(number)
@@ -127,28 +131,145 @@ def checked_value(name: str, value: float, type: ParameterType) -> int | float: 
 
 
 def number_of(name: str, value: object) -> int | float:
-    """An int, a float, or what says that it is one of them, as numpy's numbers do; else InvalidArgument."""
+    """Convert to an int or a float. Numbers of other libraries, such as numpy, are accepted; else InvalidArgument."""
     if isinstance(value, (int, float)):
         return value
     if isinstance(value, SupportsIndex):
         return value.__index__()
     if isinstance(value, SupportsFloat):
         return float(value)
-    raise InvalidArgument(f"{name} = {shown(value)} is no number")
+    raise InvalidArgument(f"{name} = {short_repr(value)} is not a number")
 
 
 def to_float32(value: float) -> float:
-    """The nearest 32-bit floating-point number; OverflowError when it is beyond them."""
+    """Round to the nearest 32-bit float. OverflowError if the value is too large."""
     return float(_FLOAT32.unpack(_FLOAT32.pack(value))[0])
 
 
-def same_value(one: float, other: float) -> bool:
-    """Whether a vehicle could not tell the two apart: equal, equal as 32-bit numbers, or both NaN."""
-    if one == other or (one != one and other != other):
+def same_value(left: float, right: float) -> bool:
+    """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
+    if left == right or (left != left and right != right):
         return True
-    if isinstance(one, int) and isinstance(other, int):
+    if isinstance(left, int) and isinstance(right, int):
         return False
     try:
-        return to_float32(one) == to_float32(other)
+        return to_float32(left) == to_float32(right)
     except OverflowError:
         return False
+
+
+# ------------------------------------------------------------------------------------- settings
+
+SettingValue = bool | int | float | str | bytes
+"""The value of a setting. ``bool`` only if a definition says so; ``str`` or ``bytes`` for the custom type."""
+
+MAX_VALUE_SIZE = 128  # bytes in one message
+
+_STRUCTS = {
+    MavParamExtType.UINT8: Struct("<B"),
+    MavParamExtType.INT8: Struct("<b"),
+    MavParamExtType.UINT16: Struct("<H"),
+    MavParamExtType.INT16: Struct("<h"),
+    MavParamExtType.UINT32: Struct("<I"),
+    MavParamExtType.INT32: Struct("<i"),
+    MavParamExtType.UINT64: Struct("<Q"),
+    MavParamExtType.INT64: Struct("<q"),
+    MavParamExtType.REAL32: Struct("<f"),
+    MavParamExtType.REAL64: Struct("<d"),
+}
+
+
+class Setting(Snapshot):
+    """One setting of a component, as last reported.
+
+    ``type`` is a MAV_PARAM_EXT_TYPE. For the custom type, ``value`` is a ``str`` if its bytes are text, else ``bytes``.
+    ``index`` is the index in the component's list, or None if not reported.
+    """
+
+    name: str
+    value: SettingValue
+    type: int
+    index: int | None = None
+
+
+def setting_value(data: bytes, type: int) -> SettingValue:  # noqa: A002 - the name of the field in the standard
+    """Decode the bytes of a message. For unknown types, return the bytes without trailing zeros."""
+    packed = _STRUCTS.get(type)  # type: ignore[call-overload]
+    if packed is not None:
+        number: int | float = packed.unpack(data[: packed.size].ljust(packed.size, b"\0"))[0]
+        return number
+    data = data.rstrip(b"\0")
+    if type == MavParamExtType.CUSTOM:
+        try:
+            text = data.decode()
+        except UnicodeDecodeError:
+            return data
+        if all(char.isprintable() or char.isspace() for char in text):
+            return text
+    return data
+
+
+def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
+    """Encode a value that :func:`checked_setting` has accepted."""
+    packed = _STRUCTS.get(type)  # type: ignore[call-overload]
+    if packed is not None:
+        data: bytes = packed.pack(value)
+        return data
+    return value.encode() if isinstance(value, str) else bytes(value)  # type: ignore[arg-type]
+
+
+def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noqa: A002
+    """Convert a value as the component stores it: to an int, a 32-bit float, a string or bytes.
+
+    Raises:
+        InvalidArgument: the type cannot hold the value: 300 as a UINT8, 1.5 as an integer, a string for a number, a
+            number for a string, or more than 128 bytes.
+    """
+    if type in _STRUCTS:
+        if isinstance(value, (str, bytes, bytearray)):
+            raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a number")
+        return checked_value(name, value, ParameterType(type))  # type: ignore[arg-type]  # checked there
+    if not isinstance(value, (str, bytes, bytearray)):
+        raise InvalidArgument(f"{name} = {short_repr(value)} is not allowed: a text or bytes")
+    try:
+        data = value.encode() if isinstance(value, str) else bytes(value)
+    except UnicodeEncodeError:
+        raise InvalidArgument(f"{name} = {short_repr(value)} has characters that cannot be encoded") from None
+    if len(data) > MAX_VALUE_SIZE:
+        raise InvalidArgument(f"{name} = {short_repr(value)} has {len(data)} bytes, at most {MAX_VALUE_SIZE} fit")
+    if data.endswith(b"\0"):
+        raise InvalidArgument(f"{name} = {short_repr(value)}: zeros at its end would be lost")
+    return setting_value(data, type)
+
+
+def settings_equal(left: SettingValue, right: SettingValue) -> bool:
+    """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
+    if isinstance(left, (str, bytes)) or isinstance(right, (str, bytes)):
+        return _encoded(left) == _encoded(right)
+    if left == right or (left != left and right != right):
+        return True
+    if not isinstance(left, float) and not isinstance(right, float):
+        return False
+    try:
+        return _FLOAT.pack(left) == _FLOAT.pack(right) and math.isfinite(left)
+    except (OverflowError, struct.error):
+        return False
+
+
+_FLOAT = _STRUCTS[MavParamExtType.REAL32]
+
+
+def setting_key(value: SettingValue) -> object:
+    """Return a key that is the same for values that are equal according to :func:`settings_equal`."""
+    if isinstance(value, (str, bytes)):
+        return _encoded(value)
+    if not isinstance(value, float):
+        return value
+    try:
+        return _FLOAT.unpack(_FLOAT.pack(value))[0] if value == value else "NaN"
+    except (OverflowError, struct.error):
+        return value
+
+
+def _encoded(value: SettingValue) -> object:
+    return value.encode() if isinstance(value, str) else value

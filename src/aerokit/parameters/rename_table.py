@@ -1,13 +1,13 @@
-"""What ArduPilot renamed between 4.6 and 4.7, taken from the metadata of both and from the firmware's conversions.
+"""Table of parameters that ArduPilot renamed.
 
-One group a row: the vehicle types, the divisor from old to new units, ``OLD>NEW`` pairs. Conversions in the firmware:
-AC_WPNav, AC_Loiter, AC_PosControl, AC_AttitudeControl, AC_Circle, AC_Avoid, AP_Arming, AP_RangeFinder, GCS, and the
-vehicles' Parameters.cpp; https://ardupilot.org/copter/docs/common-param-name-changes.html. The firmware moves
-PSC_ACCZ_FF, _PDMX and _D_FF unscaled although P, I and D are scaled by 0.1; so do we.
+For 4.7: from the metadata of 4.6 and 4.7 and the conversions in the firmware (AC_WPNav, AC_Loiter, AC_PosControl,
+AC_AttitudeControl, AC_Circle, AC_Avoid, AP_Arming, AP_RangeFinder, GCS, the vehicles' Parameters.cpp);
+https://ardupilot.org/copter/docs/common-param-name-changes.html. Like the firmware, PSC_ACCZ_FF, _PDMX and _D_FF are
+not scaled, although P, I and D are scaled by 0.1.
 
-From the names that the sources of those years document, and from the conversions that the firmware made at its first
-start (convert_old_parameters in the vehicles' Parameters.cpp, AP_Mount, AP_Camera, AP_GPS, AP_BattMonitor …). Where
-the value changed otherwise than by its unit (gains, choices), nothing is converted: see `REPLACED`.
+For earlier versions: from the source code and the firmware's conversions (convert_old_parameters in the vehicles'
+Parameters.cpp, AP_Mount, AP_Camera, AP_GPS, AP_BattMonitor …). If a value changed by more than its unit (gains,
+choices), nothing is converted: see `REPLACED`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,7 @@ _STREAMS = "RAW_SENS EXT_STAT RC_CHAN RAW_CTRL POSITION EXTRA1 EXTRA2 EXTRA3 PAR
 
 _LOITER = "SPEED>SPEED_MS ACC_MAX>ACC_MAX_M BRK_ACCEL>BRK_ACC_M BRK_JERK>BRK_JRK_M"
 
-_WAYPOINT = (
-    "SPEED>SPD SPEED_UP>SPD_UP SPEED_DN>SPD_DN RADIUS>RADIUS_M ACCEL>ACC ACCEL_Z>ACC_Z ACCEL_C>ACC_CNR"
-)
+_WAYPOINT = "SPEED>SPD SPEED_UP>SPD_UP SPEED_DN>SPD_DN RADIUS>RADIUS_M ACCEL>ACC ACCEL_Z>ACC_Z ACCEL_C>ACC_CNR"
 
 _ATTITUDE = "ACCEL_R_MAX>ACC_R_MAX ACCEL_P_MAX>ACC_P_MAX ACCEL_Y_MAX>ACC_Y_MAX SLEW_YAW>RATE_WPY_MAX"
 
@@ -49,7 +47,7 @@ _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
 
 def _position(prefix: str) -> tuple[tuple[int, str], ...]:
-    """The position controller, from north-east-up in centimetres to north-east-down in metres."""
+    """Return the pairs of the position controller: from north-east-up in cm to north-east-down in m."""
     moved = (
         _same(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _HORIZONTAL),
         _same(f"{prefix}VELZ_", f"{prefix}D_VEL_", _HORIZONTAL),
@@ -71,6 +69,7 @@ _COPTER_CENTI = (
     "PILOT_TKOFF_ALT>PILOT_TKO_ALT_M PHLD_BRAKE_ANGLE>PHLD_BRK_ANGLE AVOID_ANGLE_MAX>AVOID_ANG_MAX"
 )
 
+# Version 4.7: vehicle types, divisor from old to new units, and ``OLD>NEW`` pairs.
 GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_ALL, 1, "SYSID_THISMAV>MAV_SYSID SYSID_MYGCS>MAV_GCS_SYSID TELEM_DELAY>MAV_TELEM_DELAY"),
     (_ALL, 1, "ARMING_CHECK>ARMING_SKIPCHK EK3_MAX_FLOW>EK3_FLOW_MAX"),
@@ -111,13 +110,13 @@ GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
 
 INVERTED = frozenset({"ARMING_CHECK"})
 
+# Version 4.7.0 had other new names for these than 4.7.1.
 OTHER_NEW_NAMES: dict[str, tuple[str, ...]] = dict(
     chain.from_iterable(
         ((f"{prefix}NE_JERK", (f"{prefix}JERK_NE",)), (f"{prefix}D_JERK", (f"{prefix}JERK_D",)))
         for prefix in ("PSC_", "Q_P_")
     )
 )
-"""Version 4.7.0 had other new names for these than 4.7.1."""
 
 _OLDER_ALL = ("Copter", "Plane", "Rover", "Sub")
 
@@ -125,7 +124,7 @@ _OLDER_COPTER, _OLDER_PLANE, _ROVER = ("Copter",), ("Plane",), ("Rover",)
 
 
 def _moved(old: str, new: str, names: str) -> str:
-    """``TYPE`` → ``RNGFND_TYPE>RNGFND1_TYPE``; ``A>B`` where the rest of the name changed, too."""
+    """``TYPE`` → ``RNGFND_TYPE>RNGFND1_TYPE``. Also takes pairs ``A>B``."""
     halves = (name.partition(">") for name in names.split())
     return " ".join(f"{old}{before}>{new}{after or before}" for before, _, after in halves)
 
@@ -138,14 +137,14 @@ _ANGLES = (
 )
 
 _RANGEFINDER = (
-    "TYPE PIN SCALING OFFSET FUNCTION MIN_CM MAX_CM STOP_PIN RMETRIC PWRRNG GNDCLEAR ADDR ORIENT "
-    "POS_X POS_Y POS_Z"
+    "TYPE PIN SCALING OFFSET FUNCTION MIN_CM MAX_CM STOP_PIN RMETRIC PWRRNG GNDCLEAR ADDR ORIENT POS_X POS_Y POS_Z"
 )
 
 _OLDER_LOITER = "SPEED>SPEED JERK>BRK_JERK MAXA>ACC_MAX MINA>BRK_ACCEL"
 
 _IGNORED = " ".join(f"IGN_{what}{number}" for what in ("ANG", "WID") for number in range(1, 5))
 
+# Version of the new name, vehicle types, divisor from old to new units, and ``OLD>NEW`` pairs.
 OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1, _moved("STB_", "ATC_ANG_", "RLL_P PIT_P YAW_P")),
     ("3.4", _OLDER_COPTER, 1, "MOT_THST_BAT_MAX>MOT_BAT_VOLT_MAX MOT_THST_BAT_MIN>MOT_BAT_VOLT_MIN"),
@@ -234,13 +233,12 @@ OLDER: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("4.6", _OLDER_ALL, 1, " ".join(f"GPS_POS{n}_{axis}>GPS{n}_POS_{axis}" for n in (1, 2) for axis in _XYZ)),
     ("4.6", _OLDER_ALL, 1, "GPS_CAN_NODEID1>GPS1_CAN_NODEID GPS_CAN_NODEID2>GPS2_CAN_NODEID"),
 )
-"""Since which version, the vehicle types, what the old value is divided by, and ``OLD>NEW`` pairs."""
 
+# The same, from old to new only, because another vehicle type still has the old name, with another meaning.
 ONE_WAY: tuple[tuple[str, tuple[str, ...], int, str], ...] = (
     ("3.4", _OLDER_COPTER, 1000, "THR_MIN>MOT_SPIN_MIN"),
     ("3.3", _ROVER, 1, "THR_MIN>MOT_THR_MIN THR_MAX>MOT_THR_MAX"),
 )
-"""As above, from old to new only: another vehicle type has the old name still, and means something else by it."""
 
 _SWITCH = "RCn_OPTION of that channel"
 
@@ -248,12 +246,9 @@ _OUTPUT = "SERVOn_FUNCTION and SERVOn_REVERSED of the outputs"
 
 _GAINS = "its gains are counted differently"
 
+# Names without a direct successor, and what replaces them.
 REPLACED: dict[str, str] = {
-    **{
-        f"RATE_{axis}_{gain}": f"ATC_RAT_{axis}_{gain}; {_GAINS}"
-        for axis in ("RLL", "PIT", "YAW")
-        for gain in "PID"
-    },
+    **{f"RATE_{axis}_{gain}": f"ATC_RAT_{axis}_{gain}; {_GAINS}" for axis in ("RLL", "PIT", "YAW") for gain in "PID"},
     **{f"RATE_{axis}_IMAX": f"ATC_RAT_{axis}_IMAX; {_GAINS}" for axis in ("RLL", "PIT", "YAW")},
     **{
         f"ATC_RAT_{axis}_FILT": f"ATC_RAT_{axis}_FLTT, ATC_RAT_{axis}_FLTE and ATC_RAT_{axis}_FLTD"
@@ -263,9 +258,7 @@ REPLACED: dict[str, str] = {
     **{f"PTCH2SRV_{gain}": f"PTCH_RATE_{gain}; {_GAINS}" for gain in ("P", "I", "D", "FF", "IMAX")},
     **{f"SPEED2THR_{gain}": f"ATC_SPEED_{gain}; {_GAINS}" for gain in ("P", "I", "D", "IMAX")},
     **{f"RC{number}_REV": f"RC{number}_REVERSED, 1 for reversed" for number in range(1, 15)},
-    **dict.fromkeys(
-        ("FENCE_CHANNEL", "RST_MISSION_CH", "CHUTE_CHAN", "FBWA_TDRAG_CHAN", "FLAP_IN_CHANNEL"), _SWITCH
-    ),
+    **dict.fromkeys(("FENCE_CHANNEL", "RST_MISSION_CH", "CHUTE_CHAN", "FBWA_TDRAG_CHAN", "FLAP_IN_CHANNEL"), _SWITCH),
     **dict.fromkeys(("INVERTEDFLT_CH", "SOAR_ENABLE_CH", "LEARN_CH"), _SWITCH),
     **dict.fromkeys(("MNT_RC_IN_ROLL", "MNT_RC_IN_TILT", "MNT_RC_IN_PAN"), _SWITCH),
     **{f"ELEVON_{what}": _OUTPUT for what in ("MIXING", "OUTPUT", "REVERSE", "CH1_REV", "CH2_REV")},
@@ -285,4 +278,3 @@ REPLACED: dict[str, str] = {
     "SKIP_GYRO_CAL": "INS_GYR_CAL",
     "RNGFND_GAIN": "RNGFND_FILT",
 }
-"""Names without a successor that has the same meaning → what does their work now."""

@@ -1,4 +1,4 @@
-"""``ParameterTable``: the parameters of a vehicle at one moment."""
+"""``ParameterTable``: the parameters of a vehicle at one moment, and comparison of tables."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from aerokit.parameters.parameter import Parameter, ParameterType, same_value
 
 
 class ParameterTable(Mapping[str, Parameter]):
-    """Name → :class:`Parameter`, in the vehicle's order; immutable.
+    """Maps names to :class:`Parameter`, in the vehicle's order; immutable.
 
-    ``table["WP_SPD"].value`` is one value, ``table.values_by_name()`` all of them as a plain dict. Of several
-    parameters with one name the last one counts.
+    ``table["WP_SPD"].value`` is one value, ``table.values_by_name()`` a dict of all. If a name occurs twice, the last
+    one counts.
     """
 
     __slots__ = ("_by_name",)
@@ -30,7 +30,7 @@ class ParameterTable(Mapping[str, Parameter]):
         values: Mapping[str, int | float],
         types: Mapping[str, ParameterType] = MappingProxyType({}),
     ) -> ParameterTable:
-        """A table of plain values; a name without a type becomes REAL32 (its value is kept as it is)."""
+        """Create a table from values. Parameters without a type become REAL32; their values are not converted."""
         rows = enumerate(values.items())
         real = ParameterType.REAL32
         return cls(Parameter(name, value, types.get(name, real), None, i) for i, (name, value) in rows)
@@ -57,32 +57,33 @@ class ParameterTable(Mapping[str, Parameter]):
         return f"<ParameterTable: {len(self)} parameters>"
 
     def values_by_name(self) -> dict[str, int | float]:
-        """Name → value, a dict of the caller's own."""
+        """Return a new dict of names and values."""
         return {name: parameter.value for name, parameter in self._by_name.items()}
 
     def types_by_name(self) -> dict[str, ParameterType]:
-        """Name → type, a dict of the caller's own."""
+        """Return a new dict of names and types."""
         return {name: parameter.type for name, parameter in self._by_name.items()}
 
     @property
     def has_defaults(self) -> bool:
-        """Whether the default of every parameter is known."""
+        """True if the default of every parameter is known."""
         return all(parameter.default is not None for parameter in self._by_name.values())
 
     def changed_from_default(self) -> ParameterTable:
-        """Those whose value is another than their default.
+        """Return the parameters whose value differs from their default.
 
-        Raises :class:`ValueUnknownError` when no default is known at all: the list protocol tells none.
+        Raises:
+            ValueUnknownError: no default is known, because the list protocol does not report defaults.
         """
         known = [parameter for parameter in self._by_name.values() if parameter.default is not None]
         if self._by_name and not known:
-            raise ValueUnknownError("no default is known: only a download by MAVFTP brings them")
+            raise ValueUnknownError("no default is known: only a download by MAVFTP reports defaults")
         return ParameterTable(parameter for parameter in known if parameter.is_changed)
 
-    def with_(self, parameters: Iterable[Parameter]) -> ParameterTable:
-        """A copy with these put in: a known one in its place, a new one at the end.
+    def updated_with(self, parameters: Iterable[Parameter]) -> ParameterTable:
+        """Return a copy with these parameters: known ones are replaced, new ones appended.
 
-        A default or index that an update does not tell stays as it was.
+        A default or index that is None in the update is kept.
         """
         merged = dict(self._by_name)
         for new in parameters:
@@ -90,25 +91,23 @@ class ParameterTable(Mapping[str, Parameter]):
         return ParameterTable(merged.values())
 
     def without(self, names: Iterable[str]) -> ParameterTable:
-        """A copy without these names; unknown ones do not matter."""
+        """Return a copy without these names. Unknown names are ignored."""
         dropped = set(names)
         return ParameterTable(p for p in self._by_name.values() if p.name not in dropped)
 
     def matching(self, pattern: str) -> ParameterTable:
-        """Those whose name fits a pattern like ``"WP_*"``; case does not matter."""
+        """Return the parameters whose names match a pattern such as ``"WP_*"``, ignoring case."""
         pattern = pattern.upper()
         return ParameterTable(p for p in self._by_name.values() if fnmatchcase(p.name.upper(), pattern))
 
     def by_index(self) -> dict[int, Parameter]:
-        """Index in the vehicle's list → parameter, for those that have told their index."""
+        """Return a dict of the parameters with a known index in the vehicle's list."""
         return {p.index: p for p in self._by_name.values() if p.index is not None}
 
     def in_order_of_index(self) -> ParameterTable:
-        """A copy in the vehicle's order, however the parameters arrived; those without an index come last."""
+        """Return a copy sorted by index. Parameters without an index come last."""
         last = 1 << 16
-        return ParameterTable(
-            sorted(self._by_name.values(), key=lambda p: last if p.index is None else p.index)
-        )
+        return ParameterTable(sorted(self._by_name.values(), key=lambda p: last if p.index is None else p.index))
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:
@@ -119,11 +118,11 @@ def _merged(old: Parameter | None, new: Parameter) -> Parameter:
 
 
 ParameterValues = Mapping[str, "int | float"] | Mapping[str, Parameter]
-"""Whatever has names and values: a :class:`ParameterTable`, a file that was read, a dict."""
+"""Anything with names and values: a :class:`ParameterTable`, a parameter file, a dict."""
 
 
 class ParameterDifference(Snapshot):
-    """One parameter that is not the same on both sides; None where it is missing."""
+    """A parameter that differs. None on the side where it is missing."""
 
     name: str
     before: int | float | None
@@ -140,11 +139,10 @@ def diff(
     *,
     names: Iterable[str] | None = None,
 ) -> tuple[ParameterDifference, ...]:
-    """What differs, in the order of ``before``, then what only ``after`` has.
+    """Compare parameters. Differences are in the order of ``before``, then those that only ``after`` has.
 
-    Numbers that a vehicle cannot tell apart (0.1 and the 32-bit number nearest to it) are the same, and so are numbers
-    not further apart than ``tolerance``. ``names`` restricts it: ``diff(file, table, names=file)`` says nothing
-    about parameters that the file does not mention.
+    Numbers that are equal as 32-bit floats, or differ by at most ``tolerance``, count as the same. ``names`` restricts
+    the comparison: ``diff(file, table, names=file)`` ignores parameters that the file does not have.
     """
     old, new = plain_values(before), plain_values(after)
     chosen = dict.fromkeys(names) if names is not None else {**dict.fromkeys(old), **dict.fromkeys(new)}
@@ -153,16 +151,15 @@ def diff(
 
 
 def plain_values(values: ParameterValues) -> dict[str, int | float]:
-    """Name → number."""
     if isinstance(values, ParameterTable):
         return values.values_by_name()
-    return {name: each.value if isinstance(each, Parameter) else each for name, each in values.items()}
+    return {name: value.value if isinstance(value, Parameter) else value for name, value in values.items()}
 
 
-def _same(one: float | None, other: float | None, tolerance: float) -> bool:
-    if one is None or other is None:
-        return one is other
-    return same_value(one, other) or abs(one - other) <= tolerance
+def _same(left: float | None, right: float | None, tolerance: float) -> bool:
+    if left is None or right is None:
+        return left is right
+    return same_value(left, right) or abs(left - right) <= tolerance
 
 
 def _text(value: float | None) -> str:

@@ -1,4 +1,4 @@
-"""``BlockRequests``: which blocks of a file are asked for or sent next, how many at a time, and which of them again."""
+"""Windowed requests for the blocks of a file or log, and reassembly of their answers."""
 
 from __future__ import annotations
 
@@ -8,162 +8,156 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
+# Answers arrive in the order of their requests: one overtaken by this many later ones was lost.
 OVERTAKEN = 3
-"""Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
 
-AT_ONCE = 4
-"""ArduPilot keeps five requests waiting, drops what comes beside, and looks at them every 2 ms."""
+# ArduPilot queues five requests, drops further ones, and processes them every 2 ms.
+BURST_SIZE = 4
 
+# Between requests beyond a burst.
 SPACING_S = 0.002
-"""Between further ones."""
 
-SOON = 0.5
-"""An answer that comes within this part of the fastest round trip was to an earlier sending."""
+# An answer within this fraction of the fastest round trip belongs to an earlier sending.
+MIN_ROUND_TRIP_FRACTION = 0.5
 
-STEADY = 3
-"""So often in a row an answer may be overdue before requests come more rarely: radios lose single frames."""
+# Consecutive timeouts before requests back off, because radios lose single frames.
+TIMEOUTS_BEFORE_BACKOFF = 3
 
 
 class AdaptiveWindow:
-    """How many requests may be under way: as many as the link carries without their answers taking longer.
+    """Number of requests in flight: as many as the link carries without delaying their answers.
 
-    It grows while answers come as fast as the fastest ones, and shrinks when they take much longer: they wait in a
-    queue then. Loss says nothing, radios lose frames; only when most is lost, something is too full.
+    It grows while answers arrive as fast as the fastest ones, and shrinks when they take much longer, because they then
+    wait in a queue. Loss does not shrink it unless most requests are lost, because radios lose frames at any rate.
     """
 
-    def __init__(self, *, start: int = 4, lowest: int = 2, highest: int = 64) -> None:
+    def __init__(self, *, start: int = 4, min_size: int = 2, max_size: int = 64) -> None:
         self._size = float(start)
-        self._lowest, self._highest = lowest, highest
+        self._min_size, self._max_size = min_size, max_size
         self._fastest_s: float | None = None
         self._loss = 0.0
 
     @property
     def size(self) -> int:
-        """Requests that may be under way."""
+        """Requests that may be in flight."""
         return int(self._size)
 
     def widen(self, size: float) -> None:
-        """So many answers fit into a round trip, as is known from elsewhere: begin with as many requests."""
-        self._size = max(self._size, min(size, self._highest / 2))
+        """Raise the size to the number of answers that are known to fit into one round trip."""
+        self._size = max(self._size, min(size, self._max_size / 2))
 
-    def answered(self, seconds: float | None) -> None:
-        """An answer came so long after its request; None when that is not known for sure."""
+    def on_answer(self, seconds: float | None) -> None:
+        """Record an answer ``seconds`` after its request; None if it is unclear which sending it answers."""
         self._loss -= self._loss / 16
         if seconds is None:
             return
         if self._fastest_s is None or seconds < self._fastest_s:
             self._fastest_s = seconds
         if seconds <= 1.25 * self._fastest_s + 0.01:
-            self._size = min(self._highest, self._size + 0.5)
+            self._size = min(self._max_size, self._size + 0.5)
         elif seconds > 2.0 * self._fastest_s + 0.05:
-            self._size = max(self._lowest, self._size - 0.25)
+            self._size = max(self._min_size, self._size - 0.25)
 
-    def lost(self) -> None:
-        """No answer came in time."""
+    def on_loss(self) -> None:
+        """Record a request without an answer."""
         self._loss += (1.0 - self._loss) / 16
         if self._loss > 0.75:
-            self._size = max(self._lowest, self._size / 2)
+            self._size = max(self._min_size, self._size / 2)
             self._loss = 0.5
 
 
 class _Block:
-    __slots__ = ("attempts", "before_at", "order", "sent_at")
+    __slots__ = ("attempts", "number", "previous_sent_at", "sent_at")
 
     def __init__(self) -> None:
-        self.attempts = self.order = 0
-        self.before_at = self.sent_at = 0.0
+        self.attempts = self.number = 0
+        self.previous_sent_at = self.sent_at = 0.0
 
 
 class BlockRequests:
-    """Requests for blocks by their offsets, a window of them under way; beyond ``at_once`` they are sent ``spacing_s``
-    seconds apart.
+    """Requests for blocks, identified by their offsets, with an adaptive window of them in flight.
 
-    One is sent again when its answer is overdue (:class:`RoundTrip`), or when later ones were answered before it.
+    The first ``burst_size`` requests are sent at once, further ones ``spacing_s`` seconds apart. A request is repeated
+    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
-    def __init__(
-        self, round_trip: RoundTrip, *, at_once: int = AT_ONCE, spacing_s: float = SPACING_S
-    ) -> None:
+    def __init__(self, round_trip: RoundTrip, *, burst_size: int = BURST_SIZE, spacing_s: float = SPACING_S) -> None:
         self.window: AdaptiveWindow = AdaptiveWindow()
-        self._round_trip, self._at_once, self._spacing_s = round_trip, at_once, spacing_s
+        self._round_trip, self._burst_size, self._spacing_s = round_trip, burst_size, spacing_s
         self._waiting: dict[int, None] = {}
-        self._under_way: dict[int, _Block] = {}  # in the order of sending
+        self._in_flight: dict[int, _Block] = {}  # in the order of sending
         self._blocks: dict[int, _Block] = {}
-        self._orders = 0
-        self._silent = 0
-        self._busy_at = self._free_at = float("-inf")
+        self._sent_count = 0
+        self._timeouts = 0
+        self._busy_until = self._free_at = float("-inf")
         self._is_held_back = False
 
     def __len__(self) -> int:
-        return len(self._waiting) + len(self._under_way)
-
-    @property
-    def under_way(self) -> int:
-        """How many wait for their answers."""
-        return len(self._under_way)
+        return len(self._waiting) + len(self._in_flight)
 
     @property
     def deadline(self) -> float | None:
-        """When an answer is overdue or another request may be sent; None while none is waited for."""
-        overdue_at = min((self._due_at(block) for block in self._under_way.values()), default=None)
+        """Time at which an answer is overdue or another request may be sent; None while none is in flight."""
+        overdue_at = min((self._due_at(block) for block in self._in_flight.values()), default=None)
         if self._is_held_back and overdue_at is not None:
             return min(overdue_at, self._free_at)
         return overdue_at
 
-    def ask(self, offset: int) -> None:
-        """Have it sent as soon as there is room; nothing happens when it waits or is under way."""
-        if offset not in self._under_way:
+    def request(self, offset: int) -> None:
+        """Queue a request, unless one is waiting or in flight."""
+        if offset not in self._in_flight:
             self._waiting[offset] = None
 
-    def forget(self, offset: int) -> None:
-        """Send it no more: the block came another way."""
+    def discard(self, offset: int) -> None:
+        """Drop the request for a block, for example because the block arrived in a burst."""
         self._waiting.pop(offset, None)
-        self._under_way.pop(offset, None)
+        self._in_flight.pop(offset, None)
         self._blocks.pop(offset, None)
 
-    def forget_from(self, end: int) -> None:
-        """There are no blocks from there on."""
-        for offset in [each for each in (*self._waiting, *self._under_way) if each >= end]:
-            self.forget(offset)
+    def discard_from(self, end: int) -> None:
+        """Drop the requests for all blocks from ``end`` on."""
+        for offset in [offset for offset in (*self._waiting, *self._in_flight) if offset >= end]:
+            self.discard(offset)
 
-    def busy(self, until: float) -> None:
-        """The server has something else to do: nothing is overdue, and no answer measures."""
-        self._busy_at = until
+    def set_busy(self, until: float) -> None:
+        """Suspend timeouts and round-trip measurements, because the server is sending a burst."""
+        self._busy_until = until
 
-    def answered(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
-        """Its answer has come; ``sent_at``: to the request that was sent then, None when that is not known."""
+    def on_answer(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
+        """Record an answer. ``sent_at`` is the time of the sending that it answers, if known."""
         block = self._blocks.get(offset)
-        self.forget(offset)
+        self.discard(offset)
         if block is None:
             return
         if sent_at is None:
             sent_at = self._answered_sending(block, now)
-        self._silent = 0
-        if sent_at is None or sent_at <= self._busy_at:
-            self.window.answered(None)
+        self._timeouts = 0
+        if sent_at is None or sent_at <= self._busy_until:
+            self.window.on_answer(None)
             return
-        self._round_trip.measured(now - sent_at)
-        self.window.answered(now - sent_at)
+        self._round_trip.add_sample(now - sent_at)
+        self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._give_up_overtaken(block.order)
+            self._requeue_overtaken(block.number)
 
     def _answered_sending(self, block: _Block, now: float) -> float | None:
-        """When that was sent which was answered, as far as it can be told."""
+        """Return the time of the sending that was answered, or None if unclear."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0
-        return block.before_at if now - block.sent_at < SOON * fastest_s else None  # not long enough
+        is_too_early = now - block.sent_at < MIN_ROUND_TRIP_FRACTION * fastest_s
+        return block.previous_sent_at if is_too_early else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
-        """The offsets to be sent now, first those to be sent again; they count as sent. ``limit``: of the window."""
-        overdue = [offset for offset, block in self._under_way.items() if self._due_at(block) <= now]
-        self._put_first(overdue)
-        self._silent += bool(overdue)
+        """Return the offsets to request now, retries first, and count them as sent. ``limit`` restricts the window."""
+        overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
+        self._requeue(overdue)
+        self._timeouts += bool(overdue)
         size = self.window.size if limit is None else min(limit, self.window.size)
         due: list[int] = []
         self._is_held_back = False
-        while self._waiting and len(self._under_way) < size:
-            if len(self._under_way) >= self._at_once:
+        while self._waiting and len(self._in_flight) < size:
+            if len(self._in_flight) >= self._burst_size:
                 if now < self._free_at:
                     self._is_held_back = True
                     break
@@ -175,40 +169,41 @@ class BlockRequests:
         return due
 
     def _due_at(self, block: _Block) -> float:
-        return max(block.sent_at, self._busy_at) + self._round_trip.timeout_s(max(1, self._silent - STEADY))
+        backoff = max(1, self._timeouts - TIMEOUTS_BEFORE_BACKOFF)
+        return max(block.sent_at, self._busy_until) + self._round_trip.timeout_s(backoff)
 
     def _send(self, offset: int, now: float) -> None:
-        self._orders += 1
+        self._sent_count += 1
         block = self._blocks.setdefault(offset, _Block())
         block.attempts += 1
-        block.order, block.before_at, block.sent_at = self._orders, block.sent_at, now
-        self._under_way[offset] = block
+        block.number, block.previous_sent_at, block.sent_at = self._sent_count, block.sent_at, now
+        self._in_flight[offset] = block
 
-    def _give_up_overtaken(self, order: int) -> None:
+    def _requeue_overtaken(self, number: int) -> None:
         overtaken = []
-        for offset, block in self._under_way.items():
-            if block.order > order - OVERTAKEN:
+        for offset, block in self._in_flight.items():
+            if block.number > number - OVERTAKEN:
                 break
             overtaken.append(offset)
-        self._put_first(overtaken)
+        self._requeue(overtaken)
 
-    def _put_first(self, offsets: list[int]) -> None:
+    def _requeue(self, offsets: list[int]) -> None:
         if offsets:
             for offset in offsets:
-                del self._under_way[offset]
-                self.window.lost()
+                del self._in_flight[offset]
+                self.window.on_loss()
             self._waiting = {**dict.fromkeys(offsets), **self._waiting}
 
 
 WriteBytes = Callable[[bytes], object]
-"""Takes the next bytes of a file."""
+"""A function that takes the next bytes of a file."""
 
 
 class Reassembly:
-    """Puts the blocks of one file into their order; ``write`` gets them one after the other.
+    """Reassembles the blocks of one file, and passes them to ``write`` in order.
 
-    So what was written is always the beginning of the file, whatever happens next. Blocks begin ``start`` plus a
-    multiple of ``block_size`` bytes into the file; only the last one is shorter.
+    What was written is therefore always the beginning of the file. Blocks start at ``start`` plus a multiple of
+    ``block_size`` bytes; only the last one may be shorter.
     """
 
     position: int
@@ -217,29 +212,28 @@ class Reassembly:
         self.start: int = start
         self.block_size: int = block_size
         self.position = start
-        """Everything before this was written."""
+        """Offset up to which everything was written."""
         self.tail: int = start
-        """The end of the last block that has come."""
+        """End of the last block received."""
         self.end: int | None = None
-        """Where the file ends; None while that is not known."""
+        """Size of the file; None while unknown."""
         self.gaps: dict[int, None] = {}
-        """The blocks before ``tail`` that are missing, by their offsets, in order."""
+        """Offsets of the missing blocks before ``tail``, in order."""
         self._write = write
         self._ahead: dict[int, bytes] = {}
         self._bytes_ahead = 0
 
     @property
     def done(self) -> int:
-        """Bytes that are there, those of the beginning that were there before included."""
+        """Bytes received, including those before ``start``."""
         return self.position + self._bytes_ahead
 
     @property
     def is_complete(self) -> bool:
-        """Whether all of the file has come."""
         return self.end is not None and self.position >= self.end
 
     def add(self, offset: int, data: bytes) -> bool:
-        """Take one block; whether it was missing. One that is shorter than the others is the last."""
+        """Add a block, and return True if it was missing. A block shorter than ``block_size`` ends the file."""
         if not data or (offset - self.start) % self.block_size or not self._is_missing(offset):
             return False
         if offset >= self.tail:
@@ -257,22 +251,22 @@ class Reassembly:
         return True
 
     def end_at(self, end: int) -> None:
-        """The file is known to end there; of several ends the first one counts."""
+        """Set the size of the file. The smallest one counts."""
         if self.end is not None and self.end <= end:
             return
         self.end = end
-        for offset in [each for each in self.gaps if each >= end]:
+        for offset in [offset for offset in self.gaps if offset >= end]:
             del self.gaps[offset]
-        for offset in [each for each in self._ahead if each >= end]:
+        for offset in [offset for offset in self._ahead if offset >= end]:
             self._bytes_ahead -= len(self._ahead.pop(offset))
         if self.tail < end:
             self.gaps.update(dict.fromkeys(range(self.tail, end, self.block_size)))
         self.tail = max(end, self.position)
 
     def missing(self, size: int | None = None) -> tuple[tuple[int, int], ...]:
-        """What has not come, as (offset, size); ``size`` is that of the file, as far as it is known.
+        """Return the missing ranges as (offset, size); ``size`` is the expected size of the file, if known.
 
-        A size of 0 means from there to an end that nobody knows.
+        A range of size 0 means from there to an unknown end.
         """
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:

@@ -1,4 +1,4 @@
-"""What every request to a vehicle has in common, without IO and without a clock."""
+"""Base classes of all protocol exchanges with a vehicle. Sans-IO: no sockets, tasks or clocks."""
 
 from __future__ import annotations
 
@@ -13,30 +13,31 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
 __all__ = [
-    "PATIENCE_S",
-    "EarlyAnswers",
+    "IDLE_TIMEOUT_S",
     "Exchange",
+    "MessageStream",
     "OnProgress",
-    "Progress",
     "RoundTrip",
+    "StaleAnswerFilter",
     "Transfer",
     "TransferOptions",
-    "ranges",
+    "TransferProgress",
+    "format_ranges",
 ]
 
 ResultT = TypeVar("ResultT")
 
 
 class Exchange(ABC, Generic[ResultT]):
-    """One request to one vehicle with its retries and its end.
+    """One request to one vehicle, with retries and a result.
 
-    A driver calls ``start`` once, ``receive`` for every message of ``expects`` that the target sends, ``expire`` when
-    ``deadline`` has come, and sends what ``take_outbox`` gives after each of them, until ``done``.
-    Times are seconds on any steady clock, as long as it is always the same one.
+    A driver calls ``start`` once, ``receive`` for every message of the classes in ``expects`` from the target, and
+    ``expire`` at ``deadline``. After each call it sends what ``take_outbox`` returns, until ``done`` is True.
+    Times are seconds on any monotonic clock.
     """
 
     expects: tuple[type[Message], ...] = ()
-    """The message classes that ``receive`` wants to see."""
+    """The message classes to pass to ``receive``."""
 
     def __init__(self) -> None:
         self.deadline: float | None = None
@@ -47,34 +48,34 @@ class Exchange(ABC, Generic[ResultT]):
 
     @abstractmethod
     def start(self, now: float) -> None:
-        """Put the first message into the outbox and set the deadline."""
+        """Queue the first message and set the deadline."""
 
     @abstractmethod
     def receive(self, message: Message, now: float) -> None:
-        """Take one message of the target; what does not belong to this request is ignored."""
+        """Process a message from the target. Messages that do not belong to this request are ignored."""
 
     @abstractmethod
     def expire(self, now: float) -> None:
-        """The deadline has come: send again or give up. Not called once it is ``done``."""
+        """Retry or fail, because the deadline has passed. Not called once ``done``."""
 
     def link_changed(self, now: float) -> None:
-        """The vehicle is spoken to over another link from now on, by another port of it.
+        """Handle a switch to another link, and so to another port of the vehicle.
 
-        Most exchanges send again what got no answer. One whose state the vehicle keeps for the port begins anew.
+        Most exchanges only retry what was not answered. One whose state the vehicle keeps for each port restarts.
         """
         return
 
     def abort(self, error: Exception) -> None:
-        """End at once with this error, unless the end was there before."""
+        """End with this error, unless already done."""
         self._fail(error)
 
     def take_outbox(self) -> list[Message]:
-        """What has to be sent now; the second call gives nothing."""
+        """Return the messages to send now, and clear the outbox."""
         outbox, self._outbox = self._outbox, []
         return outbox
 
     def result(self) -> ResultT:
-        """What came of it; raises the error it ended with. Only once ``done``."""
+        """Return the result, or raise the error with which the exchange ended. Only valid once ``done``."""
         if self._error is not None:
             raise self._error
         if not self.done:
@@ -92,38 +93,36 @@ class Exchange(ABC, Generic[ResultT]):
             self.deadline = None
 
 
+# The smoothing factors and the number of deviations of TCP (RFC 6298).
 GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
-
 DEVIATIONS = 4.0
 
-SPARE_S = 0.03
-"""What the vehicle's main loop and the resolution of clocks add, however steady the answers come."""
+# Added by the vehicle's main loop and the clock resolution, however regular the answers are.
+JITTER_S = 0.03
 
 BACKOFF = 1.5
-
-MOST_BACKOFFS = 30
+MAX_BACKOFFS = 30
 
 
 class RoundTrip:
-    """Smoothed round-trip time of one vehicle, shared by its transfers.
+    """Smoothed round-trip time to one vehicle, shared by its transfers.
 
-    Only answers to requests that were sent once count: of one sent again nobody knows which was answered.
+    Only answers to requests that were sent once are measured (Karn's algorithm): an answer after a retry may belong to
+    either sending.
     """
 
-    def __init__(
-        self, initial_s: float | None = None, *, shortest_s: float = 0.05, longest_s: float = 2.0
-    ) -> None:
+    def __init__(self, initial_s: float | None = None, *, min_s: float = 0.05, max_s: float = 2.0) -> None:
         self.smoothed_s: float | None = None
-        """Seconds; None before the first measurement."""
+        """Smoothed round-trip time in seconds; None before the first measurement."""
         self.fastest_s: float | None = None
-        """Seconds of the fastest one so far; nothing can be an answer sooner."""
+        """The shortest round-trip time so far, in seconds."""
         self._deviation_s = 0.0
-        self._shortest_s, self._longest_s = shortest_s, longest_s
+        self._min_s, self._max_s = min_s, max_s
         if initial_s is not None:
-            self.measured(initial_s)
+            self.add_sample(initial_s)
 
-    def measured(self, seconds: float) -> None:
-        """An answer came so many seconds after its only request."""
+    def add_sample(self, seconds: float) -> None:
+        """Record the time from a request, sent once, to its answer."""
         self.fastest_s = seconds if self.fastest_s is None else min(self.fastest_s, seconds)
         if self.smoothed_s is None:
             self.smoothed_s, self._deviation_s = seconds, seconds / 2
@@ -132,25 +131,70 @@ class RoundTrip:
         self.smoothed_s += GAIN * (seconds - self.smoothed_s)
 
     def timeout_s(self, attempt: int = 1) -> float:
-        """Seconds to wait for the answer to the ``attempt``-th sending (from 1) before sending again.
+        """Seconds to wait for the answer to the ``attempt``-th sending, counted from 1, before the next retry.
 
-        The second attempt waits as long as the first, since radios lose single frames; later ones wait longer, as for
-        a link that is choked or gone.
+        The second attempt waits as long as the first, because radios lose single frames. Later ones back off, because
+        the link may be congested or down.
         """
         if self.smoothed_s is None:
-            first = min(1.0, self._longest_s)
+            first = min(1.0, self._max_s)
         else:
-            first = self.smoothed_s + max(DEVIATIONS * self._deviation_s, SPARE_S)
-        patient = max(first, self._shortest_s) * BACKOFF ** min(max(0, attempt - 2), MOST_BACKOFFS)
-        return min(patient, max(self._longest_s, first))
+            first = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
+        backed_off = max(first, self._min_s) * BACKOFF ** min(max(0, attempt - 2), MAX_BACKOFFS)
+        return min(backed_off, max(self._max_s, first))
 
 
-PATIENCE_S = 10.0
-"""How long a transfer goes on asking while nothing comes, unless the caller says otherwise."""
+# The probability that a radio loses this many messages in a row is negligible: the vehicle has stopped sending.
+SILENT_MESSAGES = 10
 
 
-class Progress(Snapshot):
-    """How far a transfer is: ``done`` of ``total`` (None: not known yet) parameters, items or bytes."""
+class MessageStream:
+    """Tracks the messages that follow one request, and when they must have ended.
+
+    The stream has ended when nothing arrives for much longer than the interval between two messages.
+    """
+
+    def __init__(self, round_trip: RoundTrip) -> None:
+        self._round_trip = round_trip
+        self._interval = RoundTrip(min_s=0.001)
+        self._received_at: float | None = None
+        self._last_at = 0.0
+        self.failures: int = 0
+        """Consecutive requests without any message; counted by the owner."""
+
+    @property
+    def interval_s(self) -> float | None:
+        """Smoothed seconds between two messages."""
+        return self._interval.smoothed_s
+
+    @property
+    def due_at(self) -> float:
+        """Time at which the stream has ended, or failed to start, unless messages arrive."""
+        silence = self._round_trip.timeout_s(max(1, self.failures - 1))
+        if self._received_at is not None and self._interval.smoothed_s is not None:
+            silence += max(SILENT_MESSAGES * self._interval.smoothed_s, self._interval.timeout_s())
+        return self._last_at + silence
+
+    def on_request(self, now: float) -> None:
+        """Record that the request is sent."""
+        self._last_at, self._received_at = now, None
+
+    def on_message(self, now: float, messages: int) -> None:
+        """Record a message that comes ``messages`` places after the previous one."""
+        if self._received_at is not None and messages > 0:
+            self._interval.add_sample((now - self._received_at) / messages)
+        elif self._received_at is None and self.failures == 0:
+            self._round_trip.add_sample(now - self._last_at)
+        self._last_at = self._received_at = now
+        self.failures = 0
+
+
+IDLE_TIMEOUT_S = 10.0
+"""Default seconds without progress after which a transfer fails."""
+
+
+class TransferProgress(Snapshot):
+    """Progress of a transfer: ``done`` of ``total`` parameters, items or bytes. ``total`` is None while unknown."""
 
     done: int
     total: int | None
@@ -158,52 +202,54 @@ class Progress(Snapshot):
 
     @property
     def fraction(self) -> float | None:
-        """0 to 1; None while the total is not known."""
+        """Progress from 0 to 1; None while the total is unknown."""
         if self.total is None:
             return None
         return self.done / self.total if self.total else 1.0
 
     @property
     def rate(self) -> float:
-        """Parameters, items or bytes per second since the start; 0 before any time has passed."""
+        """Parameters, items or bytes per second since the start."""
         return self.done / self.elapsed_s if self.elapsed_s > 0 else 0.0
 
 
-_MOST_RANGES = 10
+_MAX_RANGES = 10
 
 
-def ranges(numbers: Iterable[int]) -> str:
-    """Numbers as text: ``3, 7–12``; of many ranges the first ten, and how many more there are."""
+def format_ranges(numbers: Iterable[int]) -> str:
+    """Format numbers as ranges: ``3, 7–12``. Beyond ten ranges, only the count of the others follows."""
     found: list[tuple[int, int]] = []
     for number in sorted(numbers):
         if found and number == found[-1][1] + 1:
             found[-1] = (found[-1][0], number)
         else:
             found.append((number, number))
-    text = ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in found[:_MOST_RANGES])
-    more = len(found) - _MOST_RANGES
+    text = ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in found[:_MAX_RANGES])
+    more = len(found) - _MAX_RANGES
     return f"{text} and {more} more ranges" if more > 0 else text
 
 
-OnProgress = Callable[[Progress], None]
+OnProgress = Callable[[TransferProgress], None]
 
 
 class TransferOptions(TypedDict, total=False):
-    """What transfers hand on to their base."""
+    """Keyword arguments that subclasses pass on to `Transfer`."""
 
     round_trip: RoundTrip | None
-    patience_s: float
+    idle_timeout_s: float
     on_progress: OnProgress | None
 
 
 class Transfer(Exchange[ResultT]):
-    """An exchange of many messages with one component. It ends when all is there, or when nothing has come for
-    ``patience_s`` seconds; what did come sets that clock back, so that a long transfer over a bad radio ends well.
+    """An exchange of many messages with one component.
+
+    It fails after ``idle_timeout_s`` seconds without progress. A long transfer over a bad radio succeeds while anything
+    new arrives.
     """
 
-    # from start() on
+    # set by start()
     _started_at: float
-    _moved_at: float
+    _progress_at: float
 
     def __init__(
         self,
@@ -211,61 +257,60 @@ class Transfer(Exchange[ResultT]):
         target_component: int,
         *,
         round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         on_progress: OnProgress | None = None,
     ) -> None:
         super().__init__()
-        if not patience_s > 0:
-            raise InvalidArgument(f"patience_s = {patience_s!r} is not allowed: above 0")
+        if not idle_timeout_s > 0:
+            raise InvalidArgument(f"idle_timeout_s = {idle_timeout_s!r} is not allowed: above 0")
         self.target_system: int = target_system
         self.target_component: int = target_component
         self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip
-        self._patience_s = patience_s
+        self._idle_timeout_s = idle_timeout_s
         self._on_progress = on_progress
 
-    def _begin(self, now: float) -> None:
-        """Time starts to count."""
-        self._started_at = self._moved_at = now
+    def _start_clock(self, now: float) -> None:
+        self._started_at = self._progress_at = now
 
-    def _move(self, now: float, done: int, total: int | None) -> None:
-        """Something new has come: tell the caller, and be patient again."""
-        self._moved_at = now
+    def _report_progress(self, now: float, done: int, total: int | None) -> None:
+        self._progress_at = now
         if self._on_progress is not None:
-            self._on_progress(Progress(done, total, now - self._started_at))
+            self._on_progress(TransferProgress(done, total, now - self._started_at))
 
-    def _is_out_of_patience(self, now: float) -> bool:
-        return now >= self._moved_at + self._patience_s  # as the deadline is computed, to the last bit
+    @property
+    def _idle_deadline(self) -> float:
+        return self._progress_at + self._idle_timeout_s
+
+    def _is_idle(self, now: float) -> bool:
+        return now >= self._idle_deadline
 
     def _is_from_target(self, message: Message) -> bool:
-        """Whether the component we talk to sent it; other components of the same vehicle do not count."""
         frame = message.received_frame
-        return frame is None or (
-            frame.system_id == self.target_system and frame.component_id == self.target_component
-        )
+        return frame is None or (frame.system_id == self.target_system and frame.component_id == self.target_component)
 
 
-SOONEST = 0.5
-"""An answer takes at least this part of the fastest round trip so far."""
+# No answer arrives in less than this fraction of the fastest round trip so far.
+MIN_ROUND_TRIP_FRACTION = 0.5
 
-EARLY_ONES = 2
-"""Early after more sendings than that, it is the vehicle that has become faster: one that was busy at first would be
-asked, and not be believed, until nobody has patience any more."""
+# After more early answers than this, the vehicle has become faster. Without the limit, one that was slow at first would
+# be asked until the idle timeout.
+MAX_EARLY_ANSWERS = 2
 
 
-class EarlyAnswers:
-    """What is too early for an answer to the last sending is a late or repeated one to something before."""
+class StaleAnswerFilter:
+    """Detects answers that arrive too early to belong to the last request: late or repeated answers to earlier ones."""
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
-        self._sendings: dict[str, set[float]] = {}
+        self._early: dict[str, set[float]] = {}
 
-    def is_one(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
-        """Whether what comes now can be no answer to what was asked about this name, the ``attempts``-th time."""
+    def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
+        """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``."""
         elapsed_s = now - sent_at
-        if elapsed_s >= SOONEST * (self._round_trip.fastest_s or 0.0):
+        if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False
         if attempts == 1:
-            self._round_trip.measured(elapsed_s)  # perhaps this vehicle is so fast: believe it next time
-        sendings = self._sendings.setdefault(name, set())
-        sendings.add(sent_at)
-        return len(sendings) <= EARLY_ONES
+            self._round_trip.add_sample(elapsed_s)  # the vehicle may be this fast: accept the next such answer
+        early = self._early.setdefault(name, set())
+        early.add(sent_at)
+        return len(early) <= MAX_EARLY_ANSWERS

@@ -1,9 +1,7 @@
-"""MAVFTP on the wire: what is in the payload of FILE_TRANSFER_PROTOCOL, its numbers, and its errors in words.
+"""MAVFTP messages, errors and single requests (https://mavlink.io/en/services/ftp.html).
 
-See https://mavlink.io/en/services/ftp.html.
-
-A request that is sent again keeps its sequence number: the servers keep their last reply and give it again, so that
-nothing is done twice. A new request gets a new number.
+A retried request keeps its sequence number: servers keep their last reply and repeat it, so that no operation is
+executed twice. A new request gets a new number.
 """
 
 from __future__ import annotations
@@ -15,13 +13,12 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.exchange import PATIENCE_S, OnProgress, Transfer
+from aerokit.protocols.exchange import Transfer, TransferOptions
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    from typing_extensions import Self, Unpack
 
     from aerokit.mavlink.message import Message
-    from aerokit.protocols.exchange import RoundTrip
 
 __all__ = [
     "DATA_SIZE",
@@ -36,10 +33,10 @@ __all__ = [
 ]
 
 DATA_SIZE = 239
-"""Bytes of data in one message at most."""
+"""Maximum number of data bytes in one message."""
 
 PATH_SIZE = DATA_SIZE - 1
-"""Bytes of a path at most: both ArduPilot and PX4 overwrite the last byte of a longer one with their NUL."""
+"""Maximum number of bytes of a path. ArduPilot and PX4 overwrite the last byte of a longer one with NUL."""
 
 HEADER = struct.Struct("<HBBBBBxI")
 
@@ -47,32 +44,33 @@ PAYLOAD_SIZE = HEADER.size + DATA_SIZE
 
 CODES: dict[int, str] = {
     MavFtpErr.NONE: "no reason given",
-    MavFtpErr.FAIL: "it failed, no reason given",
-    MavFtpErr.FAILERRNO: "it failed",
-    MavFtpErr.INVALIDDATASIZE: "the size of the data is not valid",
+    MavFtpErr.FAIL: "the operation failed, no reason given",
+    MavFtpErr.FAILERRNO: "the operation failed",
+    MavFtpErr.INVALIDDATASIZE: "invalid data size",
     MavFtpErr.INVALIDSESSION: "no file is open in this session, or another program has one open",
     MavFtpErr.NOSESSIONSAVAILABLE: "another program has a file open, or left one open",
     MavFtpErr.EOF: "end of file",
-    MavFtpErr.UNKNOWNCOMMAND: "the vehicle does not know this operation",
-    MavFtpErr.FILEEXISTS: "it exists already",
-    MavFtpErr.FILEPROTECTED: "it is write protected",
+    MavFtpErr.UNKNOWNCOMMAND: "the vehicle does not support this operation",
+    MavFtpErr.FILEEXISTS: "the file or directory already exists",
+    MavFtpErr.FILEPROTECTED: "the file is write-protected",
     MavFtpErr.FILENOTFOUND: "no such file or directory",
 }
 
+# Error numbers of Linux, NuttX and newlib, which agree in the small ones.
 ERRNOS = {
-    1: ("EPERM", "not permitted"),
+    1: ("EPERM", "operation not permitted"),
     2: ("ENOENT", "no such file or directory"),
-    5: ("EIO", "input or output error"),
-    9: ("EBADF", "the file is not open for that"),
-    11: ("EAGAIN", "not now, try again"),
+    5: ("EIO", "input/output error"),
+    9: ("EBADF", "the file is not open for this operation"),
+    11: ("EAGAIN", "temporarily unavailable, try again"),
     12: ("ENOMEM", "out of memory"),
     13: ("EACCES", "permission denied"),
     16: ("EBUSY", "busy"),
-    17: ("EEXIST", "it exists already"),
+    17: ("EEXIST", "the file or directory already exists"),
     19: ("ENODEV", "no such device"),
     20: ("ENOTDIR", "not a directory"),
     21: ("EISDIR", "it is a directory"),
-    22: ("EINVAL", "not valid"),
+    22: ("EINVAL", "invalid argument"),
     23: ("ENFILE", "too many open files"),
     24: ("EMFILE", "too many open files"),
     27: ("EFBIG", "the file is too large"),
@@ -86,7 +84,6 @@ ERRNOS = {
     91: ("ENAMETOOLONG", "the name is too long"),
     95: ("EOPNOTSUPP", "not supported"),
 }
-"""Of Linux, NuttX and newlib, which agree in the small numbers."""
 
 OPERATIONS: dict[int, str] = {
     MavFtpOpcode.TERMINATESESSION: "close",
@@ -110,7 +107,7 @@ OPERATIONS: dict[int, str] = {
 class FtpMessage(Snapshot):
     """The payload of one FILE_TRANSFER_PROTOCOL message, a request or a reply.
 
-    ``size`` is that of ``data``, except in READFILE and BURSTREADFILE, where it says how much is wanted.
+    ``size`` is the length of ``data``, except in READFILE and BURSTREADFILE, where it is the number of bytes requested.
     """
 
     sequence: int
@@ -124,14 +121,14 @@ class FtpMessage(Snapshot):
 
     @classmethod
     def decode(cls, payload: bytes, *, cut: bool = True) -> Self:
-        """Read a payload; ``data`` is cut to ``size``, or all 239 bytes. Never raises for bytes off the air."""
+        """Decode a payload of any bytes. ``data`` is cut to ``size``, or with ``cut=False`` to 239 bytes."""
         payload = payload.ljust(PAYLOAD_SIZE, b"\0")
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)
         data = payload[HEADER.size : HEADER.size + size if cut else PAYLOAD_SIZE]
         return cls(sequence, opcode, session, size, request_opcode, burst_complete != 0, offset, data)
 
     def encode(self) -> bytes:
-        """The 251 bytes of the payload."""
+        """Encode the 251 bytes of the payload."""
         head = HEADER.pack(
             self.sequence,
             self.session,
@@ -145,25 +142,24 @@ class FtpMessage(Snapshot):
 
     @property
     def is_ack(self) -> bool:
-        """Whether it is the answer to a request that was carried out."""
         return self.opcode == MavFtpOpcode.ACK
 
     @property
     def error_code(self) -> int:
-        """The reason of a NAK, a MAV_FTP_ERR; FAIL when it gives none."""
+        """The MAV_FTP_ERR of a NAK; FAIL if it gives none."""
         return self.data[0] if self.data else MavFtpErr.FAIL
 
     @property
     def errno(self) -> int | None:
-        """The system's error number behind FAILERRNO."""
+        """The error number of the vehicle's operating system, if the error is FAILERRNO."""
         return self.data[1] if len(self.data) > 1 and self.data[0] == MavFtpErr.FAILERRNO else None
 
 
 def path_bytes(path: str) -> bytes:
-    """A path as it is sent.
+    """Encode a path for a request.
 
     Raises:
-        InvalidArgument: it is empty, not text that UTF-8 can encode, has a NUL, or is longer than 238 bytes.
+        InvalidArgument: it is empty, not encodable as UTF-8, has a NUL, or is longer than 238 bytes.
     """
     if not isinstance(path, str):
         raise InvalidArgument(f"path = {path!r} is not allowed: text")
@@ -175,15 +171,15 @@ def path_bytes(path: str) -> bytes:
         raise InvalidArgument(f"path = {path!r} is not allowed: not empty, without NUL")
     if len(encoded) > PATH_SIZE:
         raise InvalidArgument(
-            f"path = {path!r} is not allowed: {len(encoded)} bytes, one message has room for {PATH_SIZE}"
+            f"path = {path!r} is not allowed: {len(encoded)} bytes, at most {PATH_SIZE} fit into a message"
         )
     return encoded
 
 
 def file_error(request_opcode: int, path: str, code: int, errno: int | None) -> FileError:
-    """The error for a NAK: operation, path, and the reason by name and in words."""
+    """Create the error for a NAK."""
     operation = OPERATIONS.get(request_opcode, f"operation {request_opcode}")
-    text = CODES.get(code, "not known to the standard")
+    text = CODES.get(code, "unknown error code")
     name = MavFtpErr(code).name if code in CODES else f"code {code}"
     if errno is not None:
         errno_name, text = ERRNOS.get(errno, (f"errno {errno}", text))
@@ -197,33 +193,31 @@ SEQUENCES = 0x10000
 
 SESSIONS = 255
 
+# Before it answers, the vehicle reads the whole file, or saves what was written to it.
 SLOW_REQUESTS = (MavFtpOpcode.CALCFILECRC, MavFtpOpcode.TERMINATESESSION)
-"""The vehicle reads a whole file, or takes over what was written to it, before it answers."""
-
 SLOW_ANSWER_S = 0.25
 
-MOST_RENUMBERED = 3
+MAX_RENUMBERED = 3
 
-STEADY = 3
-"""So often it is sent again before that happens ever more rarely: radios lose single frames."""
+# Attempts before retries back off, because radios lose single frames.
+ATTEMPTS_BEFORE_BACKOFF = 3
 
 NEED_SESSION = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)
 
+# Answers to them while no file is open: INVALIDSESSION from PX4, FILENOTFOUND from ArduPilot, and FILEEXISTS from a PX4
+# that has answered FILEEXISTS once and then repeats it for any refusal until another operation fails with an errno.
 NO_SESSION = (MavFtpErr.INVALIDSESSION, MavFtpErr.FILENOTFOUND, MavFtpErr.FILEEXISTS)
-"""What they are answered when no file is open: by PX4, by ArduPilot, and by a PX4 that has said once that a file exists
-already: it says so of whatever it refuses until another operation fails in the system.
-"""
 
 
 class FtpSessionLost(FileError):
-    """The vehicle has closed the file: another program's session, its own time-out, or a reboot."""
+    """The vehicle closed the file: because of another program, its own timeout, or a reboot."""
 
 
 class FtpClient:
-    """What the exchanges of one client with one server share: addresses, sequence numbers, session numbers.
+    """State shared by all exchanges of one client with one server: addresses, sequence and session numbers.
 
-    ``first_sequence`` should differ from program to program: the servers answer a request that has the number of the
-    one before with the reply of the one before.
+    ``first_sequence`` should differ between programs, because a server that receives the sequence number of its last
+    request again repeats its last reply.
     """
 
     def __init__(
@@ -243,22 +237,22 @@ class FtpClient:
         self._session = first_sequence
 
     def next_sequence(self, replies: int = 1) -> int:
-        """The number of a new request. ``replies``: at most so many numbers after it are used in its replies."""
+        """Return the sequence number of a new request, and reserve the next ``replies`` numbers for its replies."""
         sequence = self._sequence % SEQUENCES
         self._sequence = sequence + replies
         return sequence
 
     def next_session(self) -> int:
-        """The number of a new session, 1–255. ArduPilot takes it; PX4 answers with its own, which is always 0."""
+        """Return a new session number, 1–255. ArduPilot uses it; PX4 answers with its own, which is always 0."""
         self._session = self._session % SESSIONS + 1
         return self._session
 
     def message(self, request: FtpMessage) -> FileTransferProtocol:
-        """The request as a message to the server."""
+        """Wrap a request into a MAVLink message to the server."""
         return FileTransferProtocol(0, self.target_system, self.target_component, request.encode())
 
     def is_for_us(self, message: FileTransferProtocol) -> bool:
-        """Whether it is addressed to us; servers may leave the address out."""
+        """Return True if the message is addressed to this client, or not addressed at all."""
         return message.target_system in (0, self.source_system) and message.target_component in (
             0,
             self.source_component,
@@ -266,30 +260,16 @@ class FtpClient:
 
 
 class FtpExchange(Transfer[ResultT]):
-    """What one request, a download and an upload have in common."""
+    """Base class of requests, downloads and uploads."""
 
     expects: tuple[type[Message], ...] = (FileTransferProtocol,)
 
-    def __init__(
-        self,
-        client: FtpClient,
-        path: str,
-        *,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
-    ) -> None:
-        super().__init__(
-            client.target_system,
-            client.target_component,
-            round_trip=round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
-        )
+    def __init__(self, client: FtpClient, path: str, **options: Unpack[TransferOptions]) -> None:
+        super().__init__(client.target_system, client.target_component, **options)
         self._client, self._path = client, path
 
     def receive(self, message: Message, now: float) -> None:
-        """Take a message; replies of this server to us are looked at."""
+        """Process a message. Only replies of this server to this client count."""
         if self.done or not isinstance(message, FileTransferProtocol):
             return
         if self._is_from_target(message) and self._client.is_for_us(message):
@@ -311,16 +291,16 @@ class FtpExchange(Transfer[ResultT]):
 
 
 class FtpRequest(FtpExchange[FtpMessage]):
-    """One request and its answer, for everything that takes one message: the result is the ACK.
+    """One request with a single reply. The result is the ACK.
 
     Args:
-        path: for the texts of errors.
-        is_sent: it was sent already, outside of this exchange.
+        path: used in error texts.
+        is_sent: True if the request was already sent outside this exchange.
     """
 
     attempts: int
 
-    # from start() on
+    # set by start()
     _sent_at: float
 
     def __init__(
@@ -333,12 +313,11 @@ class FtpRequest(FtpExchange[FtpMessage]):
         offset: int = 0,
         data: bytes = b"",
         is_sent: bool = False,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
+        **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(client, path, round_trip=round_trip, patience_s=patience_s)
+        super().__init__(client, path, **options)
         self.attempts = 0
-        """How often it was sent."""
+        """Number of times the request was sent."""
         self._request = FtpMessage(
             client.next_sequence(), opcode, session=session, size=len(data), offset=offset, data=data
         )
@@ -347,34 +326,30 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     @property
     def message(self) -> FileTransferProtocol:
-        """The request as it is sent."""
         return self._client.message(self._request)
 
     @property
     def path(self) -> str:
-        """What it is about."""
         return self._path
 
     @property
     def session(self) -> int:
-        """The session that it names."""
         return self._request.session
 
     @property
     def is_answered(self) -> bool:
-        """Whether it was carried out."""
+        """True if the vehicle acknowledged the request."""
         return self._result is not None
 
     def start(self, now: float) -> None:
-        """Send it, unless that was done."""
-        self._begin(now)
+        """Send the request, unless ``is_sent``."""
+        self._start_clock(now)
         self._transmit(now)
         if self._is_sent:
             self._outbox.clear()
 
     def expire(self, now: float) -> None:
-        """Send it again, or give up."""
-        if self._is_out_of_patience(now):
+        if self._is_idle(now):
             self._fail(FileTimeout(f"{self._operation} {self._path}: no answer to {self.attempts} requests"))
         else:
             self._transmit(now)
@@ -386,10 +361,10 @@ class FtpRequest(FtpExchange[FtpMessage]):
         self._wait(now)
 
     def _wait(self, now: float) -> None:
-        timeout_s = self.round_trip.timeout_s(max(1, self.attempts - STEADY))
+        timeout_s = self.round_trip.timeout_s(max(1, self.attempts - ATTEMPTS_BEFORE_BACKOFF))
         if self._request.opcode == MavFtpOpcode.CALCFILECRC:
             timeout_s += SLOW_ANSWER_S * (self.attempts - 1)
-        self.deadline: float | None = min(now + timeout_s, self._moved_at + self._patience_s)
+        self.deadline: float | None = min(now + timeout_s, self._idle_deadline)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.sequence != (self._request.sequence + 1) % SEQUENCES:
@@ -398,12 +373,12 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._renumber(now)
         else:
             if self.attempts == 1 and self._request.opcode not in SLOW_REQUESTS:
-                self.round_trip.measured(now - self._sent_at)
+                self.round_trip.add_sample(now - self._sent_at)
             self._end(reply)
 
     def _renumber(self, now: float) -> None:
-        """The server took it for the request before, which had the same number, and gave that one's reply again."""
-        if self._renumbered < MOST_RENUMBERED:
+        # The server mistook it for its previous request, which had the same sequence number, and repeated that reply.
+        if self._renumbered < MAX_RENUMBERED:
             self._renumbered += 1
             self._request = self._request.replace(sequence=self._client.next_sequence())
             self._sent_at = now
@@ -411,24 +386,24 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
-        """ArduPilot finishes a burst before it looks at the next request."""
+        # ArduPilot finishes a burst before it processes the next request.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
-            self._moved_at = now
+            self._progress_at = now
             self._wait(now)
 
     def _end(self, reply: FtpMessage) -> None:
-        if reply.is_ack or self._is_done_before(reply):
+        if reply.is_ack or self._was_done_before(reply):
             self._finish(reply)
         else:
             self._fail(self._refused(reply))
 
-    def _is_done_before(self, reply: FtpMessage) -> bool:
-        """A NAK says that what was asked for is so already."""
+    def _was_done_before(self, reply: FtpMessage) -> bool:
         opcode, code = self._request.opcode, reply.error_code
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            return True  # there is no such session, or no longer
+            return True  # the session does not exist, or no longer
         if self.attempts == 1:
-            return False  # else: an earlier sending did it, and its answer was lost
+            return False
+        # An earlier sending may have done it, and its answer was lost.
         if opcode in (MavFtpOpcode.REMOVEFILE, MavFtpOpcode.REMOVEDIRECTORY):
             return code == MavFtpErr.FILENOTFOUND
         return opcode == MavFtpOpcode.CREATEDIRECTORY and code == MavFtpErr.FILEEXISTS

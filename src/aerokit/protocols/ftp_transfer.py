@@ -1,13 +1,14 @@
-"""MAVFTP: the content of an open file, down by bursts and up by many writes at a time.
+"""MAVFTP downloads by bursts, and uploads by windowed writes.
 
-What servers do (ArduPilot 4.7, PX4 1.17), and what follows from it:
+Behaviour of servers (ArduPilot 4.7, PX4 1.17) that determines this design:
 
-- A burst is answered by blocks without further requests. ArduPilot sends 500 of them and looks at nothing else
-  meanwhile; five requests wait, more are dropped. PX4 answers reads while it bursts, and a new burst replaces the
-  one under way. So missing blocks are asked for at once, four at a time while the burst goes on, more afterwards.
-- Blocks are always asked for whole and at multiples of their size: ``@PARAM/param.pck`` is packed for one block size.
-- The size that ArduPilot gives for what begins with ``@`` is a guess. Only the end of file tells.
-- The end of file of a burst comes as a NAK. ArduPilot's has the offset of the last block when that one was full.
+- A burst request is answered by blocks without further requests. ArduPilot sends 500 of them and processes nothing else
+  meanwhile; it queues five requests and drops further ones. PX4 answers reads during a burst, and a new burst request
+  replaces the current one. So missing blocks are requested at once: four at a time during a burst, more afterwards.
+- Requests are always for whole blocks at multiples of the block size: ``@PARAM/param.pck`` is packed for one block
+  size.
+- The size that ArduPilot reports for files whose names begin with ``@`` is an estimate. Only the EOF error is reliable.
+- The EOF error of a burst is a NAK. If the last block was full, ArduPilot's NAK has the offset of that block.
 """
 
 from __future__ import annotations
@@ -17,40 +18,43 @@ from typing import TYPE_CHECKING, NamedTuple
 from aerokit.errors import FileTimeout, RemoteProtocolError
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.blocks import BlockRequests
-from aerokit.protocols.exchange import PATIENCE_S, OnProgress, RoundTrip
+from aerokit.protocols.exchange import RoundTrip, TransferOptions
 from aerokit.protocols.ftp import DATA_SIZE, SEQUENCES, FtpClient, FtpExchange, FtpMessage
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from aerokit.protocols.blocks import Reassembly
 
 __all__ = ["FtpDownload", "FtpUpload", "is_virtual"]
 
+# Errors with which servers refuse bursts altogether.
 NO_BURST = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
-WHILE_BURSTING = 4
-MOST_GAPS = 512
-"""With more blocks missing than that, they are fetched before the burst goes on: their followers are in memory."""
+WINDOW_DURING_BURST = 4
+# With more missing blocks than this, they are requested before the next burst, because the blocks after them are held
+# in memory.
+MAX_GAPS = 512
 BURST_BLOCKS = 500
 BUSY_BLOCKS = 3
-FIRST_BLOCK_S = 0.5
-"""A slow radio carries a few blocks in that time."""
+# A slow radio carries a few blocks in this time.
+FIRST_BLOCK_TIMEOUT_S = 0.5
 SHORT_FILE = 20 * DATA_SIZE
-MOST_REPEATED = 3
-MOST_BURSTS = 32
-"""So many that may still be on their way are remembered."""
-MOST_AHEAD = SEQUENCES // 2 * DATA_SIZE
-"""Beyond that, the number of a block could mean another one, too."""
+MAX_REPEATED_BURSTS = 3
+# Bursts whose blocks may still arrive.
+MAX_BURSTS = 32
+# Beyond this distance, the sequence number of a block is ambiguous.
+MAX_BLOCK_DISTANCE = SEQUENCES // 2 * DATA_SIZE
+# The probability of losing this many blocks in a row is negligible: the burst has not started, or has ended.
 FIRST_BLOCKS, SILENT_BLOCKS = 4, 10
-"""So many blocks in a row are hardly ever lost: the burst has ended."""
 
 
 def is_virtual(path: str) -> bool:
-    """Whether the vehicle makes this file up when it is read: its size is a guess, and so is its checksum."""
+    """Return True if the vehicle generates the file when it is read: its size and checksum are estimates."""
     return path.startswith("@")
 
 
-class _Sent(NamedTuple):
-    """A request for one block: every sending has its own number, so that its answer measures."""
-
+class _SentRequest(NamedTuple):
+    # Each sending has its own sequence number, so that every answer measures the round trip.
     offset: int
     at: float
 
@@ -61,16 +65,16 @@ class _Burst(NamedTuple):
     sent_at: float
 
     def blocks_before(self, reply: FtpMessage) -> int:
-        """How many blocks were sent before this reply to it."""
+        """Return the number of blocks sent before this reply to the burst."""
         return (reply.sequence - self.sequence - 1) % SEQUENCES
 
-    def has_sent(self, reply: FtpMessage) -> bool:
-        """Whether this block is of this burst: number and place belong together."""
+    def contains(self, reply: FtpMessage) -> bool:
+        """Return True if sequence number and offset of this block both fit the burst."""
         blocks, rest = divmod(reply.offset - self.offset, DATA_SIZE)
         return rest == 0 and blocks >= 0 and blocks % SEQUENCES == self.blocks_before(reply)
 
     def end(self, reply: FtpMessage) -> int | None:
-        """Where the file ends according to this NAK; None when it is not of this burst."""
+        """Return the end of the file according to this NAK, or None if it does not belong to the burst."""
         blocks = self.blocks_before(reply)
         if blocks == 0:
             return self.offset
@@ -81,11 +85,13 @@ class _Burst(NamedTuple):
 
 
 class FtpDownload(FtpExchange[int]):
-    """All of an open file from ``into.position`` on; the result is its size. ``into`` keeps what came in any case.
+    """Download of an open file from ``into.position`` on. The result is its size.
+
+    ``into`` keeps the blocks received, even if the download fails.
 
     Args:
-        session: of the open file.
-        size: what the server said of it when it was opened.
+        session: the session of the open file.
+        size: the size that the server reported on opening.
     """
 
     def __init__(
@@ -96,43 +102,37 @@ class FtpDownload(FtpExchange[int]):
         *,
         session: int,
         size: int,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
+        **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(client, path, round_trip=round_trip, patience_s=patience_s, on_progress=on_progress)
+        super().__init__(client, path, **options)
         self._into, self._session = into, session
         self._size = None if is_virtual(path) or size == 0 else size
-        self._seen = into.position
+        self._scanned = into.position
         self._requests = BlockRequests(self.round_trip)
-        self._reads: dict[int, _Sent] = {}
-        """By their sequence numbers."""
+        self._reads: dict[int, _SentRequest] = {}  # by sequence number
         self._bursts: list[_Burst] = []
         self._is_bursting = False
-        self._burst_fails = 0
-        self._repeated_bursts = 0
-        """So many were asked for since something new has come."""
-        self._sent: dict[int, int] = {}
-        """Bursts by their numbers, and how many blocks of each have been sent, as far as is known."""
-        self._has_burst = True
+        self._failed_bursts = 0
+        self._repeated_bursts = 0  # bursts requested since the last new block
+        self._blocks_sent: dict[int, int] = {}  # highest block number of each burst, by its sequence number
+        self._supports_bursts = True
         self._burst_at = 0.0
         self._last_block: tuple[_Burst | None, float, int] = (None, 0.0, -1)
-        self._interval = RoundTrip(shortest_s=0.001)
+        self._interval = RoundTrip(min_s=0.001)
 
     def start(self, now: float) -> None:
-        """Ask for the first burst, and for the blocks that are missing already."""
-        self._begin(now)
-        self._go_on(now)
+        """Request the first burst, and the blocks that are missing already."""
+        self._start_clock(now)
+        self._proceed(now)
 
     def expire(self, now: float) -> None:
-        """Ask again for what is overdue, or give up."""
-        if self._is_out_of_patience(now):
+        if self._is_idle(now):
             self._fail(self._timed_out())
             return
         if self._is_bursting and now >= self._burst_due_at:
             self._is_bursting = False
-            self._burst_fails += 1
-        self._go_on(now)
+            self._failed_bursts += 1
+        self._proceed(now)
 
     # ------------------------------------------------------------------------------- replies
 
@@ -144,64 +144,62 @@ class FtpDownload(FtpExchange[int]):
             if sent is not None:
                 self._receive_read(sent, reply, now)
         if not self.done:
-            self._go_on(now)
+            self._proceed(now)
 
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
         for burst in reversed(self._bursts):
-            if reply.is_ack and burst.has_sent(reply):
-                self._take_block(burst, reply, now)
+            if reply.is_ack and burst.contains(reply):
+                self._on_block(burst, reply, now)
                 return
             end = None if reply.is_ack else burst.end(reply)
             if end is not None:
                 self._end_burst(burst, end, reply)
                 return
 
-    def _take_block(self, burst: _Burst, reply: FtpMessage, now: float) -> None:
+    def _on_block(self, burst: _Burst, reply: FtpMessage, now: float) -> None:
         if not self._is_plausible(reply.offset):
             return
         is_latest = burst is self._bursts[-1]
-        self._note_time(burst, burst.blocks_before(reply), now)
-        self._burst_at, self._burst_fails = now, 0
-        self._requests.busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
+        self._measure(burst, burst.blocks_before(reply), now)
+        self._burst_at, self._failed_bursts = now, 0
+        self._requests.set_busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
         if is_latest and reply.burst_complete:
             self._stop_bursting()
         self._add(reply.offset, reply.data, now)
 
-    def _note_time(self, burst: _Burst, number: int, now: float) -> None:
-        """How long answers take, and how fast the blocks follow each other.
-
-        While a burst goes on the vehicle is not silent, even if we have its blocks from another one already.
-        """
-        if number > self._sent.get(burst.sequence, -1) and self._repeated_bursts <= MOST_REPEATED:
-            self._sent[burst.sequence], self._moved_at = number, now
-        last, before_at, before = self._last_block
-        if last is None and number == 0 and len(self._bursts) == 1:  # else one before it may be sent first
-            self.round_trip.measured(now - burst.sent_at)
-        elif last is burst and number > before:
-            self._interval.measured((now - before_at) / (number - before))
-        self._last_block = (burst, now, max(number, before) if last is burst else number)
+    def _measure(self, burst: _Burst, number: int, now: float) -> None:
+        # A burst counts as progress even if its blocks are known from another burst, but not endlessly.
+        if number > self._blocks_sent.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
+            self._blocks_sent[burst.sequence], self._progress_at = number, now
+        last, previous_at, previous = self._last_block
+        # A later burst may have to wait for the end of the one before it, so only the first one measures.
+        if last is None and number == 0 and len(self._bursts) == 1:
+            self.round_trip.add_sample(now - burst.sent_at)
+        elif last is burst and number > previous:
+            self._interval.add_sample((now - previous_at) / (number - previous))
+        self._last_block = (burst, now, max(number, previous) if last is burst else number)
 
     def _stop_bursting(self) -> None:
-        """The blocks have shown how many of them a round trip has room for."""
         self._is_bursting = False
+        # The interval between blocks shows how many fit into a round trip.
         if self._interval.smoothed_s and self.round_trip.smoothed_s:
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
     def _end_burst(self, burst: _Burst, end: int, reply: FtpMessage) -> None:
         is_latest = burst is self._bursts[-1]
         if is_latest:
-            self._burst_fails = 0
+            self._failed_bursts = 0
             self._stop_bursting()
         if reply.error_code == MavFtpErr.EOF:
             self._end_at(end)
         elif is_latest and reply.error_code in NO_BURST and self._into.done == self._into.start:
-            self._has_burst = False
+            self._supports_bursts = False
         elif is_latest:
             self._fail(self._refused(reply))
 
-    def _receive_read(self, sent: _Sent, reply: FtpMessage, now: float) -> None:
+    def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
         offset = sent.offset
-        self._requests.answered(offset, now, sent_at=sent.at)
+        self._requests.on_answer(offset, now, sent_at=sent.at)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
         elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
@@ -211,14 +209,14 @@ class FtpDownload(FtpExchange[int]):
 
     def _end_at(self, end: int) -> None:
         self._into.end_at(end)
-        self._requests.forget_from(end)
+        self._requests.discard_from(end)
 
     def _is_plausible(self, offset: int) -> bool:
-        """Whether a block can be there. What lies far behind all others would make millions of gaps."""
-        return not self._is_past_size(offset) and offset - self._into.tail < MOST_AHEAD
+        # A block far behind all others would create millions of gaps.
+        return not self._is_past_size(offset) and offset - self._into.tail < MAX_BLOCK_DISTANCE
 
     def _is_past_size(self, offset: int) -> bool:
-        """PX4 says that a file exists already where it means its end, once it has said so of another file."""
+        # PX4 answers FILEEXISTS instead of EOF once it has answered FILEEXISTS to another request.
         return self._size is not None and offset >= self._size
 
     def _add(self, offset: int, data: bytes, now: float) -> None:
@@ -226,18 +224,18 @@ class FtpDownload(FtpExchange[int]):
             data = data[: self._size - offset]  # the file may have grown
         try:
             is_new = self._into.add(offset, data)
-        except Exception as error:  # the disk is full: nothing that comes from now on can be kept
+        except Exception as error:  # the disk is full, for example
             self._fail(error)
             return
         if is_new:
             self._repeated_bursts = 0
-            self._requests.forget(offset)
-            self._move(now, self._into.done, self._total)
+            self._requests.discard(offset)
+            self._report_progress(now, self._into.done, self._total)
 
     # -------------------------------------------------------------------------------- requests
 
-    def _go_on(self, now: float) -> None:
-        """Finish, or ask for whatever can be asked for now."""
+    def _proceed(self, now: float) -> None:
+        """Finish, or send the requests that are due."""
         into = self._into
         if self._size is not None and into.position >= self._size:
             self._finish(into.position)
@@ -245,67 +243,65 @@ class FtpDownload(FtpExchange[int]):
         if into.is_complete:
             self._end()
             return
-        self._ask_for_gaps()
-        if not self._has_burst:
-            self._ask_ahead()
-        limit = WHILE_BURSTING if self._is_bursting else None
+        self._request_gaps()
+        if not self._supports_bursts:
+            self._request_ahead()
+        limit = WINDOW_DURING_BURST if self._is_bursting else None
         for offset in self._requests.take_due(now, limit=limit):
             self._read(offset, now)
-        if self._wants_burst:
+        if self._needs_burst:
             self._burst(now)
         self._set_deadline()
 
-    def _ask_for_gaps(self) -> None:
-        """Those that were not seen before."""
-        while self._seen < self._into.tail:
-            if self._seen in self._into.gaps:
-                self._requests.ask(self._seen)
-            self._seen += DATA_SIZE
+    def _request_gaps(self) -> None:
+        while self._scanned < self._into.tail:
+            if self._scanned in self._into.gaps:
+                self._requests.request(self._scanned)
+            self._scanned += DATA_SIZE
 
     @property
-    def _wants_burst(self) -> bool:
-        if self._is_bursting or not self._has_burst or self._into.end is not None:
+    def _needs_burst(self) -> bool:
+        if self._is_bursting or not self._supports_bursts or self._into.end is not None:
             return False
-        is_all_sent = self._size is not None and self._into.tail >= self._size
-        return not is_all_sent and len(self._into.gaps) < MOST_GAPS
+        was_sent_completely = self._size is not None and self._into.tail >= self._size
+        return not was_sent_completely and len(self._into.gaps) < MAX_GAPS
 
-    def _ask_ahead(self) -> None:
-        """Without bursts, ask for the blocks behind the last one, too."""
+    def _request_ahead(self) -> None:
         if self._into.end is None:
             for number in range(self._requests.window.size):
-                self._requests.ask(self._into.tail + number * DATA_SIZE)
+                self._requests.request(self._into.tail + number * DATA_SIZE)
 
     def _read(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()
-        self._reads[sequence] = _Sent(offset, now)
+        self._reads[sequence] = _SentRequest(offset, now)
         self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, self._session, DATA_SIZE, offset=offset))
 
     def _burst(self, now: float) -> None:
-        """Ask for everything behind the last block. The numbers of its replies are kept free: else a server might take
-        a later request for this one, and give its last reply again.
-        """
+        """Request everything after the last block."""
         offset = self._into.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
+        # The sequence numbers of the replies are reserved. Otherwise a server might mistake a later request for this
+        # one, and repeat its last reply.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCES // 2))
-        self._bursts = [*self._bursts[1 - MOST_BURSTS :], _Burst(sequence, offset, now)]
+        self._bursts = [*self._bursts[1 - MAX_BURSTS :], _Burst(sequence, offset, now)]
         self._is_bursting, self._burst_at = True, now
         self._repeated_bursts += 1
         self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
 
     @property
     def _burst_due_at(self) -> float:
-        """When the burst must have ended, or was never begun."""
-        silence = self.round_trip.timeout_s(1 + self._burst_fails)
+        """Time at which the burst has ended, or failed to start, unless blocks arrive."""
+        silence = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
-            if self._size is not None and self._size > SHORT_FILE:  # a second burst of it would take long
-                silence = max(silence, FIRST_BLOCK_S)
+            if self._size is not None and self._size > SHORT_FILE:  # repeating a long burst is expensive
+                silence = max(silence, FIRST_BLOCK_TIMEOUT_S)
         else:
             blocks = SILENT_BLOCKS if self._last_block[0] is self._bursts[-1] else FIRST_BLOCKS
             silence += max(blocks * self._interval.smoothed_s, self._interval.timeout_s())
         return self._burst_at + silence
 
     def _set_deadline(self) -> None:
-        deadline = self._moved_at + self._patience_s
+        deadline = self._idle_deadline
         due_at = self._requests.deadline
         if due_at is not None:
             deadline = min(deadline, due_at)
@@ -320,28 +316,24 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._into.end is None else self._into.end
 
     def _end(self) -> None:
-        """The vehicle says that this is all: true unless it had said before that there is more."""
         end = self._into.position
         if self._size is None:
             self._finish(end)
         else:
-            self._fail(
-                RemoteProtocolError(
-                    f"read {self._path}: it ended after {end} of the {self._size} bytes it had"
-                )
-            )
+            text = f"read {self._path}: the file ended after {end} bytes, but its size is {self._size}"
+            self._fail(RemoteProtocolError(text))
 
     def _timed_out(self) -> FileTimeout:
         missing = self._into.missing(self._size)
         return FileTimeout(
-            f"read {self._path}: nothing has come for {self._patience_s:g} s, {self._into.done} bytes are there,"
-            f" {len(missing)} ranges are missing, the first one from {missing[0][0] if missing else 0} on",
+            f"read {self._path}: no data received for {self._idle_timeout_s:g} s; {self._into.done} bytes received,"
+            f" {len(missing)} ranges missing, the first from byte {missing[0][0] if missing else 0}",
             missing=missing,
         )
 
 
 class FtpUpload(FtpExchange[None]):
-    """Write ``data`` to an open file: by blocks, several at a time, each of them until it is acknowledged."""
+    """Upload of ``data`` to an open file: blocks are sent in a window and repeated until acknowledged."""
 
     def __init__(
         self,
@@ -350,38 +342,33 @@ class FtpUpload(FtpExchange[None]):
         data: bytes,
         *,
         session: int,
-        round_trip: RoundTrip | None = None,
-        patience_s: float = PATIENCE_S,
-        on_progress: OnProgress | None = None,
+        **options: Unpack[TransferOptions],
     ) -> None:
-        super().__init__(client, path, round_trip=round_trip, patience_s=patience_s, on_progress=on_progress)
+        super().__init__(client, path, **options)
         self._data, self._session = data, session
         self._requests = BlockRequests(self.round_trip)
         self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))
         self._written = 0
-        self._writes: dict[int, _Sent] = {}
-        """By their sequence numbers."""
+        self._writes: dict[int, _SentRequest] = {}  # by sequence number
 
     def start(self, now: float) -> None:
-        """Send the first blocks."""
-        self._begin(now)
+        self._start_clock(now)
         for offset in self._unwritten:
-            self._requests.ask(offset)
-        self._go_on(now)
+            self._requests.request(offset)
+        self._proceed(now)
 
     def expire(self, now: float) -> None:
-        """Send again what is overdue, or give up."""
-        if self._is_out_of_patience(now):
+        if self._is_idle(now):
             missing = tuple((offset, len(self._block(offset))) for offset in self._unwritten)
             self._fail(
                 FileTimeout(
-                    f"write {self._path}: nothing was acknowledged for {self._patience_s:g} s,"
-                    f" {len(missing)} of {-(-len(self._data) // DATA_SIZE)} blocks are missing",
+                    f"write {self._path}: no block acknowledged for {self._idle_timeout_s:g} s;"
+                    f" {len(missing)} of {-(-len(self._data) // DATA_SIZE)} blocks missing",
                     missing=missing,
                 )
             )
         else:
-            self._go_on(now)
+            self._proceed(now)
 
     def _receive_reply(self, reply: FtpMessage, now: float) -> None:
         if reply.request_opcode != MavFtpOpcode.WRITEFILE:
@@ -394,28 +381,25 @@ class FtpUpload(FtpExchange[None]):
             return
         offset = sent.offset
         del self._unwritten[offset]
-        self._requests.answered(offset, now, sent_at=sent.at)
+        self._requests.on_answer(offset, now, sent_at=sent.at)
         self._written += len(self._block(offset))
-        self._move(now, self._written, len(self._data))
-        self._go_on(now)
+        self._report_progress(now, self._written, len(self._data))
+        self._proceed(now)
 
-    def _go_on(self, now: float) -> None:
+    def _proceed(self, now: float) -> None:
         if not self._unwritten:
             self._finish(None)
             return
         for offset in self._requests.take_due(now):
             self._write(offset, now)
-        patient = self._moved_at + self._patience_s
         due_at = self._requests.deadline
-        self.deadline: float | None = patient if due_at is None else min(patient, due_at)
+        self.deadline: float | None = self._idle_deadline if due_at is None else min(self._idle_deadline, due_at)
 
     def _write(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()
-        self._writes[sequence] = _Sent(offset, now)
+        self._writes[sequence] = _SentRequest(offset, now)
         data = self._block(offset)
-        self._send(
-            FtpMessage(sequence, MavFtpOpcode.WRITEFILE, self._session, len(data), offset=offset, data=data)
-        )
+        self._send(FtpMessage(sequence, MavFtpOpcode.WRITEFILE, self._session, len(data), offset=offset, data=data))
 
     def _block(self, offset: int) -> bytes:
         return self._data[offset : offset + DATA_SIZE]

@@ -1,8 +1,6 @@
-"""What PARAM and PARAM_EXT have in common: the list with holes, requests by name, and when an answer counts.
+"""Base classes of the parameter protocols: lists with gaps, requests by name, and when an answer counts.
 
-https://mavlink.io/en/services/parameter.html
-
-https://mavlink.io/en/services/parameter_ext.html
+See https://mavlink.io/en/services/parameter.html and https://mavlink.io/en/services/parameter_ext.html.
 """
 
 from __future__ import annotations
@@ -13,8 +11,8 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from aerokit.errors import ParameterRejected, ParameterTimeout
-from aerokit.protocols.exchange import Transfer, ranges
-from aerokit.protocols.request_window import WINDOW, RequestWindow
+from aerokit.protocols.exchange import Transfer, format_ranges
+from aerokit.protocols.request_window import DEFAULT_SIZE, RequestWindow
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -25,49 +23,45 @@ if TYPE_CHECKING:
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
+# A list stream has stopped when nothing arrives for this many of its longest pauses.
 PAUSES = 4
-"""The stream of a list has stopped when nothing comes for so many of its longest pauses."""
-SHORTEST_START_S = 0.3
-"""A list may take that long to begin; asking again would make it begin anew."""
-ROUNDS = 3
-"""How often indices are asked for again that were told under another count."""
+# A list may take this long to start; requesting it again would restart it.
+MIN_START_TIMEOUT_S = 0.3
+# How often values that were received under another count are requested again.
+MAX_REFRESHES = 3
+# The index in requests by name.
 BY_NAME = -1
-"""The index in a request that names what it is about."""
+# The request for index 0, which every component with any parameters answers.
 PROBE, PROBE_INDEX = "", 0
-"""The request for a value that everybody has who has any."""
-DOUBT = 1e-4
-"""How probable it may be that there is such a name although nothing is said of it, while others are answered."""
-VERDICT, VERDICT_OF_NO_CHANGE = 2, 8
-"""So many answers with another value than asked for are a verdict; more when it is the value from before, which may
-also stand in a message that was under way, while what was to set it was lost."""
+# A name counts as unknown once the probability that all its answers were lost is below this.
+MAX_LOSS_PROBABILITY = 1e-4
+# This many answers with the same unexpected value settle a write. More are needed for the previous value, because it
+# may also be in a message sent before the write arrived.
+ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 
 class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
-    """Ask for a whole list once; a hole in the stream of answers is asked for by its index at once, in a window."""
+    """Request a whole list once, and request missing indices, in a window, as soon as a gap is seen."""
 
-    asked_by: ClassVar[str]
-    """The message that asks for the list."""
+    list_request_name: ClassVar[str]
     noun: ClassVar[str]
-    window_size: ClassVar[int] = WINDOW
+    window_size: ClassVar[int] = DEFAULT_SIZE
 
     def __init__(self, target_system: int, target_component: int, **options: Unpack[TransferOptions]) -> None:
         super().__init__(target_system, target_component, **options)
         self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=self.window_size)
-        self._told: dict[int, tuple[ValueT, int]] = {}
-        """Index → what was told last under it, and how many there were then."""
+        self._received: dict[int, tuple[ValueT, int]] = {}  # by index, with the count in the same message
         self._count: int | None = None
-        self._next = 0
-        """The index that the stream brings next."""
+        self._next = 0  # the next index of the stream
         self._is_streaming = False
         self._quiet_at: float | None = None
         self._last_at = self._pause_s = 0.0
-        self._attempts = self._rounds = 0
+        self._attempts = self._refreshes = 0
 
     def expire(self, now: float) -> None:
-        """Something is overdue: the beginning of the list, the rest of it, or an answer."""
         if self.deadline is None or now < self.deadline:
             return
-        if self._is_out_of_patience(now):
+        if self._is_idle(now):
             self._fail(ParameterTimeout(self._timeout_text(), missing=self._missing()))
             return
         if self._quiet_at is not None and now >= self._quiet_at:
@@ -76,32 +70,32 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
 
     @abstractmethod
     def _list_request(self) -> Message:
-        """Ask for all of them."""
+        """Return the request for the whole list."""
 
     @abstractmethod
     def _read_request(self, index: int) -> Message:
-        """Ask for one."""
+        """Return the request for one index."""
 
     @abstractmethod
     def _on_quiet(self, now: float) -> None:
-        """The stream has not begun, or has stopped before its end."""
+        """Handle a stream that has not started, or has stopped before its end."""
 
     @abstractmethod
     def _conclude(self) -> None:
-        """End when all is there, else have asked for what is missing."""
+        """Finish if complete, else queue requests for what is missing."""
 
-    def _ask_for_list(self, now: float) -> None:
+    def _send_list_request(self, now: float) -> None:
         self._attempts += 1
         self._is_streaming = True
         self._outbox.append(self._list_request())
-        self._quiet_at = now + max(self.round_trip.timeout_s(self._attempts), SHORTEST_START_S)
+        self._quiet_at = now + max(self.round_trip.timeout_s(self._attempts), MIN_START_TIMEOUT_S)
 
-    def _keep(self, index: int, value: ValueT, told_count: int, now: float) -> None:
-        is_new = index not in self._told
-        self._told[index] = value, told_count
+    def _store(self, index: int, value: ValueT, reported_count: int, now: float) -> None:
+        is_new = index not in self._received
+        self._received[index] = value, reported_count
         if is_new:
             count = self._count or 0
-            self._move(now, min(len(self._told), count), count)
+            self._report_progress(now, min(len(self._received), count), count)
 
     def _step(self, now: float) -> None:
         self._conclude()
@@ -109,36 +103,36 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             return
         for index in self._window.take_due(now):
             self._outbox.append(self._read_request(index))
-        times = (self._window.deadline, self._quiet_at, self._moved_at + self._patience_s)
+        times = (self._window.deadline, self._quiet_at, self._idle_deadline)
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
-        """Forget what was told under another count, a few times at most; the indices."""
-        stale = tuple(index for index in range(count) if self._told[index][1] != count)
-        if not stale or self._rounds >= ROUNDS:
+        """Drop values that were received under another count, a few times at most. Return their indices."""
+        stale = tuple(index for index in range(count) if self._received[index][1] != count)
+        if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
-        self._rounds += 1
+        self._refreshes += 1
         for index in stale:
-            del self._told[index]
+            del self._received[index]
         return stale
 
     def _missing(self) -> tuple[int, ...]:
-        return tuple(index for index in range(self._count or 0) if index not in self._told)
+        return tuple(index for index in range(self._count or 0) if index not in self._received)
 
     def _timeout_text(self) -> str:
         if self._count is None:
-            return f"{self.asked_by} was not answered, sent {self._attempts} times"
+            return f"{self.list_request_name} was not answered, sent {self._attempts} times"
         missing = self._missing()
         return (
-            f"{len(missing)} of {self._count} {self.noun} did not come: nothing new for {self._patience_s:g} s,"
-            f" missing {ranges(missing)}"
+            f"{len(missing)} of {self._count} {self.noun} did not come: nothing new for {self._idle_timeout_s:g} s,"
+            f" missing {format_ranges(missing)}"
         )
 
 
 class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTimeout"]], Generic[ValueT]):
-    """Ask for some names, a window of them at a time; ends with one answer for each, in the order given.
+    """Request some names, with a window of them in flight. The result has one answer for each, in the order given.
 
-    Where nothing new comes for ``patience_s`` seconds, what is missing becomes a ParameterTimeout.
+    After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout errors.
     """
 
     def __init__(
@@ -148,35 +142,31 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         names: Iterable[str],
         *,
         window: int,
-        doubles_last: bool = True,
+        duplicate_last: bool = True,
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._names = tuple(dict.fromkeys(names))
-        self._window: RequestWindow[str] = RequestWindow(
-            self.round_trip, size=window, doubles_last=doubles_last
-        )
+        self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window, duplicate_last=duplicate_last)
         self._answers: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}
 
     def start(self, now: float) -> None:
-        """Ask for the first of them."""
-        self._begin(now)
+        self._start_clock(now)
         for name in self._names:
-            self._window.ask(name)
+            self._window.request(name)
         self._step(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Take an answer; what was not asked for is ignored, as are other components."""
+        """Process an answer. Other messages, and those of other components, are ignored."""
         if not self.done and self._is_from_target(message):
-            self._hear(message, now)
+            self._on_message(message, now)
             self._step(now)
 
     def expire(self, now: float) -> None:
-        """An answer is overdue."""
         if self.deadline is None or now < self.deadline:
             return
-        if self._is_out_of_patience(now):
+        if self._is_idle(now):
             for name in self._names:
                 if name not in self._answers:
                     self._answers[name] = ParameterTimeout(self._timeout_text(name), missing=(name,))
@@ -184,25 +174,25 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
 
     @abstractmethod
     def _request(self, name: str) -> list[Message]:
-        """What is to be sent for this name now."""
+        """Return the messages to send for this name now."""
 
     @abstractmethod
-    def _hear(self, message: Message, now: float) -> None:
-        """The component has said something."""
+    def _on_message(self, message: Message, now: float) -> None:
+        """Process a message of the target."""
 
     def _timeout_text(self, name: str) -> str:
-        return f"{name} was not answered, asked for {self._window.attempts(name)} times"
+        return f"{name} was not answered, requested {self._window.attempts(name)} times"
 
     def _before_sending(self, now: float) -> None:
-        """The overdue ones are about to be sent again."""
+        """Called before due requests are sent."""
 
     def _after_sending(self, now: float) -> None:
-        """What was due has been sent."""
+        """Called after due requests were sent."""
 
     def _settle(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
-        self._window.forget(name)
+        self._window.discard(name)
         self._answers[name] = answer
-        self._move(now, len(self._answers), len(self._names))
+        self._report_progress(now, len(self._answers), len(self._names))
 
     def _step(self, now: float) -> None:
         if len(self._answers) < len(self._names):
@@ -214,21 +204,20 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
             self._outbox += self._request(name)
             self._sent_at[name] = now
         self._after_sending(now)
-        times = (self._window.deadline, self._moved_at + self._patience_s)
+        times = (self._window.deadline, self._idle_deadline)
         self.deadline: float | None = min(at for at in times if at is not None)
 
 
 class NamedReads(NamedRequests[ValueT]):
-    """Read some values by name. Silence about a name becomes a ParameterRejected, while the `PROBE` is answered."""
+    """Read some values by name. A name without an answer becomes a ParameterRejected while the `PROBE` is answered."""
 
-    whose: ClassVar[str]
-    """Who has no such value, and what it is called: "the vehicle has no parameter"."""
+    unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
     _is_probe_wanted = False
     _probes_sent = _probes_answered = 0
 
     @abstractmethod
     def _read_request(self, name: str, index: int) -> Message:
-        """Ask for one, by its name or by its index."""
+        """Return the request for one value, by name or by index."""
 
     def _request(self, name: str) -> list[Message]:
         self._probes_sent += name == PROBE
@@ -244,42 +233,40 @@ class NamedReads(NamedRequests[ValueT]):
         self._is_probe_wanted = False
 
     def _count_probe(self) -> None:
-        self._probes_answered = min(self._probes_answered + 1, self._probes_sent)  # repeated ones count once
+        self._probes_answered = min(self._probes_answered + 1, self._probes_sent)  # duplicates do not count
 
-    def _give_up_unknown(self, names: Iterable[str], now: float) -> None:
-        """Silence is an answer once it can hardly be loss."""
+    def _reject_unknown(self, names: Iterable[str], now: float) -> None:
         for name in names:
-            if self._probability_of_silence(self._window.attempts(name)) < DOUBT:
-                text = f"{self.whose} {name}: it answers others, and not this one"
+            if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
+                text = f"{self.unknown_text} {name}: it answers others but not this one"
                 self._settle(name, ParameterRejected(text, name=name), now)
 
-    def _probability_of_silence(self, attempts: int) -> float:
-        """How probable it is to lose all answers to so many requests, after what became of the probes (Laplace)."""
+    def _loss_probability(self, attempts: int) -> float:
+        """Estimate the probability of losing all answers to that many requests (rule of succession)."""
         lost = self._probes_sent - self._probes_answered
         chances = ((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
         return math.prod(chances) if self._probes_answered else 1.0
 
 
-class OtherAnswers(Generic[ValueT]):
-    """Answers to one write with another value than asked for, as far as they agree."""
+class UnexpectedAnswers(Generic[ValueT]):
+    """Consecutive answers to one write with the same value, other than the one requested."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same
-        self._told: list[ValueT] = []
+        self._answers: list[ValueT] = []
 
     def __len__(self) -> int:
-        return len(self._told)
+        return len(self._answers)
 
-    def ends_with(self, told: ValueT) -> bool:
-        """Whether the last one was the same."""
-        return bool(self._told) and self._is_same(self._told[-1], told)
+    def ends_with(self, answer: ValueT) -> bool:
+        return bool(self._answers) and self._is_same(self._answers[-1], answer)
 
-    def add(self, told: ValueT) -> None:
-        """One more; another one than before makes all of those worth nothing."""
-        if not self.ends_with(told):
-            self._told.clear()
-        self._told.append(told)
+    def add(self, answer: ValueT) -> None:
+        """Add an answer. If it differs from the previous ones, they are dropped."""
+        if not self.ends_with(answer):
+            self._answers.clear()
+        self._answers.append(answer)
 
-    def are_verdict(self, *, is_no_change: bool) -> bool:
-        """Whether this is what the value is."""
-        return len(self._told) >= (VERDICT_OF_NO_CHANGE if is_no_change else VERDICT)
+    def are_conclusive(self, *, is_unchanged: bool) -> bool:
+        """Return True if the last answer is final. ``is_unchanged``: it has the value from before the write."""
+        return len(self._answers) >= (ANSWERS_TO_SETTLE_UNCHANGED if is_unchanged else ANSWERS_TO_SETTLE)

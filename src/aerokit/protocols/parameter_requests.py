@@ -1,10 +1,6 @@
-"""What reading and writing parameters by name have in common: many at once, one result each.
+"""Reading and writing parameters by name, many at once.
 
-https://mavlink.io/en/services/parameter.html
-
-https://mavlink.io/en/services/parameter.html#read_single
-
-https://mavlink.io/en/services/parameter.html#write
+See https://mavlink.io/en/services/parameter.html#read_single and https://mavlink.io/en/services/parameter.html#write.
 """
 
 from __future__ import annotations
@@ -20,14 +16,14 @@ from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamValue
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
-from aerokit.protocols.exchange import EarlyAnswers
+from aerokit.protocols.exchange import StaleAnswerFilter
 from aerokit.protocols.named_values import (
     BY_NAME,
     PROBE,
     PROBE_INDEX,
     NamedReads,
     NamedRequests,
-    OtherAnswers,
+    UnexpectedAnswers,
 )
 
 if TYPE_CHECKING:
@@ -36,25 +32,25 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.protocols.exchange import TransferOptions
 
-__all__ = ["Answer", "ParameterReads", "ParameterRequests", "ParameterWrites", "rejection"]
+__all__ = ["ParameterAnswer", "ParameterReads", "ParameterRequests", "ParameterWrites", "rejection"]
 
-Answer = Parameter | ParameterRejected | ParameterTimeout
-"""What came of one request: what the vehicle says the parameter is, or why there is nothing to say."""
+ParameterAnswer = Parameter | ParameterRejected | ParameterTimeout
+"""Answer to one request: the parameter as the vehicle reports it, or the error."""
 
 ERRORS = {
     1: "the vehicle has no such parameter",
     2: "the vehicle does not accept this value",
     3: "the vehicle does not permit it",
     4: "the vehicle has no such component",
-    5: "it is read-only",
+    5: "the parameter is read-only",
     6: "the vehicle has no parameters of this type",
-    7: "it is of another type",
-    8: "the vehicle could not read it",
+    7: "the parameter has another type",
+    8: "the vehicle could not read the value",
 }
 
 
 class ParameterRequests(NamedRequests[Parameter]):
-    """Requests of PARAM; see the base."""
+    """Base class of the PARAM requests."""
 
     expects: tuple[type[Message], ...] = (ParamValue, ParamError)
 
@@ -66,53 +62,54 @@ class ParameterRequests(NamedRequests[Parameter]):
         *,
         bytewise: bool,
         window: int,
-        doubles_last: bool = True,
+        duplicate_last: bool = True,
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(
-            target_system, target_component, names, window=window, doubles_last=doubles_last, **options
+            target_system, target_component, names, window=window, duplicate_last=duplicate_last, **options
         )
         self._bytewise, self._own_system = bytewise, own_system
 
-    def _hear(self, message: Message, now: float) -> None:
+    def _on_message(self, message: Message, now: float) -> None:
         if isinstance(message, ParamValue):
-            self._take(message, now)
+            self._on_value(message, now)
         elif isinstance(message, ParamError) and message.target_system in (0, self._own_system):
-            self._take_error(message, now)
+            self._on_error(message, now)
 
     @abstractmethod
-    def _take(self, message: ParamValue, now: float) -> None:
-        """A value has come."""
+    def _on_value(self, message: ParamValue, now: float) -> None:
+        """Process a value."""
 
-    def _take_error(self, message: ParamError, now: float) -> None:
-        name = message.param_id  # PX4 fills what it does not use with anything: only the name counts
+    def _on_error(self, message: ParamError, now: float) -> None:
+        name = message.param_id  # only the name is reliable: PX4 does not initialise the other fields
         if name in self._names and name in self._window:
-            self._window.answered(name, now)
+            self._window.on_answer(name, now)
             self._settle(name, rejection(name, message.error), now)
 
 
 def rejection(name: str, code: int) -> ParameterRejected:
-    """The exception that stands for a PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR)."""
+    """Create the exception for a PARAM_ERROR (https://mavlink.io/en/messages/common.html#PARAM_ERROR)."""
     reason = ERRORS.get(code, f"MAV_PARAM_ERROR {code}")
     return ParameterRejected(f"{name} was refused: {reason}", name=name, code=code)
 
 
-READS_AT_ONCE = 20
+READ_WINDOW = 20
 
 
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
-    """Read some parameters by name; ends with one answer for each.
+    """Read some parameters by name. The result has one answer for each.
 
-    ArduPilot, and PX4 until 1.16, meet an unknown name with silence. So names that ``are_doubtful`` are asked for
-    together with the parameter of index 0, and when that one comes time and again, the vehicle has none of the name
-    that does not: the answer is a ParameterRejected without a code.
+    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. With ``probe=True``, overdue names are
+    requested together with the parameter of index 0. If that one is answered repeatedly, and a name is not, the answer
+    for the name is a ParameterRejected without a code.
 
-    Of a name and its ``rivals`` the vehicle has one at most: the others are rejected when that one has come.
-    An answer that tells a ``distrusted`` value may have been under way for long: it is believed the second time.
+    ``alternatives`` maps names to other names of the same parameter: the vehicle has at most one of them, so the others
+    are rejected when it answers. ``possibly_stale`` maps names to old values that a delayed message may still have:
+    such a value is accepted only the second time.
     """
 
-    whose = "the vehicle has no parameter"
+    unknown_text = "the vehicle has no parameter"
 
     def __init__(
         self,
@@ -121,9 +118,9 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
         names: Iterable[str],
         *,
         bytewise: bool,
-        are_doubtful: bool = False,
-        distrusted: Mapping[str, float] = MappingProxyType({}),
-        rivals: Mapping[str, Iterable[str]] = MappingProxyType({}),
+        probe: bool = False,
+        possibly_stale: Mapping[str, float] = MappingProxyType({}),
+        alternatives: Mapping[str, Iterable[str]] = MappingProxyType({}),
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
@@ -132,73 +129,73 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             target_component,
             names,
             bytewise=bytewise,
-            window=READS_AT_ONCE,
-            doubles_last=not are_doubtful,
+            window=READ_WINDOW,
+            duplicate_last=not probe,
             own_system=own_system,
             **options,
         )
-        self._are_doubtful = self._is_probe_wanted = are_doubtful
-        self._distrusted = dict(distrusted)
+        self._probe = self._is_probe_wanted = probe
+        self._possibly_stale = dict(possibly_stale)
         self._refused: set[str] = set()
-        self._rivals = {name: tuple(others) for name, others in rivals.items()}
+        self._alternatives = {name: tuple(others) for name, others in alternatives.items()}
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
     def _before_sending(self, now: float) -> None:
-        if self._are_doubtful and (overdue := self._overdue(now)):
-            self._give_up_unknown(overdue, now)
+        if self._probe and (overdue := self._overdue(now)):
+            self._reject_unknown(overdue, now)
             self._is_probe_wanted = True
 
-    def _take(self, message: ParamValue, now: float) -> None:
+    def _on_value(self, message: ParamValue, now: float) -> None:
         if message.param_index == PROBE_INDEX and self._window.attempts(PROBE):
             self._count_probe()
-            passed_over = self._window.answered(PROBE, now, overtaken=1)
-            self._give_up_unknown(passed_over, now)
-            self._is_probe_wanted |= bool(passed_over)
+            overtaken = self._window.on_answer(PROBE, now, overtaken=1)
+            self._reject_unknown(overtaken, now)
+            self._is_probe_wanted |= bool(overtaken)
         name = message.param_id
         if name and name in self._window:
-            self._window.answered(name, now)
-            told = parameter_of(message, self._bytewise)
-            old = self._distrusted.pop(name, None)
-            if old is not None and same_value(old, told.value):
-                self._window.ask(name)
+            self._window.on_answer(name, now)
+            reported = parameter_of(message, self._bytewise)
+            old = self._possibly_stale.pop(name, None)
+            if old is not None and same_value(old, reported.value):
+                self._window.request(name)
             else:
-                self._settle(name, told, now)
-                self._reject_rivals(name, now)
+                self._settle(name, reported, now)
+                self._reject_alternatives(name, now)
 
-    def _reject_rivals(self, name: str, now: float) -> None:
-        for other in self._rivals.get(name, ()):
+    def _reject_alternatives(self, name: str, now: float) -> None:
+        for other in self._alternatives.get(name, ()):
             if other in self._names and other not in self._answers:
-                text = f"the vehicle has no parameter {other}, it has {name}"
+                text = f"the vehicle has no parameter {other}; its name on this vehicle is {name}"
                 self._settle(other, ParameterRejected(text, name=other), now)
 
-    def _take_error(self, message: ParamError, now: float) -> None:
-        """PX4 says that there is no such parameter also when it has no room to send it: once more, then."""
+    def _on_error(self, message: ParamError, now: float) -> None:
+        # PX4 also answers DOES_NOT_EXIST if it has no room to send the value, so one retry follows.
         name = message.param_id
         is_first = name in self._names and name in self._window and name not in self._refused
         if is_first and message.error == MavParamError.DOES_NOT_EXIST:
             self._refused.add(name)
-            self._window.answered(name, now)
-            self._window.ask(name)
+            self._window.on_answer(name, now)
+            self._window.request(name)
         else:
-            super()._take_error(message, now)
+            super()._on_error(message, now)
 
 
-WRITES_AT_ONCE = 10
-"""ArduPilot saves through a queue of 30, which it must not overflow while it is armed."""
+# ArduPilot saves through a queue of 30, which must not overflow while it is armed.
+WRITE_WINDOW = 10
 
 
 class ParameterWrites(ParameterRequests):
-    """Set some parameters; ends with what the vehicle says each of them is then.
+    """Set some parameters. The result has the value of each afterwards, as the vehicle reports it.
 
-    The answer that tells value and type as asked for ends a write. When none comes the vehicle is asked what it has: a
-    PARAM_SET is never sent into a silence. Only an answer with the value from ``before`` (the one known so far) has it
-    set again; any other value is the vehicle's own (it rounds or clamps) or another station's, and is the answer
-    when it comes twice. So nothing is sent for ever, and nobody's later setting is undone.
+    An answer with the requested value and type completes a write. If none arrives, the value is read; PARAM_SET is
+    never simply repeated. It is sent again only if the vehicle reports the value from ``before``, the last known one.
+    Any other value is the vehicle's own (it rounds or clamps) or another station's, and is the result once it is
+    reported twice. So retries are bounded, and a later change by another station is not undone.
 
-    ``recent`` are names that were written a moment ago: echoes of that write
-    may still come, so that the first answer as asked is read back.
+    ``recent`` has names that were written a moment ago. Because echoes of that write may still arrive, the first
+    matching answer is verified by another read.
     """
 
     def __init__(
@@ -213,75 +210,68 @@ class ParameterWrites(ParameterRequests):
         own_system: int = 0,
         **options: Unpack[TransferOptions],
     ) -> None:
-        self._wanted = {each.name: each for each in wanted}
+        self._wanted = {parameter.name: parameter for parameter in wanted}
         super().__init__(
             target_system,
             target_component,
             self._wanted,
             bytewise=bytewise,
-            window=WRITES_AT_ONCE,
+            window=WRITE_WINDOW,
             own_system=own_system,
             **options,
         )
         self._before = dict(before)
         self._recent = set(recent)
-        self._to_set = set(self._wanted)
-        """Those that may be set with the next request."""
-        self._others: dict[str, OtherAnswers[Parameter]] = {}
-        self._early = EarlyAnswers(self.round_trip)
+        self._to_set = set(self._wanted)  # names whose next request is a PARAM_SET
+        self._unexpected: dict[str, UnexpectedAnswers[Parameter]] = {}
+        self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
-        wanted, others = self._wanted[name], self._others.get(name)
+        wanted, unexpected = self._wanted[name], self._unexpected.get(name)
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
             return [read]
         self._to_set.remove(name)
-        write = set_message(
-            self.target_system, self.target_component, name, wanted.value, wanted.type, self._bytewise
-        )
-        return [write, read] if others else [write]
+        write = set_message(self.target_system, self.target_component, name, wanted.value, wanted.type, self._bytewise)
+        return [write, read] if unexpected else [write]
 
-    def _take(self, message: ParamValue, now: float) -> None:
+    def _on_value(self, message: ParamValue, now: float) -> None:
         name = message.param_id
         if not self._window.attempts(name):
-            return  # it has not been sent yet
+            return  # not requested yet
         wanted = self._wanted[name]
-        told = self._typed(parameter_of(message, self._bytewise), wanted.type)
-        others = self._others.setdefault(name, OtherAnswers(_is_same))
-        is_as_asked = same_value(told.value, wanted.value)
-        if is_as_asked and name in self._recent:
+        reported = self._with_integer_type(parameter_of(message, self._bytewise), wanted.type)
+        unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
+        is_as_requested = same_value(reported.value, wanted.value)
+        if is_as_requested and name in self._recent:
             self._recent.remove(name)
-            others.add(told)
-            self._window.answered(name, now)
-            self._window.ask(name)
+            unexpected.add(reported)
+            self._window.on_answer(name, now)
+            self._window.request(name)
             return
-        if is_as_asked and (told.type == wanted.type or others.ends_with(told)):
-            self._window.answered(name, now)
-            self._settle(name, told, now)
+        if is_as_requested and (reported.type == wanted.type or unexpected.ends_with(reported)):
+            self._window.on_answer(name, now)
+            self._settle(name, reported, now)
             return
-        if self._is_too_early(name, now):
-            return
-        others.add(told)
-        self._window.answered(name, now)
-        is_no_change = same_value(told.value, self._before.get(name, told.value))
-        if is_no_change and not is_as_asked:
-            self._to_set.add(name)
-        if others.are_verdict(is_no_change=is_no_change):
-            self._settle(name, told, now)
-        else:
-            self._window.ask(name)
-
-    def _is_too_early(self, name: str, now: float) -> bool:
-        """Whether this can be no answer to what was sent last: it is a late or repeated one to something before."""
         sent_at = self._sent_at.get(name, now)
-        return self._early.is_one(name, sent_at, now, attempts=self._window.attempts(name))
+        if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
+            return
+        unexpected.add(reported)
+        self._window.on_answer(name, now)
+        is_unchanged = same_value(reported.value, self._before.get(name, reported.value))
+        if is_unchanged and not is_as_requested:
+            self._to_set.add(name)
+        if unexpected.are_conclusive(is_unchanged=is_unchanged):
+            self._settle(name, reported, now)
+        else:
+            self._window.request(name)
 
-    def _typed(self, told: Parameter, type_: ParameterType) -> Parameter:
-        """ArduPilot calls an integer that holds its default a float, in answers to PARAM_SET alone."""
-        is_whole = told.type is ParameterType.REAL32 and told.value == told.value // 1
+    def _with_integer_type(self, reported: Parameter, type_: ParameterType) -> Parameter:
+        # In answers to PARAM_SET, ArduPilot reports an integer as a float if the value is the default.
+        is_whole = reported.type is ParameterType.REAL32 and reported.value == reported.value // 1
         if self._bytewise or not type_.is_integer or not is_whole:
-            return told
-        return Parameter(told.name, int(told.value), type_, None, told.index)
+            return reported
+        return Parameter(reported.name, int(reported.value), type_, None, reported.index)
 
     def _timeout_text(self, name: str) -> str:
         return f"PARAM_SET of {name} was not confirmed, sent {self._window.attempts(name)} times"

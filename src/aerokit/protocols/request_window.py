@@ -1,4 +1,4 @@
-"""``RequestWindow``: which of many independent requests are sent when, and which of them again."""
+"""Windowed requests that are independent of each other: which to send when, and which to repeat."""
 
 from __future__ import annotations
 
@@ -11,129 +11,130 @@ if TYPE_CHECKING:
 
 KeyT = TypeVar("KeyT", bound=Hashable)
 
-WINDOW = 20
-"""ArduPilot keeps 20 PARAM_REQUEST_READ waiting, and drops what comes beside."""
-WIDEST = 5
-"""So many times the size at most are under way."""
-QUEUED, QUEUED_S = 1.5, 0.02
-"""An answer that takes longer than that many times the fastest one, and some, has waited in a queue."""
-FEW, UNLUCKY = 5, 3
-"""When so few are left, those that are sent the third time are sent twice: on a bad radio they would be waited for."""
-LAST_S = 0.5
-"""The last few are not waited for longer than that, or two round trips: asking for them costs little."""
-LONGEST_S = 2.0
-"""Nothing is waited for longer: a queue that made answers late may be gone by now."""
+# ArduPilot queues 20 PARAM_REQUEST_READ and drops further ones.
+DEFAULT_SIZE = 20
+# The window grows to at most this many times its size.
+MAX_GROWTH = 5
+# An answer that takes longer than QUEUED_FACTOR times the fastest one plus QUEUED_MARGIN_S has waited in a queue.
+QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
+# When this few requests are left, those at their third attempt or later are sent twice: on a bad radio the transfer
+# would otherwise wait for them alone.
+FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
+# The last few are repeated after at most this time, or two round trips, because it costs little.
+FEW_LEFT_TIMEOUT_S = 0.5
+# A queue that delayed answers may be empty by then.
+MAX_TIMEOUT_S = 2.0
+# Answers arrive in the order of their requests: one overtaken by this many later ones was lost.
 OVERTAKEN = 3
-"""Answers come in the order of their requests. One that so many later ones have overtaken was lost."""
 
 
-class _Asked:
-    __slots__ = ("attempts", "due_at", "first_at", "first_order", "order", "sent_at", "was_doubled")
+class _Request:
+    __slots__ = ("attempts", "due_at", "first_at", "first_number", "number", "sent_at", "was_duplicated")
 
-    def __init__(self, now: float, order: int) -> None:
+    def __init__(self, now: float, number: int) -> None:
         self.first_at = self.sent_at = self.due_at = now
-        self.first_order = self.order = order
-        self.was_doubled = False
+        self.first_number = self.number = number
+        self.was_duplicated = False
         self.attempts = 0
 
 
 class RequestWindow(Generic[KeyT]):
-    """Requests by key, ``size`` of them under way, and more while that does not make answers take longer.
+    """Requests by key, with ``size`` of them in flight, and more while that does not delay answers.
 
-    One is sent again when its answer is overdue (:class:`RoundTrip`), or when later requests were answered before it.
+    A request is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
-    def __init__(self, round_trip: RoundTrip, *, size: int = WINDOW, doubles_last: bool = True) -> None:
-        self._round_trip, self._size, self._room = round_trip, size, size
-        self._shortest_s = math.inf
-        self._doubles_last = doubles_last
+    def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:
+        self._round_trip, self._size, self._limit = round_trip, size, size
+        self._fastest_s = math.inf
+        self._duplicate_last = duplicate_last
         self._answered_at = self._silent_until = -math.inf
         self._silences = 0
         self._waiting: dict[KeyT, None] = {}
-        self._under_way: dict[KeyT, _Asked] = {}  # in the order of sending
-        self._asked: dict[KeyT, _Asked] = {}
+        self._in_flight: dict[KeyT, _Request] = {}  # in the order of sending
+        self._requests: dict[KeyT, _Request] = {}
         self._ambiguous: dict[KeyT, float] = {}
-        self._orders = 0
+        self._sent_count = 0
 
     def __len__(self) -> int:
-        return len(self._waiting) + len(self._under_way)
+        return len(self._waiting) + len(self._in_flight)
 
     def __contains__(self, key: object) -> bool:
-        return key in self._waiting or key in self._under_way
+        return key in self._waiting or key in self._in_flight
 
     @property
     def deadline(self) -> float | None:
-        """When the next answer is overdue; None while nothing is under way."""
-        return min((asked.due_at for asked in self._under_way.values()), default=None)
+        """Time at which the next answer is overdue; None while none is in flight."""
+        return min((request.due_at for request in self._in_flight.values()), default=None)
 
     def attempts(self, key: KeyT) -> int:
-        """How often it was sent so far."""
-        asked = self._asked.get(key)
-        return 0 if asked is None else asked.attempts
+        """Return how often the request was sent."""
+        request = self._requests.get(key)
+        return 0 if request is None else request.attempts
 
     def overdue(self, now: float) -> list[KeyT]:
-        """Those whose answers should have come by now."""
-        return [key for key, asked in self._under_way.items() if asked.due_at <= now]
+        """Return the keys of overdue requests."""
+        return [key for key, request in self._in_flight.items() if request.due_at <= now]
 
-    def ask(self, key: KeyT) -> None:
-        """Have it sent as soon as there is room; nothing happens when it waits or is under way."""
+    def request(self, key: KeyT) -> None:
+        """Queue a request, unless it is waiting or in flight."""
         if key not in self:
             self._waiting[key] = None
 
     def send(self, key: KeyT, now: float) -> None:
-        """It is sent now, beside the window."""
+        """Record a request that is sent now, regardless of the window."""
         self._waiting.pop(key, None)
         self._send(key, now)
 
-    def forget(self, key: KeyT) -> None:
-        """Send it no more: its answer came from elsewhere, or is not wanted any longer."""
+    def discard(self, key: KeyT) -> None:
+        """Drop a request, for example because another message answered it."""
         self._waiting.pop(key, None)
-        self._under_way.pop(key, None)
-        self._asked.pop(key, None)
+        self._in_flight.pop(key, None)
+        self._requests.pop(key, None)
 
-    def answered(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Its answer has come; returns those that were sent ``overtaken`` or more before it and are taken for lost."""
-        asked = self._asked.pop(key, None)
+    def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
+        """Record an answer, and return the requests considered lost: sent at least ``overtaken`` places before it."""
+        request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
-        self._under_way.pop(key, None)
+        self._in_flight.pop(key, None)
         self._answered_at, self._silences = now, 0
-        if asked is None:
-            self._answered_again(key)
+        if request is None:
+            self._on_second_answer(key)
             return []
-        if asked.attempts == 1:
-            self._measured(now - asked.first_at)
-        elif not asked.was_doubled:
-            self._ambiguous[key] = now - asked.first_at
+        if request.attempts == 1:
+            self._measure(now - request.first_at)
+        elif not request.was_duplicated:
+            self._ambiguous[key] = now - request.first_at
         lost = []
-        for other, each in self._under_way.items():
-            if each.order > asked.first_order - overtaken:
+        for other_key, other in self._in_flight.items():
+            if other.number > request.first_number - overtaken:
                 break
-            lost.append(other)
-        self._put_first(lost)
+            lost.append(other_key)
+        self._requeue(lost)
         return lost
 
     def take_due(self, now: float) -> list[KeyT]:
-        """What has to be sent now, some of it twice; it counts as sent."""
+        """Return the keys to send now, some of them twice, and count them as sent."""
         overdue = self.overdue(now)
-        if any(self._under_way[key].sent_at >= self._answered_at for key in overdue):
-            self._note_silence(now)
-        self._put_first(overdue)
+        if any(self._in_flight[key].sent_at >= self._answered_at for key in overdue):
+            self._on_silence(now)
+        self._requeue(overdue)
         due: list[KeyT] = []
-        while self._waiting and len(self._under_way) < self._room:
+        while self._waiting and len(self._in_flight) < self._limit:
             key = next(iter(self._waiting))
             del self._waiting[key]
             self._send(key, now)
             due.append(key)
-        if self._doubles_last and len(self._under_way) <= FEW and not self._waiting:
-            unlucky = [key for key in due if self._asked[key].attempts >= UNLUCKY]
-            for key in unlucky:
-                self._asked[key].was_doubled = True
-            due += unlucky
+        if self._duplicate_last and len(self._in_flight) <= FEW_LEFT and not self._waiting:
+            duplicates = [key for key in due if self._requests[key].attempts >= DUPLICATE_FROM_ATTEMPT]
+            for key in duplicates:
+                self._requests[key].was_duplicated = True
+            due += duplicates
         return due
 
-    def _note_silence(self, now: float) -> None:
-        """Nothing comes any more. These are no single losses: ask for less, and less often."""
-        self._room = self._size
+    def _on_silence(self, now: float) -> None:
+        # Nothing arrives, so these are no single losses: request less at a time, and less often.
+        self._limit = self._size
         if now >= self._silent_until:
             self._silences += 1
             self._silent_until = now + self._timeout_s(1)
@@ -141,37 +142,37 @@ class RequestWindow(Generic[KeyT]):
     def _timeout_s(self, attempts: int) -> float:
         round_trip = self._round_trip
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
-        if len(self) <= FEW and round_trip.smoothed_s is not None:
-            seconds = min(seconds, max(LAST_S, 2 * round_trip.smoothed_s))
-        return min(seconds, LONGEST_S)
+        if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
+            seconds = min(seconds, max(FEW_LEFT_TIMEOUT_S, 2 * round_trip.smoothed_s))
+        return min(seconds, MAX_TIMEOUT_S)
 
-    def _measured(self, seconds: float) -> None:
-        """Ask for more at once as long as answers come as fast as ever: a queue is building up somewhere otherwise."""
-        self._round_trip.measured(seconds)
-        self._shortest_s = min(self._shortest_s, seconds)
-        if seconds <= QUEUED * self._shortest_s + QUEUED_S:
-            self._room = min(self._room + 1, WIDEST * self._size)
+    def _measure(self, seconds: float) -> None:
+        # Widen the window while answers stay fast; slower answers show that a queue is building up.
+        self._round_trip.add_sample(seconds)
+        self._fastest_s = min(self._fastest_s, seconds)
+        if seconds <= QUEUED_FACTOR * self._fastest_s + QUEUED_MARGIN_S:
+            self._limit = min(self._limit + 1, MAX_GROWTH * self._size)
         else:
-            self._room = max(self._room - 1, self._size)
+            self._limit = max(self._limit - 1, self._size)
 
     def _send(self, key: KeyT, now: float) -> None:
-        self._orders += 1
-        asked = self._asked.get(key)
-        if asked is None:
-            asked = self._asked[key] = _Asked(now, self._orders)
-        asked.attempts += 1
-        asked.order, asked.sent_at = self._orders, now
-        asked.due_at = now + self._timeout_s(asked.attempts)
-        self._under_way[key] = asked
+        self._sent_count += 1
+        request = self._requests.get(key)
+        if request is None:
+            request = self._requests[key] = _Request(now, self._sent_count)
+        request.attempts += 1
+        request.number, request.sent_at = self._sent_count, now
+        request.due_at = now + self._timeout_s(request.attempts)
+        self._in_flight[key] = request
 
-    def _put_first(self, keys: list[KeyT]) -> None:
+    def _requeue(self, keys: list[KeyT]) -> None:
         if keys:
             for key in keys:
-                del self._under_way[key]
+                del self._in_flight[key]
             self._waiting = {**dict.fromkeys(keys), **self._waiting}
 
-    def _answered_again(self, key: KeyT) -> None:
-        """A second answer: the first one was to the first sending, which we had given up too early."""
+    def _on_second_answer(self, key: KeyT) -> None:
+        # The first answer belonged to the first sending, which was considered lost too early.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
-            self._round_trip.measured(seconds)
+            self._round_trip.add_sample(seconds)

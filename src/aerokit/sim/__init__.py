@@ -1,7 +1,7 @@
-"""Simulated vehicles: they speak MAVLink and fly, without hardware, firmware builds or waiting.
+"""Simulated vehicles that speak MAVLink and fly, without hardware or firmware.
 
-`SimulatedCopter` is the vehicle, without any IO: bytes and the time go in, bytes come out. `SimulatorServer`
-puts vehicles on links, `simulated_link` gives the client's end of a link in memory, `open_simulator` serves
+`SimulatedCopter` and its siblings do no I/O: they take bytes and the time, and return bytes. `SimulatorServer`
+serves vehicles on links, `simulated_link` returns the client's end of a link in memory, `open_simulator` listens on
 addresses:
 
 ```python
@@ -17,22 +17,19 @@ from __future__ import annotations
 from aerokit.sim.ardupilot import BootTimeline, SimulatedCopter, SimulatedPlane, SimulatedRover, SimulatedSub
 from aerokit.sim.components import SimulatedCamera, SimulatedComponent, SimulatedGimbal
 from aerokit.sim.faults import CommandFault, Faults
-from aerokit.sim.local_frame import HOME
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.motion import Wind
+from aerokit.sim.motion import HOME, SimulatedWind
 from aerokit.sim.px4 import SimulatedPx4, SimulatedPx4Plane
-from aerokit.sim.recorded import RecordedVehicle
 from aerokit.sim.server import SimulatorServer, open_simulator, simulated_link
-from aerokit.sim.vehicle import Component, ExtraComponent, SimulatedVehicle
+from aerokit.sim.vehicle import AttachableComponent, ExtraComponent, SimulatedVehicle
 
 __all__ = [
     "HOME",
+    "AttachableComponent",
     "BootTimeline",
     "CommandFault",
-    "Component",
     "ExtraComponent",
     "Faults",
-    "RecordedVehicle",
     "SimulatedCamera",
     "SimulatedComponent",
     "SimulatedCopter",
@@ -44,8 +41,8 @@ __all__ = [
     "SimulatedRover",
     "SimulatedSub",
     "SimulatedVehicle",
+    "SimulatedWind",
     "SimulatorServer",
-    "Wind",
     "open_simulator",
     "simulated_link",
 ]

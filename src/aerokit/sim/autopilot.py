@@ -1,8 +1,9 @@
-"""What simulated autopilots of every make have in common: version, files, clock, commands, the key for signing."""
+"""Base of the simulated autopilots: version, files, clock, commands, message signing, battery."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
+from itertools import pairwise
 from typing import ClassVar
 
 from aerokit.mavlink import messages as m
@@ -11,39 +12,41 @@ from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import SetupSigning
 from aerokit.mavlink.signing import LAST_TIMESTAMP, Signing, SigningKey, timestamp_at
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import Command, CommandHandler, CommandServer
-from aerokit.sim.file_tree import FileTree
-from aerokit.sim.vehicle import Component, SimulatedVehicle
+from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
+from aerokit.sim.ftp import FileTree
+from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 
 class VehicleSigning:
-    """What both makes do: take a key by SETUP_SIGNING while disarmed, sign and check on all ports, keep it.
+    """Message signing as ArduPilot and PX4 do it: SETUP_SIGNING is accepted while disarmed, every port signs and
+    checks.
 
-    ``key`` and ``timestamp`` (10 µs since 2015) were stored before. What an accepted frame told of time stamps counts
-    on every port, as long as the vehicle is on.
+    ``key`` and ``timestamp`` (10 µs since 2015) are the stored values. The time stamps of accepted frames are shared
+    by all ports until the vehicle is switched off.
     """
 
     AHEAD: ClassVar[int] = 0
-    """By how much the time stamps begin behind the stored one."""
+    """Added to the stored time stamp when a port starts to sign."""
 
     def __init__(self, vehicle: SimulatedVehicle, key: SigningKey | None, timestamp: int) -> None:
         self.key = key
-        """The stored key; None: nothing is signed or checked. Call `load` after changing it by hand."""
+        """The stored key; None turns signing off. Call `load` after assigning it."""
         self.timestamp: int = timestamp if key is not None else 0
-        """The stored time stamp."""
         self.trusts_first_port = False
-        """Whether the first port lets everything in, as ArduPilot's does by default. Call `load` after changing it."""
+        """True if the first port accepts unsigned frames, as ArduPilot's does by default. Call `load` after assigning
+        it.
+        """
         self._vehicle = vehicle
         self._streams: dict[tuple[int, int, int], int] = {}
         vehicle.on(SetupSigning, self._on_setup)
-        vehicle.when_powered_on(self._power_on)
+        vehicle.on_power_on(self._power_on)
 
     def load(self) -> None:
         for channel in self._vehicle.channels:
             self.start(channel)
 
     def start(self, channel: Channel) -> None:
-        """Use what is stored, on one port; its number is the link id."""
+        """Apply the stored key to one port; its index is the link id."""
         link_id = self._vehicle.channels.index(channel)
         if self.key is None or channel.version == 1 or not self.is_for(link_id):
             channel.sign_with(None)
@@ -58,19 +61,19 @@ class VehicleSigning:
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:
-        """Whether this port signs and checks at all."""
+        """Return True if this port signs and checks frames."""
         return True
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """What this port lets in without a good signature."""
+        """Return the predicate for unsigned frames that this port accepts."""
         raise NotImplementedError
 
     def may_change(self) -> bool:
-        """Whether a key is taken, or taken away, now; says why not."""
+        """Return True if the key can be changed now; sends the reason if not."""
         raise NotImplementedError
 
-    def changed(self) -> None:
-        """A key was taken, or taken away."""
+    def on_key_changed(self) -> None:
+        """Called after the key was set or removed."""
 
     def _power_on(self) -> None:
         self._streams = {}
@@ -80,13 +83,13 @@ class VehicleSigning:
         if not self.may_change():
             return
         self.key = SigningKey(message.secret_key) if any(message.secret_key) else None
-        self.timestamp = message.initial_timestamp & LAST_TIMESTAMP  # all that a frame has room for
+        self.timestamp = message.initial_timestamp & LAST_TIMESTAMP  # The time stamp of a frame has 48 bits.
         self.load()
-        self.changed()
+        self.on_key_changed()
 
 
 class _Signing(Signing):
-    """As firmwares count: behind the last time stamp of 48 bits comes the first."""
+    """Time stamps wrap around after 48 bits, as in the firmwares."""
 
     def sign(self, frame: bytes, now: float = 0.0) -> bytes:
         if self.timestamp > LAST_TIMESTAMP:
@@ -94,32 +97,32 @@ class _Signing(Signing):
         return super().sign(frame, now)
 
 
+# FIRMWARE_VERSION_TYPE by the suffix of the version.
 _RELEASES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "official": 255}
-"""FIRMWARE_VERSION_TYPE, by what stands behind the version's dash."""
 
 
 class SimulatedAutopilot(SimulatedVehicle):
-    """A vehicle whose firmware has a version, a card with files, a clock, and commands.
+    """A vehicle with a firmware version, files, a clock and commands.
 
-    - ``version``: as "4.7.0-dev" or "1.16.0"; ``unix_time_at_boot``: what its GPS clock says at simulated second 0
-    - ``unsupported_commands``: MAV_CMDs that this firmware does not know
-    - ``signing_key``: was set up before; None: its frames are not signed, until SETUP_SIGNING
+    - ``version``: such as "4.7.0-dev" or "1.16.0"; ``unix_time_at_boot``: GPS time at simulated second 0
+    - ``unsupported_commands``: MAV_CMDs that this firmware does not support
+    - ``signing_key``: key that was set up earlier; None sends unsigned frames until SETUP_SIGNING
     """
 
     CAPABILITIES: ClassVar[int]
-    """MAV_PROTOCOL_CAPABILITYs."""
+    """MAV_PROTOCOL_CAPABILITY flags."""
 
     files: FileTree
-    """What is on its card, and what it makes up when it is read; it survives a reboot."""
+    """Files on its card and generated ones; they survive a reboot."""
     signing: VehicleSigning
-    """The key for signing that it was given; it survives a reboot."""
+    """Key of message signing; it survives a reboot."""
 
     def __init__(
         self,
         *,
         system_id: int,
         seed: int,
-        components: Iterable[Component],
+        components: Iterable[AttachableComponent],
         version: str,
         unsupported_commands: Collection[int],
         unix_time_at_boot: float,
@@ -132,46 +135,106 @@ class SimulatedAutopilot(SimulatedVehicle):
         self.signing = self.make_signing(signing_key, timestamp_at(unix_time_at_boot))
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> VehicleSigning:
-        """What this firmware does with keys; this one and its time stamp are stored already."""
+        """Create the signing of this firmware, with a stored key and time stamp."""
         raise NotImplementedError
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Another port with its own stream rates; ``version`` is the MAVLink version it speaks."""
+        """Open another port with stream rates of its own; ``version`` is its MAVLink version."""
         channel = super().open_channel(version=version)
-        if len(self.channels) > 1:  # the first one is there before anything else
+        if len(self.channels) > 1:  # The base class opens the first channel before `signing` exists.
             self.signing.start(channel)
         return channel
 
     @property
     def capabilities(self) -> int:
-        """MAV_PROTOCOL_CAPABILITYs, for AUTOPILOT_VERSION."""
+        """MAV_PROTOCOL_CAPABILITY flags of AUTOPILOT_VERSION."""
         return self.CAPABILITIES & ~MavProtocolCapability.FTP if self.faults.no_ftp else self.CAPABILITIES
 
     @property
     def unix_time(self) -> float:
-        """What the GPS says the time is."""
+        """GPS time in seconds since 1970."""
         return self._unix_time_at_start + self.now
 
     @property
     def version_number(self) -> int:
-        """As AUTOPILOT_VERSION packs it."""
+        """Firmware version as AUTOPILOT_VERSION packs it."""
         numbers, _, release = self.version.partition("-")
         major, minor, patch = (int(part) for part in (*numbers.split("."), "0", "0")[:3])
         return major << 24 | minor << 16 | patch << 8 | _RELEASES.get(release, 0)
 
-    def listen_to_clocks(self) -> None:
-        """Answer TIMESYNC."""
+    def serve_timesync(self) -> None:
         self.on(m.Timesync, self._on_timesync)
 
     def serve_commands(self, handlers: Mapping[int, CommandHandler]) -> CommandServer:
-        """Answer these MAV_CMDs, but for those that are to be unknown."""
-        known = {number: each for number, each in handlers.items() if number not in self.unsupported_commands}
-        return CommandServer(self, known, self.refusal_of_command)
+        """Answer these MAV_CMDs, except the unsupported ones."""
+        supported = {number: handler for number, handler in handlers.items() if number not in self.unsupported_commands}
+        return CommandServer(self, supported, self.refusal_of_command)
 
-    def refusal_of_command(self, command: Command) -> int | None:
-        """The MAV_RESULT of what this firmware refuses before it looks which command it is."""
+    def refusal_of_command(self, command: ReceivedCommand) -> int | None:
+        """Return the MAV_RESULT of a command that is refused before its number is looked at, or None."""
         return None
 
     def _on_timesync(self, request: m.Timesync, channel: Channel) -> None:
         if request.tc1 == 0:
             self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
+
+
+_RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
+# From full to empty: percent, volts, volts per percent.
+_RESTING_CELL_SLOPES = tuple(
+    (low, volts, (high_volts - volts) / (high - low))
+    for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)
+)[::-1]
+
+
+class SimulatedBattery:
+    """A lithium battery pack: charge, resting voltage by charge, voltage sag by current."""
+
+    consumed_mah: float
+    consumed_wh: float
+
+    def __init__(
+        self,
+        capacity_mah: float = 3300.0,
+        *,
+        cells: int = 3,
+        percent: float = 100.0,
+        resistance_ohm: float = 0.012,
+    ) -> None:
+        self.capacity_mah = capacity_mah
+        self.cells = cells
+        self.resistance_ohm = resistance_ohm
+        self.consumed_mah = 0.0
+        """Consumption since power-on, as a current sensor counts it."""
+        self.consumed_wh = 0.0
+        self.current_a: float = 0.0
+        self._charge_mah = capacity_mah * percent / 100.0
+
+    @property
+    def percent(self) -> float:
+        """Remaining charge, 0 to 100."""
+        return 100.0 * self._charge_mah / self.capacity_mah
+
+    @percent.setter
+    def percent(self, value: float) -> None:
+        self._charge_mah = self.capacity_mah * value / 100.0
+
+    @property
+    def voltage_v(self) -> float:
+        volts = self.cells * self._resting_cell_volts() - self.current_a * self.resistance_ohm
+        return volts if volts > 0.0 else 0.0
+
+    def drain(self, current_a: float, dt: float) -> None:
+        self.current_a = current_a
+        used_mah = current_a * dt / 3.6
+        self.consumed_mah += used_mah
+        self.consumed_wh += used_mah * self.voltage_v / 1000.0
+        left_mah = self._charge_mah - used_mah
+        self._charge_mah = left_mah if left_mah > 0.0 else 0.0
+
+    def _resting_cell_volts(self) -> float:
+        percent = 100.0 * self._charge_mah / self.capacity_mah
+        for low_percent, low_volts, volts_per_percent in _RESTING_CELL_SLOPES:
+            if percent >= low_percent:
+                return low_volts + (min(percent, 100.0) - low_percent) * volts_per_percent
+        return _RESTING_CELL_VOLTS[0][1]

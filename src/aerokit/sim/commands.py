@@ -1,27 +1,34 @@
-"""Commands to a simulated vehicle: COMMAND_LONG and COMMAND_INT in, COMMAND_ACK out.
+"""Requests to a simulated vehicle: commands (COMMAND_LONG, COMMAND_INT) with their acknowledgement, and set-points.
 
 https://mavlink.io/en/services/command.html
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from aerokit.mavlink.enums import MavFrame, MavResult, MavSeverity
-from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong
+from aerokit.mavlink.enums import PositionTargetTypemask as Mask
+from aerokit.mavlink.messages import (
+    CommandAck,
+    CommandInt,
+    CommandLong,
+    SetPositionTargetGlobalInt,
+    SetPositionTargetLocalNed,
+)
 from aerokit.sim.channel import Channel
-from aerokit.sim.faults import CommandFault, Faults
-from aerokit.sim.vehicle import sender_of
+from aerokit.sim.faults import CommandFault
+from aerokit.sim.motion import Ned
+from aerokit.sim.vehicle import MessageHost, sender_of
 
 
 @dataclass(frozen=True)
-class Command:
-    """One request, whichever message it came in.
+class ReceivedCommand:
+    """A command from either message.
 
-    ``x`` and ``y`` are params 5 and 6: numbers as they are in COMMAND_LONG, degrees times 1e7 in COMMAND_INT.
+    ``x`` and ``y`` are params 5 and 6: as sent in COMMAND_LONG, degrees times 1e7 in COMMAND_INT.
     """
 
     command: int
@@ -33,71 +40,53 @@ class Command:
     y: float
     z: float
     frame: int | None
-    """MAV_FRAME of a COMMAND_INT; None in COMMAND_LONG."""
+    """MAV_FRAME of a COMMAND_INT; None for COMMAND_LONG."""
     channel: Channel
     sender: tuple[int, int]
 
     @property
     def is_long(self) -> bool:
-        """Whether it came as COMMAND_LONG."""
+        """True if it was sent as COMMAND_LONG."""
         return self.frame is None
 
     def place(self) -> tuple[int, int]:
-        """Latitude and longitude in degrees times 1e7."""
+        """Return latitude and longitude in degrees times 1e7."""
         scale = 1e7 if self.is_long else 1
         return (whole(self.x * scale), whole(self.y * scale))
 
     @property
     def altitude_frame(self) -> int:
-        """The MAV_FRAME that ``z`` is in; COMMAND_LONG means above home."""
+        """MAV_FRAME of ``z``; a COMMAND_LONG is relative to home."""
         return MavFrame.GLOBAL_RELATIVE_ALT if self.frame is None else self.frame
 
 
 @dataclass(frozen=True)
-class Progress:
-    """A command that takes time: IN_PROGRESS with these percentages, then the result."""
+class CommandProgress:
+    """Result of a command that takes time: IN_PROGRESS with these percentages, then ``result``."""
 
     percents: tuple[int, ...]
     interval_s: float
     result: int = MavResult.ACCEPTED
     finish: Callable[[], None] | None = None
-    """Done right before the result is sent."""
+    """Called right before the result is sent."""
 
 
-CommandHandler = Callable[[Command], "int | Progress | None"]
-
-
-class Commanded(Protocol):
-    """Who takes commands: a vehicle, or another component."""
-
-    faults: Faults
-
-    def on(self, message_class: type[Message], handler: Callable[[Any, Channel], None]) -> None:
-        """Hear such messages."""
-        ...
-
-    def send(self, message: Message, channel: Channel | None = None) -> None: ...
-
-    def send_text(self, severity: int, text: str) -> None: ...
-
-    def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Do something after ``delay`` seconds."""
-        ...
+CommandHandler = Callable[[ReceivedCommand], "int | CommandProgress | None"]
 
 
 class CommandServer:
-    """Finds the handler of a command, lets faults meddle, and answers to who asked.
+    """Dispatches commands to handlers, applies `Faults` and sends COMMAND_ACK to the sender.
 
-    A handler returns a MAV_RESULT, a `Progress`, or None when it answers by itself. What it sends itself goes
-    out before the acknowledgement. An unknown command is UNSUPPORTED. ``refusal`` gives the MAV_RESULT of what is
-    refused whichever command it is.
+    A handler returns a MAV_RESULT, a `CommandProgress`, or None if it answers itself; its messages precede the
+    acknowledgement. Other commands are UNSUPPORTED. ``refusal`` returns the MAV_RESULT of a command that is refused
+    before dispatch, or None.
     """
 
     def __init__(
         self,
-        vehicle: Commanded,
+        vehicle: MessageHost,
         handlers: dict[int, CommandHandler],
-        refusal: Callable[[Command], int | None] = lambda _: None,
+        refusal: Callable[[ReceivedCommand], int | None] = lambda _: None,
     ) -> None:
         self._vehicle = vehicle
         self._handlers = handlers
@@ -108,14 +97,14 @@ class CommandServer:
     def _on_long(self, message: CommandLong, channel: Channel) -> None:
         numbers = (message.param1, message.param2, message.param3, message.param4)
         place = (message.param5, message.param6, message.param7)
-        self.execute(Command(message.command, *numbers, *place, None, channel, sender_of(message)))
+        self.execute(ReceivedCommand(message.command, *numbers, *place, None, channel, sender_of(message)))
 
     def _on_int(self, message: CommandInt, channel: Channel) -> None:
         numbers = (message.param1, message.param2, message.param3, message.param4)
         place = (message.x, message.y, message.z)
-        self.execute(Command(message.command, *numbers, *place, message.frame, channel, sender_of(message)))
+        self.execute(ReceivedCommand(message.command, *numbers, *place, message.frame, channel, sender_of(message)))
 
-    def execute(self, command: Command) -> None:
+    def execute(self, command: ReceivedCommand) -> None:
         if (refused := self._refusal(command)) is not None:
             self.answer(command, refused)
             return
@@ -129,17 +118,17 @@ class CommandServer:
             return
         handler = self._handlers.get(command.command)
         answer = MavResult.UNSUPPORTED if handler is None else handler(command)
-        if isinstance(answer, Progress):
+        if isinstance(answer, CommandProgress):
             self._report(command, answer, fault)
         elif answer is not None:
             self.answer(command, answer, fault)
 
-    def answer(self, command: Command, result: int, fault: CommandFault | None = None) -> None:
-        """Send the acknowledgement, as often and as late as the fault wants it."""
+    def answer(self, command: ReceivedCommand, result: int, fault: CommandFault | None = None) -> None:
+        """Send the acknowledgement, as the fault specifies."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
             without = CommandFault(acks=fault.acks, delay_s=fault.delay_s)
-            self._report(command, Progress(fault.progress, fault.progress_interval_s, result), without)
+            self._report(command, CommandProgress(fault.progress, fault.progress_interval_s, result), without)
             return
         for _ in range(fault.acks):
             if fault.delay_s > 0:
@@ -147,7 +136,7 @@ class CommandServer:
             else:
                 self._send(command, result)
 
-    def _report(self, command: Command, progress: Progress, fault: CommandFault | None) -> None:
+    def _report(self, command: ReceivedCommand, progress: CommandProgress, fault: CommandFault | None) -> None:
         for number, percent in enumerate(progress.percents):
             self._vehicle.call_later(
                 number * progress.interval_s,
@@ -161,12 +150,88 @@ class CommandServer:
 
         self._vehicle.call_later(max(1, len(progress.percents)) * progress.interval_s, finish)
 
-    def _send(self, command: Command, result: int, progress: int = 0) -> None:
+    def _send(self, command: ReceivedCommand, result: int, progress: int = 0) -> None:
         system, component = command.sender
         ack = CommandAck(command.command, result, progress, 0, system, component)
         self._vehicle.send(ack, command.channel)
 
 
 def whole(value: float) -> int:
-    """A parameter as a whole number. 0 for NaN, by which programs leave it open, and for what is too big."""
+    """Return a parameter as an integer; 0 for NaN (unset) and for values beyond 32 bits."""
     return int(value) if value == value and abs(value) < 2**31 else 0
+
+
+PositionTarget = SetPositionTargetLocalNed | SetPositionTargetGlobalInt
+
+# Arithmetic on plain integers is ten times as fast as on flags.
+_POSITION = (int(Mask.X_IGNORE), int(Mask.Y_IGNORE), int(Mask.Z_IGNORE))
+_VELOCITY = (int(Mask.VX_IGNORE), int(Mask.VY_IGNORE), int(Mask.VZ_IGNORE))
+_ACCELERATION = (int(Mask.AX_IGNORE), int(Mask.AY_IGNORE), int(Mask.AZ_IGNORE))
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """A decoded set-point message; vectors are in the frame of the message. A vector counts if none of its axes is
+    ignored.
+    """
+
+    mask: int
+    velocity: Ned
+    acceleration: Ned
+    yaw: float | None
+    yaw_rate: float | None
+    """Radians; None if ignored."""
+
+    @classmethod
+    def of(cls, message: PositionTarget) -> Setpoint:
+        """Decode a message."""
+        mask = message.type_mask
+        return cls(
+            mask,
+            (message.vx, message.vy, message.vz),
+            (message.afx, message.afy, message.afz),
+            None if mask & Mask.YAW_IGNORE else message.yaw,
+            None if mask & Mask.YAW_RATE_IGNORE else message.yaw_rate,
+        )
+
+    @property
+    def has_position(self) -> bool:
+        return not self.mask & sum(_POSITION)
+
+    @property
+    def has_velocity(self) -> bool:
+        return not self.mask & sum(_VELOCITY)
+
+    @property
+    def has_acceleration(self) -> bool:
+        return not self.mask & sum(_ACCELERATION)
+
+    @property
+    def is_force(self) -> bool:
+        """True if the accelerations are forces (FORCE_SET)."""
+        return bool(self.mask & Mask.FORCE_SET) and self.has_acceleration
+
+    def axes(self, position: Ned) -> tuple[Ned, Ned, Ned]:
+        """Return position, velocity and acceleration; an axis is NaN if it is ignored or not finite."""
+        vectors = ((position, _POSITION), (self.velocity, _VELOCITY), (self.acceleration, _ACCELERATION))
+        p, v, a = (self._masked(vector, bits) for vector, bits in vectors)
+        return p, v, a
+
+    def _masked(self, vector: Ned, bits: tuple[int, int, int]) -> Ned:
+        x, y, z = (
+            math.nan if self.mask & bit or not math.isfinite(value) else value
+            for value, bit in zip(vector, bits, strict=True)
+        )
+        return (x, y, z)
+
+
+def rotated(vector: Ned, yaw: float) -> Ned:
+    """Rotate a body vector (forward, right, down) to north, east, down."""
+    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    forward, right, down = vector
+    return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)
+
+
+def is_finite(*vectors: Ned | None) -> bool:
+    """Return True if all components are finite; None is skipped."""
+    return all(math.isfinite(part) for vector in vectors if vector is not None for part in vector)

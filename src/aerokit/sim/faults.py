@@ -1,53 +1,55 @@
-"""What can go wrong with a simulated vehicle on demand: one object with plain attributes and a few verbs."""
+"""Faults that can be injected into a simulated vehicle."""
 
 from __future__ import annotations
 
+import random
 from dataclasses import dataclass, field
 
 from aerokit.mavlink.enums import MavResult
 from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import Heartbeat
 
 
 @dataclass
 class CommandFault:
-    """How one command is mistreated; ``times`` counts down, None is for ever."""
+    """Fault of one command. ``times`` counts down; None means always."""
 
     times: int | None = None
     refuse_with: int | None = None
-    """This MAV_RESULT instead of doing it."""
+    """MAV_RESULT of the refusal, instead of executing the command."""
     text: str | None = None
-    """A status text that goes out with the refusal."""
+    """Status text sent with the refusal."""
     ignore: bool = False
-    """Neither done nor answered."""
+    """Neither execute nor acknowledge the command."""
     acks: int = 1
-    """How many answers are sent: 0 loses the answer, 2 repeats it."""
+    """Number of acknowledgements: 0 loses it, 2 repeats it."""
     delay_s: float = 0.0
-    """The answer comes this much later; the deed is done at once."""
+    """Delay of the acknowledgement in seconds; the command is executed at once."""
     progress: tuple[int, ...] = ()
-    """IN_PROGRESS answers with these percentages come first."""
+    """Percentages of IN_PROGRESS answers sent before the result."""
     progress_interval_s: float = 0.5
 
 
 @dataclass
 class Faults:
-    """Everything is off at first. Change attributes at any time; they act from the next message or step on.
+    """Faults of a vehicle or component, all off at first. Changes apply from the next message or step on.
 
-    - ``gps_lost``: no GPS fix any more; after seven seconds the estimator gives its position up
-    - ``rc_lost``: the pilot's transmitter is off; what follows is up to the failsafes of the kind
-    - ``leak``: there is water in the hull of a submarine
-    - ``heartbeats_stopped``: every stream goes on, heartbeats do not
-    - ``frozen``: the autopilot hangs; it neither hears, moves nor sends until it is False again
-    - ``silent``: the radio is out; nothing gets through in either direction, the vehicle flies on
-    - ``prearm_failures``: reasons that the arming checks give besides the real ones ("Compass not healthy")
-    - ``drop_outgoing``, ``drop_incoming``: this many of the next frames are lost (they count down)
-    - ``loss``, ``loss_incoming``: share of the outgoing and of the incoming frames that is lost at random, 0 to 1, the
-      same for the same seed
-    - ``lost_messages``: message id → how many of the next ones of this kind are lost on their way out; see ``lose``
-    - ``motor_failed``: a motor stands still; the vehicle cannot hold its height and comes down
-    - ``no_ftp``: FILE_TRANSFER_PROTOCOL is neither answered nor among the capabilities
-    - ``parameter_limits``: name → lowest and highest value; what is set is clamped to them without a word
-    - ``read_only_parameters``: names whose values cannot be set
-    - ``mute_parameters``: names whose PARAM_VALUE never gets through
+    - ``gps_lost``: no GPS fix; the estimator drops its position after seven seconds
+    - ``rc_lost``: the pilot's transmitter is off; the failsafes of the vehicle react
+    - ``leak``: water in the hull of a submarine
+    - ``heartbeats_stopped``: HEARTBEAT stops, all other streams continue
+    - ``frozen``: the autopilot hangs; it does not receive, move or send until this is False
+    - ``silent``: the radio fails in both directions; the vehicle continues to fly
+    - ``prearm_failures``: additional reasons of the arming checks, such as "Compass not healthy"
+    - ``drop_outgoing``, ``drop_incoming``: number of frames to lose next (counts down)
+    - ``loss``, ``loss_incoming``: share of outgoing and incoming frames lost at random, 0 to 1; determined by the
+      seed
+    - ``lost_messages``: message id → number of outgoing messages to lose next; see ``lose``
+    - ``motor_failed``: one motor stops; the vehicle cannot hold its altitude and descends
+    - ``no_ftp``: FILE_TRANSFER_PROTOCOL is not answered and not in the capabilities
+    - ``parameter_limits``: name → minimum and maximum; values that are set are clamped silently
+    - ``read_only_parameters``: names of parameters that cannot be set
+    - ``mute_parameters``: names of parameters whose PARAM_VALUE is always lost
     """
 
     gps_lost: bool = False
@@ -77,51 +79,63 @@ class Faults:
         *,
         times: int | None = None,
     ) -> None:
-        """Answer a MAV_CMD with this MAV_RESULT, and a status text before it, instead of doing it."""
+        """Refuse a MAV_CMD with this MAV_RESULT and an optional status text, without executing it."""
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 
     def ignore(self, command: int, *, times: int | None = None) -> None:
-        """Neither do nor answer a MAV_CMD."""
+        """Neither execute nor acknowledge a MAV_CMD."""
         self.commands[command] = CommandFault(times, ignore=True)
 
     def lose_ack(self, command: int, *, times: int | None = 1) -> None:
-        """Do it, but lose the answer."""
+        """Execute a MAV_CMD, but lose its acknowledgement."""
         self.commands[command] = CommandFault(times, acks=0)
 
     def lose(self, message_type: type[Message], *, times: int = 1) -> None:
-        """Have the next messages of a kind lost on their way out."""
+        """Lose the next outgoing messages of this type."""
         self.lost_messages[message_type.ID] = times
 
-    def loses(self, message: Message) -> bool:
-        """Whether this one is lost; counts down."""
-        left = self.lost_messages.get(message.ID, 0)
-        if left:
+    def drops_outgoing(self, message: Message, rng: random.Random) -> bool:
+        """Return True if this message is lost while being sent; decrements the counters."""
+        if self.silent or (self.heartbeats_stopped and message.ID == Heartbeat.ID):
+            return True
+        if left := self.lost_messages.get(message.ID, 0):
             self.lost_messages[message.ID] = left - 1
-        return left > 0
+            return True
+        if self.drop_outgoing > 0:
+            self.drop_outgoing -= 1
+            return True
+        return self.loss > 0.0 and rng.random() < self.loss
+
+    def drops_incoming(self, rng: random.Random) -> bool:
+        """Return True if the next incoming message is lost; decrements the counters."""
+        if self.drop_incoming > 0:
+            self.drop_incoming -= 1
+            return True
+        return self.loss_incoming > 0.0 and rng.random() < self.loss_incoming
 
     def repeat_ack(self, command: int, count: int = 2, *, times: int | None = None) -> None:
-        """Do it and answer several times."""
+        """Execute a MAV_CMD and acknowledge it several times."""
         self.commands[command] = CommandFault(times, acks=count)
 
     def delay_ack(self, command: int, seconds: float, *, times: int | None = None) -> None:
-        """Do it at once and answer later."""
+        """Execute a MAV_CMD at once and acknowledge it later."""
         self.commands[command] = CommandFault(times, delay_s=seconds)
 
     def report_progress(
         self, command: int, percents: tuple[int, ...] = (10, 50, 90), *, interval_s: float = 0.5
     ) -> None:
-        """Answer IN_PROGRESS at these percentages before the result, one every ``interval_s`` seconds."""
+        """Answer IN_PROGRESS with these percentages before the result, one every ``interval_s`` seconds."""
         self.commands[command] = CommandFault(progress=percents, progress_interval_s=interval_s)
 
     def clear(self, command: int | None = None) -> None:
-        """Treat one command, or every command, properly again."""
+        """Remove the faults of one command, or of all commands."""
         if command is None:
             self.commands.clear()
         else:
             self.commands.pop(command, None)
 
     def take(self, command: int) -> CommandFault | None:
-        """What to do to this command now; counts ``times`` down."""
+        """Return the fault that applies to this command now, and decrement its ``times``."""
         fault = self.commands.get(command)
         if fault is not None and fault.times is not None:
             fault.times -= 1

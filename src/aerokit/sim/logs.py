@@ -1,6 +1,6 @@
-"""Flight logs of a simulated vehicle, and LOG_REQUEST_LIST, LOG_REQUEST_DATA, LOG_ERASE as both autopilots serve them.
+"""Flight logs of a simulated vehicle, served by LOG_REQUEST_LIST, LOG_REQUEST_DATA and LOG_ERASE.
 
-There is no page of the protocol but the messages': https://mavlink.io/en/messages/common.html#LOG_REQUEST_LIST
+The protocol is documented with its messages only: https://mavlink.io/en/messages/common.html#LOG_REQUEST_LIST
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import (
@@ -27,21 +28,21 @@ _BLOCK = 90
 
 @dataclass(frozen=True)
 class SimulatedLog:
-    """One log; its content is noise that follows from size and time, so that every run gives the same."""
+    """A flight log. Its content is noise derived from size and time, the same in every run."""
 
     size: int
     time_utc: int = 1_790_000_000
     """Seconds since 1970."""
     seed: int | None = None
-    """What the noise follows from instead."""
+    """Seed of the noise, instead of size and time."""
 
     def make(self) -> bytes:
-        """All of its content; of a longer one with the same seed it is the beginning."""
+        """Return the content; with the same seed, a longer log starts with it."""
         words = -(-self.size // 4)
         return random.Random(self._noise).randbytes(4 * words)[: self.size]
 
     def grown(self, count: int, time_utc: int) -> SimulatedLog:
-        """The same log when ``count`` bytes more have been written."""
+        """Return this log extended by ``count`` bytes."""
         return SimulatedLog(self.size + count, time_utc, self._noise)
 
     @property
@@ -50,9 +51,9 @@ class SimulatedLog:
 
 
 class LogServer:
-    """Lists logs and sends their content in blocks of 90 bytes, ``rate_hz`` messages a second, ``burst`` at once.
+    """Sends log lists, and log content in blocks of 90 bytes: ``rate_hz`` messages a second, ``burst`` at a time.
 
-    One transfer at a time; an autopilot's own class says what else differs.
+    Serves one transfer at a time. Subclasses implement what differs between autopilots.
     """
 
     burst = 10
@@ -62,7 +63,7 @@ class LogServer:
         vehicle: SimulatedVehicle,
         logs: Sequence[SimulatedLog],
         *,
-        rate_hz: float,
+        rate_hz: float = 4000.0,
         erase_files: Callable[[], None] = lambda: None,
         append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
     ) -> None:
@@ -81,11 +82,11 @@ class LogServer:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a list or a log is on its way."""
+        """True while a list or a log is being sent."""
         return bool(self._outgoing)
 
     def restart(self) -> None:
-        """Stop whatever is on its way."""
+        """Abort the transfer."""
         self._transfer += 1
         self._outgoing.clear()
 
@@ -105,26 +106,26 @@ class LogServer:
         self.restart()
 
     def content(self, number: int) -> bytes:
-        """All of the log at this place of the list."""
+        """Return the content of the log at this index."""
         if (self._content[0], len(self._content[1])) != (number, self.logs[number].size):
             self._content = (number, self.logs[number].make())
         return self._content[1]
 
     def write_on(self, count: int, time_utc: int) -> None:
-        """The newest log has been written on: it has ``count`` bytes more, and this time."""
+        """Extend the newest log by ``count`` bytes and update its time."""
         before = self.logs[-1]
         self.logs[-1] = before.grown(count, time_utc)
         self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[before.size :])
 
     def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
-        """What sends ``count`` bytes from ``offset`` on, block by block; an empty block where there are none."""
+        """Return functions that create the LOG_DATA blocks of a range; a single empty block if there is no data."""
         data = self.content(number)
         end = min(len(data), offset + count)
         starts = range(offset, end, _BLOCK) if offset < end else range(offset, offset + 1)
         return [lambda start=start: _block(data, log_id, start, end) for start in starts]  # type: ignore[misc]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
-        """Send these one after the other, instead of what was on its way."""
+        """Send these messages, and abort the transfer before."""
         self.restart()
         self._outgoing.extend(messages)
         self._channel = channel
@@ -140,7 +141,7 @@ class LogServer:
 
 
 class ArduPilotLogServer(LogServer):
-    """Logs have the numbers 1, 2, 3 …; what is asked for during a transfer is ignored, data of an unknown log ends it.
+    """Log numbers start at 1. Requests during a transfer are ignored; data of an unknown log aborts it.
 
     Nothing is listed or sent while armed.
     """
@@ -151,13 +152,9 @@ class ArduPilotLogServer(LogServer):
         logs: Sequence[SimulatedLog],
         *,
         is_armed: Callable[[], bool],
-        rate_hz: float = 4000.0,
-        erase_files: Callable[[], None] = lambda: None,
-        append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            vehicle, logs, rate_hz=rate_hz, erase_files=erase_files, append_to_file=append_to_file
-        )
+        super().__init__(vehicle, logs, **options)
         self._is_armed = is_armed
         self._has_warned = False
 
@@ -203,25 +200,13 @@ class ArduPilotLogServer(LogServer):
 
 
 class Px4LogServer(LogServer):
-    """Logs have the numbers 0, 1, 2 …; the end of a list request is ignored, data only comes once there was a list.
+    """Log numbers start at 0. Data is sent only after a list request, whose ``end`` is ignored.
 
-    A new request replaces the one that runs. The last block is not cut to what was asked for. Without logs a list
-    request is met with silence.
+    A new request replaces the transfer. The last block is not cut to the requested size. Without logs, a list
+    request is not answered.
     """
 
-    def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        logs: Sequence[SimulatedLog],
-        *,
-        rate_hz: float = 4000.0,
-        erase_files: Callable[[], None] = lambda: None,
-        append_to_file: Callable[[int, bytes], None] = lambda number, data: None,
-    ) -> None:
-        super().__init__(
-            vehicle, logs, rate_hz=rate_hz, erase_files=erase_files, append_to_file=append_to_file
-        )
-        self._was_listed = False
+    _was_listed = False
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
         self._was_listed = True
@@ -235,8 +220,8 @@ class Px4LogServer(LogServer):
         return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
 
     def _on_data(self, request: LogRequestData, channel: Channel) -> None:
-        known = self._was_listed and request.id < len(self.logs)
-        if not known or request.ofs >= self.logs[request.id].size:
+        is_available = self._was_listed and request.id < len(self.logs)
+        if not is_available or request.ofs >= self.logs[request.id].size:
             self.restart()
             return
         whole = -(-request.count // _BLOCK) * _BLOCK or _BLOCK

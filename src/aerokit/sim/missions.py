@@ -1,6 +1,6 @@
-"""Missions, fences and rally points of a simulated vehicle: what every kind of vehicle shares.
+"""Missions, fences and rally points of a simulated vehicle: conversions and the ``@MISSION`` files.
 
-The protocol and what a vehicle makes of an item differ so much between autopilots that each has a server of its own
+The protocol itself differs so much between autopilots that each has a server of its own
 (`sim.ardupilot.mission_server`, `sim.px4.mission_server`). https://mavlink.io/en/services/mission.html
 """
 
@@ -16,40 +16,38 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType
 from aerokit.mavlink.messages import MissionItemInt
 from aerokit.missions import MissionItem
-from aerokit.missions.pack import NO_CLEAR, pack_items, read_header, unpack_items
-from aerokit.sim.file_tree import EINVAL, ENFILE, ENOENT, FileFault, Mount, OpenFile
+from aerokit.missions.wire import NO_CLEAR, pack_items, read_header, to_wire, unpack_items
+from aerokit.sim.ftp import EINVAL, ENFILE, ENOENT, FileFault, FileHandle, Mount, UploadedFile
 
 INVALID_INDEX = 0xFFFF
-"""No item, where a message wants a number."""
+"""The value of an unset index."""
 
 AnyItem = m.MissionItemInt | m.MissionItem
 AnyRequest = m.MissionRequestInt | m.MissionRequest
 
 
 class MissionStore(Protocol):
-    """What other servers of the vehicle (files) need of its missions.
+    """The missions of a vehicle, as its file server uses them.
 
     ``mission_type`` is a MAV_MISSION_TYPE: 0 mission, 1 fence, 2 rally points.
     """
 
     @property
     def transfer_is_open(self) -> bool:
-        """Whether somebody's upload or download is going on."""
+        """True during an upload or download."""
         ...
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """What the vehicle has, as it gives it back: ArduPilot's home, item 0, included."""
+        """Return the items as a download has them, including ArduPilot's home (item 0)."""
         ...
 
-    def replace(
-        self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True
-    ) -> int:
-        """Store items at once, as a file does; the MAV_MISSION_RESULT."""
+    def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
+        """Replace the items at once, as a file upload does; returns the MAV_MISSION_RESULT."""
         ...
 
 
 def float32(value: float) -> float:
-    """As the wire and the vehicle's memory round it; infinity beyond the range."""
+    """Round to single precision; infinity beyond the range."""
     try:
         return float(struct.unpack("<f", struct.pack("<f", value))[0])
     except OverflowError:
@@ -57,10 +55,8 @@ def float32(value: float) -> float:
 
 
 def item_from(message: AnyItem) -> MissionItem:
-    """The item in a MISSION_ITEM_INT, or in a MISSION_ITEM with ``x`` and ``y`` as they are there."""
-    return MissionItem(
-        message.command,
-        message.frame,
+    """Return the item of a MISSION_ITEM_INT, or of a MISSION_ITEM without scaling ``x`` and ``y``."""
+    numbers = (
         message.param1,
         message.param2,
         message.param3,
@@ -68,7 +64,21 @@ def item_from(message: AnyItem) -> MissionItem:
         message.x,
         message.y,
         message.z,
-        bool(message.autocontinue),
+    )
+    return MissionItem(message.command, message.frame, *numbers, autocontinue=bool(message.autocontinue))
+
+
+def item_message_int(
+    item: MissionItem, seq: int, to: tuple[int, int], mission_type: int, *, current: bool
+) -> m.MissionItemInt:
+    system, component = to
+    return to_wire(
+        item,
+        seq,
+        target_system=system,
+        target_component=component,
+        mission_type=mission_type,
+        current=current,
     )
 
 
@@ -80,22 +90,10 @@ def item_message_float(
     mission_type: int,
     current: int = 0,
 ) -> m.MissionItem:
-    """MISSION_ITEM for somebody; ``place`` is what goes into ``x`` and ``y``."""
-    return m.MissionItem(
-        *to,
-        seq,
-        item.frame,
-        item.command,
-        current,
-        int(item.autocontinue),
-        item.param1,
-        item.param2,
-        item.param3,
-        item.param4,
-        *place,
-        item.z,
-        mission_type,
-    )
+    """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
+    head = (*to, seq, item.frame, item.command, current, int(item.autocontinue))
+    numbers = (item.param1, item.param2, item.param3, item.param4)
+    return m.MissionItem(*head, *numbers, *place, item.z, mission_type)
 
 
 _FILES = {
@@ -103,13 +101,13 @@ _FILES = {
     "fence.dat": MavMissionType.FENCE,
     "rally.dat": MavMissionType.RALLY,
 }
+# Fills gaps in an upload.
 _EMPTY = MissionItem(0, 0, autocontinue=False)
-"""What is where nothing was written."""
 _PLACEHOLDER_SIZE = 1 << 20
 
 
 class MissionMount(Mount):
-    """Mounted as ``@MISSION``; one upload at a time. An open tells one mebibyte, whatever there is."""
+    """Files mounted as ``@MISSION``. Accepts one upload at a time; an open reports one mebibyte."""
 
     def __init__(self, store: MissionStore) -> None:
         self._store = store
@@ -119,8 +117,8 @@ class MissionMount(Mount):
         _type_of(path)
         return _PLACEHOLDER_SIZE
 
-    def open(self, path: str, *, writing: bool) -> OpenFile:
-        """Read what the vehicle has, or write what it shall have."""
+    def open(self, path: str, *, writing: bool) -> FileHandle:
+        """Open the stored items for reading, or an upload that replaces them."""
         type_ = _type_of(path)
         if not writing:
             return _Reader(_packed(self._store.items(type_), type_))
@@ -130,7 +128,7 @@ class MissionMount(Mount):
         return self._writer
 
 
-class _Reader(OpenFile):
+class _Reader(FileHandle):
     def __init__(self, content: bytes) -> None:
         self._content = content
 
@@ -138,36 +136,29 @@ class _Reader(OpenFile):
         return self._content[offset : offset + size]
 
 
-class _Writer(OpenFile):
-    """A file that is not whole, or that the vehicle does not like, has no effect, and nobody is told."""
+class _Writer(UploadedFile):
+    """An upload that is incomplete or rejected has no effect and is not reported."""
 
     def __init__(self, store: MissionStore, type_: int) -> None:
+        super().__init__()
         self.is_closed = False
         self._store = store
         self._type = type_
-        self._content = bytearray()
 
-    def read(self, offset: int, size: int) -> bytes:
-        raise FileFault(EINVAL)
-
-    def write(self, offset: int, data: bytes) -> None:
-        content = self._content
-        if offset == 0:
-            with suppress(RemoteProtocolError):
-                header = read_header(data)
-                if header.items < INVALID_INDEX:
-                    content.extend(bytes(max(0, header.length - len(content))))
-        content.extend(bytes(max(0, offset + len(data) - len(content))))
-        content[offset : offset + len(data)] = data
+    def announced_size(self, data: bytes) -> int:
+        with suppress(RemoteProtocolError):
+            header = read_header(data)
+            return header.length if header.items < INVALID_INDEX else 0
+        return 0
 
     def close(self) -> None:
         self.is_closed = True
         try:
-            header = read_header(bytes(self._content))
-            items = unpack_items(bytes(self._content[: header.length]))
+            header = read_header(bytes(self.content))
+            items = unpack_items(bytes(self.content[: header.length]))
         except (RemoteProtocolError, InvalidArgument):
             raise FileFault(EINVAL) from None
-        if len(self._content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
+        if len(self.content) >= header.length + MissionItemInt.LENGTH or _EMPTY in items:
             raise FileFault(EINVAL)
         clear = not header.options & NO_CLEAR
         result = self._store.replace(self._type, items, start=header.first, clear=clear)

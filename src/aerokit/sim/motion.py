@@ -1,9 +1,8 @@
-"""How a simulated multicopter moves: a point mass with a heading that leans as its acceleration needs.
+"""Local frame and motion of a simulated multicopter: a point mass that leans as its acceleration requires.
 
-What it does: limits of speed, acceleration and turn rate; the slowing down before a target that ArduPilot's
-and PX4's square-root controllers show; drag, which makes it lean into its airspeed; a constant wind with
-gusts; ground. What it does not: propeller dynamics, attitude control loops, ground effect, being blown off
-its track.
+Modelled: limits of speed, acceleration and turn rate; braking before a target as ArduPilot's and PX4's square-root
+controllers do; drag, which makes it lean into its airspeed; constant wind with gusts; ground. Not modelled:
+propeller dynamics, attitude control loops, ground effect, drift.
 """
 
 from __future__ import annotations
@@ -11,12 +10,67 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from aerokit.sim.local_frame import Ned
+from aerokit.errors import InvalidArgument
+
+_METRES_PER_DEGREE_E7 = 0.011131884502145034  # ArduPilot's LOCATION_SCALING_FACTOR: the same sphere and rounding.
+
+
+Ned = tuple[float, float, float]
+"""Metres north, east and down."""
+
+
+class GlobalPoint(NamedTuple):
+    """A position in degrees times 1e7 and metres above mean sea level."""
+
+    latitude_e7: int
+    longitude_e7: int
+    altitude_m: float
+
+
+class LocalFrame:
+    """Metres north, east and down of an origin; accurate within a few kilometres, like the autopilots' own frames."""
+
+    __slots__ = ("_east_scale", "origin")
+
+    def __init__(self, origin: GlobalPoint) -> None:
+        self.origin: GlobalPoint = origin
+        self._east_scale = _METRES_PER_DEGREE_E7 * math.cos(math.radians(origin.latitude_e7 * 1e-7))
+
+    def to_global(self, north: float, east: float, down: float) -> GlobalPoint:
+        return GlobalPoint(
+            self.origin.latitude_e7 + round(north / _METRES_PER_DEGREE_E7),
+            self.origin.longitude_e7 + round(east / self._east_scale),
+            self.origin.altitude_m - down,
+        )
+
+    def to_local(self, latitude_e7: int, longitude_e7: int) -> tuple[float, float]:
+        """Return metres north and east of the origin."""
+        return (
+            (latitude_e7 - self.origin.latitude_e7) * _METRES_PER_DEGREE_E7,
+            (longitude_e7 - self.origin.longitude_e7) * self._east_scale,
+        )
+
+
+def true_place(vehicle: Any) -> GlobalPoint:
+    """Return the true position of a simulated vehicle.
+
+    Raises InvalidArgument for a vehicle without one, such as a recording.
+    """
+    frame, motion = getattr(vehicle, "frame", None), getattr(vehicle, "motion", None)
+    if frame is None or motion is None:
+        raise InvalidArgument(f"{type(vehicle).__name__} has no true position")
+    place: GlobalPoint = frame.to_global(*motion.place)
+    return place
+
+
+HOME = (-35.363261, 149.165230, 584.09)
+"""SITL's default home, a model airfield near Canberra: degrees, and metres above mean sea level."""
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Of a rotation about yaw, then pitch, then roll."""
+    """Return the quaternion of a rotation by yaw, then pitch, then roll (radians)."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
@@ -29,7 +83,7 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float,
 
 
 def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Roll, pitch, yaw of a unit quaternion."""
+    """Return roll, pitch and yaw of a unit quaternion in radians."""
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
         math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
@@ -38,7 +92,7 @@ def euler_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float
 
 
 GRAVITY_M_S2 = 9.80665
-_DRAG_PER_S = 0.33  # deceleration per airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s
+_DRAG_PER_S = 0.33  # Deceleration per airspeed: a 450 mm quadrotor leans 20 degrees at 10 m/s.
 _VELOCITY_TIME_CONSTANT_S = 0.3
 _LEAN_TIME_CONSTANT_S = 0.15
 _TURN_GAIN_PER_S = 2.0
@@ -46,19 +100,19 @@ _TERMINAL_SPEED_M_S = 25.0
 
 
 def wrap_pi(angle: float) -> float:
-    """The same direction between -pi and pi."""
+    """Return the angle between -pi and pi."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def _within(value: float, limit: float) -> float:
-    """The value, but no further from zero than ``limit``."""
+def _clamp(value: float, limit: float) -> float:
+    """Limit the absolute value."""
     if value > limit:
         return limit
     return value if value > -limit else -limit
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """How fast to go towards something ``distance`` metres away and stop there without overshoot."""
+    """Return the speed at which to approach a point ``distance`` metres away and stop there without overshoot."""
     linear = deceleration / (gain * gain)
     if distance <= linear:
         return distance * gain
@@ -67,7 +121,7 @@ def approach_speed(distance: float, gain: float, deceleration: float) -> float:
 
 @dataclass
 class MotionLimits:
-    """What the airframe and its controller settings allow."""
+    """Limits of the airframe and its controller."""
 
     acceleration_m_s2: float = 2.5
     vertical_acceleration_m_s2: float = 1.5
@@ -76,8 +130,8 @@ class MotionLimits:
 
 
 @dataclass
-class Wind:
-    """Where the air goes, in m/s; ``gusts_m_s`` is the standard deviation of its changes."""
+class SimulatedWind:
+    """Wind in m/s, as the direction in which the air moves. ``gusts_m_s`` is the standard deviation of its changes."""
 
     north_m_s: float = 0.0
     east_m_s: float = 0.0
@@ -87,8 +141,7 @@ class Wind:
 class Motion:
     """Position (metres north, east, down of an origin), velocity (m/s) and attitude (rad) of a multicopter.
 
-    One of the ``seek_…`` methods says what to do next; ``step`` does it. The ground is level at
-    ``ground_down``.
+    A ``seek_…`` method sets the target; ``step`` moves towards it. The ground is level at ``ground_down``.
     """
 
     north: float
@@ -97,10 +150,10 @@ class Motion:
     pitch: float
 
     def __init__(
-        self, rng: random.Random, limits: MotionLimits | None = None, wind: Wind | None = None
+        self, rng: random.Random, limits: MotionLimits | None = None, wind: SimulatedWind | None = None
     ) -> None:
         self.limits: MotionLimits = limits if limits is not None else MotionLimits()
-        self.wind: Wind = wind if wind is not None else Wind()
+        self.wind: SimulatedWind = wind if wind is not None else SimulatedWind()
         self._rng = rng
         self.ground_down: float = 0.0
         self.north = 0.0
@@ -119,7 +172,7 @@ class Motion:
         self.pitch_rate: float = 0.0
         self.yaw_rate: float = 0.0
         self.impact_speed_m_s: float = 0.0
-        """Vertical speed at the last touch of the ground."""
+        """Vertical speed at the last touchdown."""
         self._gust_north = self._gust_east = 0.0
         self._wanted = (0.0, 0.0, 0.0)
         self._leaning: tuple[float, float] | None = None
@@ -129,25 +182,25 @@ class Motion:
 
     @property
     def place(self) -> Ned:
-        """North, east, down."""
+        """Metres north, east and down."""
         return (self.north, self.east, self.down)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
-        """Fly at this velocity."""
+        """Fly at this velocity (m/s)."""
         self._wanted, self._leaning, self._accelerating = (north, east, down), None, False
 
     def seek_acceleration(self, north: float, east: float, down: float) -> None:
-        """Accelerate like this for as long as it is asked."""
+        """Apply this acceleration (m/s²) until the next target."""
         self._wanted, self._leaning, self._accelerating = (north, east, down), None, True
 
     def seek_attitude(self, roll: float, pitch: float, velocity_down: float) -> None:
-        """Lean like this and keep this vertical speed."""
+        """Hold these angles (rad) and this vertical speed."""
         self._wanted, self._leaning, self._accelerating = (0.0, 0.0, velocity_down), (roll, pitch), False
 
     def seek_position(
         self, north: float, east: float, down: float, *, speed: float, climb: float, descent: float
     ) -> None:
-        """Fly towards a point and stop there, with these speed limits in m/s."""
+        """Fly to a point and stop there, with these speed limits in m/s."""
         offset_north, offset_east, offset_down = north - self.north, east - self.east, down - self.down
         distance = math.hypot(offset_north, offset_east)
         scale = 0.0
@@ -159,21 +212,20 @@ class Motion:
         self.seek_velocity(offset_north * scale, offset_east * scale, math.copysign(vertical, offset_down))
 
     def face(self, yaw: float) -> None:
-        """Turn to this heading."""
+        """Turn to this heading (rad)."""
         self._wanted_yaw = yaw
 
     def turn(self, rate: float) -> None:
-        """Keep turning at this rate, in radians per second."""
+        """Turn at this rate (rad/s)."""
         self._wanted_yaw, self._wanted_yaw_rate = None, rate
 
     @property
     def is_on_ground(self) -> bool:
-        """Whether the skids touch."""
         return self.down >= self.ground_down
 
     @property
     def airspeed_m_s(self) -> float:
-        """Horizontal speed through the air."""
+        """Horizontal airspeed."""
         return math.hypot(
             self.velocity_north - self.wind.north_m_s - self._gust_north,
             self.velocity_east - self.wind.east_m_s - self._gust_east,
@@ -181,13 +233,13 @@ class Motion:
 
     @property
     def ground_speed_m_s(self) -> float:
-        """Horizontal speed over the ground."""
+        """Horizontal ground speed."""
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Move on by ``dt`` seconds; without power it falls."""
+        """Advance by ``dt`` seconds; unpowered, it falls."""
         if self.wind.gusts_m_s > 0.0:
-            self._blow(dt)
+            self._update_gusts(dt)
         if powered:
             north, east, down = self._commanded_acceleration()
         else:
@@ -199,7 +251,7 @@ class Motion:
         self._turn(dt, powered=powered)
 
     def settle(self) -> None:
-        """Stand still and level on the ground."""
+        """Stop, level, on the ground."""
         self.down = self.ground_down
         self.velocity_north = self.velocity_east = self.velocity_down = 0.0
         self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0
@@ -207,7 +259,7 @@ class Motion:
         self._wanted, self._leaning, self._accelerating = (0.0, 0.0, 0.0), None, False
         self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
 
-    def _blow(self, dt: float) -> None:
+    def _update_gusts(self, dt: float) -> None:
         decay, kick = 1.0 - dt / 2.0, self.wind.gusts_m_s * math.sqrt(dt)
         self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)
         self._gust_east = self._gust_east * decay + self._rng.gauss(0.0, kick)
@@ -218,7 +270,7 @@ class Motion:
         down = wanted_down
         if not self._accelerating:
             down = (wanted_down - self.velocity_down) / _VELOCITY_TIME_CONSTANT_S
-        down = _within(down, limits.vertical_acceleration_m_s2)
+        down = _clamp(down, limits.vertical_acceleration_m_s2)
         if self._leaning is not None:
             north, east = self._acceleration_from_lean(*self._leaning)
             return north, east, down
@@ -234,8 +286,8 @@ class Motion:
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
         lean = self.limits.lean_rad
         forward, right = (
-            -GRAVITY_M_S2 * math.tan(_within(pitch, lean)),
-            GRAVITY_M_S2 * math.tan(_within(roll, lean)),
+            -GRAVITY_M_S2 * math.tan(_clamp(pitch, lean)),
+            GRAVITY_M_S2 * math.tan(_clamp(roll, lean)),
         )
         cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
         drag_north, drag_east = self._drag()
@@ -276,8 +328,8 @@ class Motion:
             north, east = north + drag_north, east + drag_east
             cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
             limit = self.limits.lean_rad
-            pitch = _within(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
-            roll = _within(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
+            pitch = _clamp(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
+            roll = _clamp(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
         share = dt / _LEAN_TIME_CONSTANT_S if dt < _LEAN_TIME_CONSTANT_S else 1.0
         roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
         self.roll += roll_step
@@ -291,7 +343,7 @@ class Motion:
             rate = self._wanted_yaw_rate
             if self._wanted_yaw is not None:
                 rate = _TURN_GAIN_PER_S * wrap_pi(self._wanted_yaw - self.yaw)
-            rate = _within(rate, self.limits.turn_rate_rad_s)
+            rate = _clamp(rate, self.limits.turn_rate_rad_s)
         self.yaw_rate = rate
         if rate != 0.0:
             self.yaw = wrap_pi(self.yaw + rate * dt)

@@ -1,4 +1,4 @@
-"""Servers of parameters: what every make does, and how ArduPilot and PX4 do it."""
+"""Parameter protocol of the simulated vehicles, for ArduPilot and PX4."""
 
 from __future__ import annotations
 
@@ -13,20 +13,28 @@ from aerokit.parameters import Parameter, ParameterTable, ParameterType
 from aerokit.parameters.encoding import UNKNOWN_INDEX, value_message, value_of
 from aerokit.parameters.pack import HASH_NAME, px4_hash
 from aerokit.sim.channel import Channel
-from aerokit.sim.parameters import Parameters
+from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle, sender_of
 
 
 class ParameterServer:
-    """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; an autopilot's own class says how.
+    """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; subclasses implement what differs.
 
-    A list goes out ``list_rate_hz`` parameters a second, ``burst`` at once, each port its own.
+    Lists are sent per port, at ``list_rate_hz`` parameters a second in groups of ``burst``.
     """
 
     burst = 5
 
-    def __init__(self, vehicle: SimulatedVehicle, parameters: Parameters, *, list_rate_hz: float) -> None:
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        parameters: SimParameters,
+        *,
+        list_rate_hz: float = 1000.0,
+        errors: bool = True,
+    ) -> None:
         self.list_rate_hz = list_rate_hz
+        self.errors = errors
         self._vehicle = vehicle
         self._parameters = parameters
         self._lists: dict[Channel, int] = {}
@@ -37,20 +45,19 @@ class ParameterServer:
 
     @property
     def running_lists(self) -> int:
-        """On how many ports a list is on its way."""
+        """Number of ports on which a list is being sent."""
         return len(self._lists)
 
     def restart(self) -> None:
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:
-        """Send all of them on a port; a list that runs there begins anew."""
+        """Send all parameters on a port; restarts a running list."""
         self._list_number += 1
         self._lists[channel] = number = self._list_number
         self._vehicle.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(0, channel, number))
 
     def stop_list(self, channel: Channel) -> None:
-        """Send no more of them."""
         self._lists.pop(channel, None)
 
     def _send_from(self, index: int, channel: Channel, number: int) -> None:
@@ -62,9 +69,7 @@ class ParameterServer:
         if end >= len(names):
             self.stop_list(channel)
             return
-        self._vehicle.call_later(
-            self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number)
-        )
+        self._vehicle.call_later(self.burst / self.list_rate_hz, lambda: self._send_from(end, channel, number))
 
     def _on_list(self, request: ParamRequestList, channel: Channel) -> None:
         raise NotImplementedError
@@ -76,49 +81,49 @@ class ParameterServer:
         raise NotImplementedError
 
     def value_message(self, name: str, index: int) -> ParamValue:
-        """The PARAM_VALUE of a parameter."""
         parameters = self._parameters
         return ParamValue(name, parameters[name], parameters.type(name), len(parameters), index)
 
     def send(self, name: str, index: int, channel: Channel | None) -> None:
-        """Send a value on one port, or on all."""
+        """Send a PARAM_VALUE on one port, or on all if ``channel`` is None."""
         if name not in self._vehicle.faults.mute_parameters:
             self._vehicle.send(self.value_message(name, index), channel)
 
     def send_error(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
-        """Send a PARAM_ERROR."""
         self._vehicle.send(ParamError(*to, name, index, code), channel)
 
     def clamped(self, name: str, value: float) -> float:
-        """What remains of a value under the limits among the faults."""
+        """Apply `Faults.parameter_limits` to a value."""
         low, high = self._vehicle.faults.parameter_limits.get(name, (value, value))
         return max(low, min(high, value)) if value == value else value
 
 
 _QUEUE_DEPTH = 20
 _READ_PERIOD_S = 0.001
-_BOTH_WAYS = 0.01
+_ROUNDING_OFFSET = 0.01
 
 
 class ArduPilotParameterServer(ParameterServer):
-    """The development version of 4.7 says nothing to an unknown name or a value that is no number; with ``errors``
-    it sends PARAM_ERROR, as the released one does, and confirms to who has asked besides telling everybody.
+    """Parameter protocol of ArduPilot.
 
-    Reads wait in a queue of twenty, one is done each millisecond; what does not fit is lost. A list begins with
-    the banner.
+    The development version of 4.7 does not answer an unknown name or a value that is not a number. With ``errors``
+    it sends PARAM_ERROR, as the released version does, and sends the confirmation of PARAM_SET to the sender's port
+    in addition to the broadcast.
+
+    Read requests wait in a queue of 20, and one is served each millisecond; requests beyond that are lost. A list
+    begins with the banner.
     """
 
     def __init__(
         self,
         vehicle: SimulatedVehicle,
-        parameters: Parameters,
+        parameters: SimParameters,
         *,
         list_rate_hz: float = 2000.0,
         errors: bool = False,
         send_banner: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
-        self.errors = errors
+        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz, errors=errors)
         self._send_banner = send_banner
         self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()
         self._is_reading = False
@@ -176,41 +181,30 @@ class ArduPilotParameterServer(ParameterServer):
 
 
 def rounded(value: float, type_: int) -> float:
-    """What ArduPilot makes of a float for a whole number: a hundredth is added away from zero, the rest cut off."""
+    """Convert a float for an integer parameter as ArduPilot does: add 0.01 away from zero, then truncate."""
     if type_ == MavParamType.REAL32:
         return value
-    shifted = value + math.copysign(_BOTH_WAYS, value)
+    shifted = value + math.copysign(_ROUNDING_OFFSET, value)
     return float(math.trunc(struct.unpack("<f", struct.pack("<f", shifted))[0]))
 
 
 _SECOND_ECHO_S = 0.02
-_GARBAGE = 24400
-"""What was seen in the field of a PARAM_ERROR that is not used."""
+# Seen in the unused index field of PX4's PARAM_ERROR.
+_UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """With ``errors`` as main sends them (PARAM_ERROR); without, as v1.16, which says nothing.
+    """Parameter protocol of PX4; ``errors`` sends PARAM_ERROR as main does, v1.16 sends none.
 
-    No value is checked: whatever the four bytes are is stored. Each PARAM_SET is confirmed to who has asked, and a
-    change is told to everybody a moment later. Setting _HASH_CHECK stops a list; a request for one that runs begins
-    it anew without the hash.
+    Values are not checked: the four bytes are stored. PARAM_SET is confirmed on the sender's port, and a change is
+    broadcast shortly after. Setting _HASH_CHECK stops a list; a list request during a list restarts it without the
+    hash.
     """
 
     burst = 10
 
-    def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        parameters: Parameters,
-        *,
-        list_rate_hz: float = 1000.0,
-        errors: bool = True,
-    ) -> None:
-        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
-        self.errors = errors
-
     def value_message(self, name: str, index: int) -> ParamValue:
-        """The PARAM_VALUE of a parameter: the four bytes of its value, whatever they would be as a float."""
+        """Return the PARAM_VALUE; its float field holds the bytes of the value."""
         parameter = self._parameters.row(name).as_parameter(index)
         return value_message(parameter, len(self._parameters), bytewise=True)
 
@@ -240,15 +234,15 @@ class Px4ParameterServer(ParameterServer):
         elif request.param_id in self._parameters:
             self.send(request.param_id, self._parameters.index(request.param_id), channel)
         else:
-            self._refuse(sender, request.param_id, _GARBAGE, MavParamError.DOES_NOT_EXIST, channel)
+            self._refuse(sender, request.param_id, _UNUSED_INDEX, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
         if name == HASH_NAME:
             self.stop_list(channel)
-        code = self._objection(name, request.param_type)
+        code = self._error_for(name, request.param_type)
         if code is not None:
-            self._refuse(sender_of(request), name, _GARBAGE, code, channel)
+            self._refuse(sender_of(request), name, _UNUSED_INDEX, code, channel)
             return
         value = value_of(request, bytewise=True)
         before = parameters[name]
@@ -258,7 +252,7 @@ class Px4ParameterServer(ParameterServer):
         if parameters[name] != before and value == value:
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
-    def _objection(self, name: str, type_: int) -> int | None:
+    def _error_for(self, name: str, type_: int) -> int | None:
         if name == HASH_NAME:
             return MavParamError.READ_ONLY
         if name not in self._parameters:

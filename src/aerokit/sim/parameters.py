@@ -1,4 +1,4 @@
-"""The parameters of a simulated vehicle: names, values, types and defaults."""
+"""Parameters of a simulated vehicle, and the ``@PARAM`` files that transfer them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from difflib import get_close_matches
 from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavParamType
 from aerokit.parameters import Parameter, ParameterType
-from aerokit.parameters.pack import HEADER, MAGIC, pack_served, read_entry, read_header
-from aerokit.sim.file_tree import EINVAL, ENOENT, FileFault, Mount, OpenFile
+from aerokit.parameters.pack import HEADER, MAGIC, pack_for_download, read_entry, read_header
+from aerokit.sim.ftp import EINVAL, ENOENT, FileFault, FileHandle, Mount, UploadedFile
 
 _VOLATILE = "v"
 
@@ -28,8 +28,8 @@ _RANGES = {
 
 
 @dataclass
-class ParameterRow:
-    """One parameter."""
+class SimParameter:
+    """A parameter with its type and default."""
 
     name: str
     type: int
@@ -37,38 +37,40 @@ class ParameterRow:
     value: float
     default: float
     is_volatile: bool = False
-    """Left out of PX4's hash: the vehicle changes it by itself."""
+    """Excluded from PX4's hash, because the vehicle changes it."""
     switch: str | None = None
-    """ArduPilot lists and counts it only while this parameter is not 0; it is there by name at any time."""
+    """Name of a parameter; while that is 0, ArduPilot leaves this one out of lists and counts, but answers reads by
+    name.
+    """
 
     def as_parameter(self, index: int | None = None) -> Parameter:
-        """The same as clients have it: whole numbers are integers."""
+        """Convert to the client's `Parameter`; integer types become int."""
         type_ = ParameterType(self.type)
         value, default = (int(x) if type_.is_integer else x for x in (self.value, self.default))
         return Parameter(self.name, value, type_, default, index)
 
 
-class Parameters:
-    """By name, in the vehicle's order. They survive a reboot.
+class SimParameters:
+    """Parameters by name, in the vehicle's order. They survive a reboot.
 
-    A value is what the vehicle can store: 32-bit floats, whole numbers within the type's range.
+    Values are rounded and clamped as the vehicle stores them: 32-bit floats, or integers within the type's range.
     """
 
-    def __init__(self, rows: Iterable[ParameterRow]) -> None:
-        self._rows: dict[str, ParameterRow | str] = {row.name: row for row in rows}
+    def __init__(self, rows: Iterable[SimParameter]) -> None:
+        self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
         self._switched = {row.name: row.switch for row in self._all() if row.switch is not None}
         self._names: tuple[str, ...] | None = None
         self._indices: dict[str, int] = {}
 
     @classmethod
-    def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> Parameters:
-        """One ``name,type,value[,default[,switch]]`` a line; a switch ``v`` means volatile.
+    def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
+        """Parse lines of ``name,type,value[,default[,switch]]``; the switch ``v`` marks a volatile parameter.
 
-        ``count``: only so many, in the text's order, the ``used`` ones among them in any case.
+        ``count`` limits their number, in the order of the text; those in ``used`` are always included.
         """
         lines = text.split()
         if count is not None:
-            lines = _some_of(lines, frozenset(used), count)
+            lines = _select_lines(lines, frozenset(used), count)
         parameters = cls(())
         parameters._rows = {line.partition(",")[0]: line for line in lines}
         parameters._switched = dict(filter(None, map(_switched, lines)))
@@ -77,11 +79,10 @@ class Parameters:
     def __getitem__(self, name: str) -> float:
         try:
             return self._rows[name].value  # type: ignore[union-attr]
-        except AttributeError:  # a line of text that nobody has asked for yet
+        except AttributeError:  # The row is still a line of text.
             return self.row(name).value
 
     def get(self, name: str, default: float) -> float:
-        """The value; the default when this table is without it."""
         return self[name] if name in self else default  # noqa: SIM401 - this is `get`
 
     def __setitem__(self, name: str, value: float) -> None:
@@ -92,7 +93,10 @@ class Parameters:
             self._names = None
 
     def change(self, values: Mapping[str, float]) -> None:
-        """Set several; InvalidArgument for a name that is not there, with those that are like it."""
+        """Set several parameters.
+
+        Raises InvalidArgument, with similar names, for an unknown one.
+        """
         for name, value in values.items():
             if name not in self:
                 similar = ", ".join(get_close_matches(name, self._rows)) or "none"
@@ -110,7 +114,7 @@ class Parameters:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """In the vehicle's order: the place here is the index in messages."""
+        """Listed names, in the vehicle's order; the position is the index on the wire."""
         if self._names is None:
             off = {name for name, switch in self._switched.items() if not self[switch]}
             self._names = tuple(name for name in self._rows if name not in off)
@@ -118,27 +122,27 @@ class Parameters:
         return self._names
 
     def index(self, name: str) -> int:
-        """The place in ``names``; KeyError when it is not among them."""
+        """Return the position in ``names``; KeyError if it is not listed."""
         _ = self.names
         return self._indices[name]
 
     def type(self, name: str) -> int:
-        """The MAV_PARAM_TYPE."""
+        """Return the MAV_PARAM_TYPE."""
         return self.row(name).type
 
     def default(self, name: str) -> float:
         return self.row(name).default
 
-    def row(self, name: str) -> ParameterRow:
-        """Everything about one of them; read from its line when it is first asked for."""
+    def row(self, name: str) -> SimParameter:
+        """Return the parameter; its line is parsed on first access."""
         row = self._rows[name]
         if isinstance(row, str):
             row = self._rows[name] = _row(row.split(","))
         return row
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
-        """One more at the end, as when a feature is switched on: the count changes while the vehicle runs."""
-        self._rows[name] = ParameterRow(name, type, stored(value, type), stored(value, type))
+        """Append a parameter, as when a feature is enabled at run time."""
+        self._rows[name] = SimParameter(name, type, stored(value, type), stored(value, type))
         self._names = None
 
     def remove(self, name: str) -> None:
@@ -146,34 +150,34 @@ class Parameters:
         self._switched.pop(name, None)
         self._names = None
 
-    def _all(self) -> Iterator[ParameterRow]:
+    def _all(self) -> Iterator[SimParameter]:
         return (self.row(name) for name in list(self._rows))
 
 
 def stored(value: float, type_: int) -> float:
-    """What a parameter of this MAV_PARAM_TYPE holds after it was given a value."""
+    """Return the value that a parameter of this MAV_PARAM_TYPE stores."""
     range_ = _RANGES.get(MavParamType(type_))
     if range_ is None:
         return float(struct.unpack("<f", struct.pack("<f", value))[0]) if math.isfinite(value) else value
     return float(max(range_[0], min(range_[1], int(value))))
 
 
-def _row(fields: list[str]) -> ParameterRow:
+def _row(fields: list[str]) -> SimParameter:
     name, type_, value = fields[0], int(fields[1]), float(fields[2])
     default = float(fields[3]) if len(fields) > 3 else value
     extra = fields[4] if len(fields) > 4 else None
     switch = None if extra == _VOLATILE else extra
-    return ParameterRow(name, type_, stored(value, type_), stored(default, type_), extra == _VOLATILE, switch)
+    return SimParameter(name, type_, stored(value, type_), stored(default, type_), extra == _VOLATILE, switch)
 
 
 def _switched(line: str) -> tuple[str, str] | None:
-    """The name and its switch, if it has one."""
+    """Return the name and switch of a line, or None if it has no switch."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
     return line.partition(",")[0], line.rpartition(",")[2]
 
 
-def _some_of(lines: list[str], used: frozenset[str], count: int) -> list[str]:
+def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
     is_used = [line.partition(",")[0] in used for line in lines]
     others = max(0, count - sum(is_used))
     chosen: list[str] = []
@@ -189,38 +193,38 @@ _GUESSED_ROW_SIZE = 12
 
 
 class ParameterPackMount(Mount):
-    """Mounted as ``@PARAM``.
+    """Files mounted as ``@PARAM``.
 
-    ``apply(name, value)`` is called for what was uploaded. ``block`` fixes the size of the blocks that no value
-    lies across, and lets an open tell the exact size (PX4); without it the first read decides (ArduPilot).
+    ``apply(name, value)`` is called for each uploaded parameter. With ``block`` no value crosses a block of that
+    size and an open reports the exact size (PX4); without it, the first read sets the block size (ArduPilot).
     """
 
     def __init__(
-        self, parameters: Parameters, apply: Callable[[str, float], None], *, block: int | None = None
+        self, parameters: SimParameters, apply: Callable[[str, float], None], *, block: int | None = None
     ) -> None:
         self._parameters = parameters
         self._apply = apply
         self._block = block
 
     def size(self, path: str) -> int:
-        """12 bytes for each parameter, whatever is asked for; the true one with a fixed block size."""
+        """Return the exact size if the block size is fixed, else 12 bytes per parameter."""
         if self._block is not None:
             return len(_Reader(self._parameters, path, self._block).content)
         _query(path)
         return len(self._parameters) * _GUESSED_ROW_SIZE
 
-    def open(self, path: str, *, writing: bool) -> OpenFile:
-        """Read all, or those of ``?start=&count=``, with defaults where ``?withdefaults=1``; or write."""
+    def open(self, path: str, *, writing: bool) -> FileHandle:
+        """Open for reading, with the query ``?start=&count=&withdefaults=``, or for writing."""
         if writing:
             _query(path)
             return _Writer(self._parameters, self._apply)
         return _Reader(self._parameters, path, self._block)
 
 
-class _Reader(OpenFile):
-    """All reads have to be of one size: so a value is never torn when blocks come from different moments."""
+class _Reader(FileHandle):
+    """All reads must have the same size, so that blocks read at different times never split a value."""
 
-    def __init__(self, parameters: Parameters, path: str, block: int | None) -> None:
+    def __init__(self, parameters: SimParameters, path: str, block: int | None) -> None:
         query = _query(path)
         self._parameters = parameters
         self._start, self._count = query.get("start", 0), query.get("count", 0)
@@ -233,14 +237,14 @@ class _Reader(OpenFile):
 
     @property
     def content(self) -> bytes:
-        """The whole file, as it is at the first look."""
+        """File content, created on first access."""
         if self._content is None:
             self._content = self._packed()
         return self._content
 
     def _packed(self) -> bytes:
         try:
-            return pack_served(
+            return pack_for_download(
                 (self._parameters.row(name).as_parameter() for name in self._parameters.names),
                 start=self._start,
                 count=self._count,
@@ -260,28 +264,22 @@ class _Reader(OpenFile):
         return self.content[offset : offset + size]
 
 
-class _Writer(OpenFile):
-    """Everything takes effect at the end; a file that is not whole has no effect, and nobody is told."""
+class _Writer(UploadedFile):
+    """Parameters are applied on close. An invalid file has no effect and is not reported."""
 
-    def __init__(self, parameters: Parameters, apply: Callable[[str, float], None]) -> None:
+    def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
+        super().__init__()
         self._parameters = parameters
         self._apply = apply
-        self._content = bytearray()
 
-    def read(self, offset: int, size: int) -> bytes:
-        raise FileFault(EINVAL)
-
-    def write(self, offset: int, data: bytes) -> None:
-        content = self._content
-        if offset == 0:
-            with suppress(RemoteProtocolError):
-                magic, _, length = read_header(data)
-                content.extend(bytes(max(0, length - len(content)) if magic == MAGIC else 0))
-        content.extend(bytes(max(0, offset + len(data) - len(content))))
-        content[offset : offset + len(data)] = data
+    def announced_size(self, data: bytes) -> int:
+        with suppress(RemoteProtocolError):
+            magic, _, length = read_header(data)
+            return length if magic == MAGIC else 0
+        return 0
 
     def close(self) -> None:
-        content = bytes(self._content)
+        content = bytes(self.content)
         try:
             magic, count, length = read_header(content)
             if magic != MAGIC or length != len(content):
@@ -303,7 +301,7 @@ class _Writer(OpenFile):
 
 
 def _query(path: str) -> dict[str, int]:
-    """The arguments behind the question mark; FileFault when it is not that file."""
+    """Parse the query string; FileFault for another file name."""
     name, _, query = path.partition("?")
     if name != _NAME:
         raise FileFault(ENOENT)

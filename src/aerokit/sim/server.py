@@ -1,4 +1,4 @@
-"""Simulated vehicles on links, in real time or faster, inside the running event loop."""
+"""Serves simulated vehicles on links, in real time or faster, inside the running event loop."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from typing import Any
 from typing_extensions import Self
 
 from aerokit.errors import BusyError, InvalidArgument, LinkLost
-from aerokit.sim.channel import Channel, SharedHearing, datagrams
+from aerokit.sim.channel import Channel, SharedMessageReader, datagrams
 from aerokit.sim.vehicle import TICK_S, SimulatedVehicle
 from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, memory_link_pair
 
-_SHORTEST_WAIT_S = 0.001
-"""Of the loop's time, for many vehicles or when they run faster than it: several ticks are then done in one go."""
-_MANY = 10
-_WAIT_OF_MANY_S = TICK_S
-"""Simulated, for more than `_MANY` unless they are on virtual time: what falls into it goes out together."""
+# Shortest timer, in loop time, for many vehicles or faster than real time: several ticks then run at once.
+_MIN_WAIT_S = 0.001
+_BATCH_THRESHOLD = 10
+# Simulated seconds whose output is sent together, for more than `_BATCH_THRESHOLD` vehicles in real time.
+_BATCH_INTERVAL_S = TICK_S
+# On virtual time, events this close together run in the same callback, as timers would.
 _INSTANT_S = 1e-8
-"""What is due so soon on virtual time happens before anybody answers, as it does by a timer."""
-_TURNS = 1
-_LONGEST_LEAP_S = 0.5
-"""Simulated; what the loop was late beyond that does not pass for the vehicles, unless they are to keep real time."""
+_EXTRA_TURNS = 1
+# Simulated seconds that are caught up after the loop was blocked; more is skipped unless in real time.
+_MAX_CATCH_UP_S = 0.5
 
 
 class SimulatorServer:
-    """Vehicles that live as long as an ``async with`` block; every vehicle is on every link.
+    """Serves vehicles while its ``async with`` block runs. Every vehicle is on every link.
 
-    ``vehicles_on`` says for each link, in the order of the links, which vehicles are on it instead.
+    ``vehicles_on`` overrides that: for each link, the vehicles on it.
 
-    It runs on the loop's own clock by timers alone: no task, no thread. ``speedup`` 10 makes ten simulated
-    seconds of a real one. What the loop missed because something blocked it is caught up in real time. Otherwise all
-    but half a simulated second of it is left out: a client that had no chance to speak is not taken for a silent one.
-    Leaving the block closes the links.
+    It runs on the loop's clock with timers only, without tasks or threads. ``speedup`` 10 runs ten simulated seconds
+    per second. If the loop was blocked, time is caught up in real time; at other speeds all but half a simulated
+    second is skipped, so that a client that had no chance to send does not look silent. Leaving the block closes the
+    links.
 
-    What a vehicle raises, by a mistake of its own or of somebody's callback, ends the block at once: the links
-    are closed, the task that runs the block is cancelled, and the block raises it.
+    An exception in a vehicle or a callback ends the block at once: the links are closed, the task that runs the
+    block is cancelled, and the block raises the exception.
 
-    Raises LinkOpenError when a link cannot be opened; nothing is left behind then.
+    Raises LinkOpenError if a link cannot be opened; the others are closed then.
     """
 
     def __init__(
@@ -55,37 +55,37 @@ class SimulatorServer:
     ) -> None:
         if not speedup > 0:
             raise InvalidArgument(f"speedup = {speedup!r} must be above 0")
-        self.vehicles: tuple[SimulatedVehicle] | tuple[SimulatedVehicle, ...] = (
+        self.vehicles: tuple[SimulatedVehicle, ...] = (
             (vehicles,) if isinstance(vehicles, SimulatedVehicle) else tuple(vehicles)
         )
         self._links = (links,) if isinstance(links, Link) else tuple(links)
-        self.vehicles_on: (
-            list[tuple[SimulatedVehicle] | tuple[SimulatedVehicle, ...]] | list[Sequence[SimulatedVehicle]]
-        ) = [self.vehicles] * len(self._links) if vehicles_on is None else list(vehicles_on)
+        on_all: Sequence[Sequence[SimulatedVehicle]] = [self.vehicles] * len(self._links)
+        self.vehicles_on: list[Sequence[SimulatedVehicle]] = list(on_all if vehicles_on is None else vehicles_on)
         if len(self.vehicles_on) != len(self._links):
-            raise InvalidArgument(f"vehicles_on is for {len(self.vehicles_on)} links of {len(self._links)}")
+            raise InvalidArgument(f"vehicles_on has {len(self.vehicles_on)} entries for {len(self._links)} links")
         self._speedup = speedup
-        self._dues = [0.0] * len(self.vehicles)  # when each vehicle has something to do
+        self._dues = [0.0] * len(self.vehicles)  # Next due time of each vehicle.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
-        self._shortest_wait_s = _SHORTEST_WAIT_S if speedup != 1.0 or len(self.vehicles) > _MANY else 0.0
+        self._min_wait_s = _MIN_WAIT_S if speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._jump: Callable[[float], bool] | None = None  # of a loop on virtual time
+        self._jump: Callable[[float], bool] | None = None  # `VirtualClockLoop.jump`, if the loop has one.
         self._started_at = 0.0
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
         self._ports: list[_Port] = []
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due = self._timer_at = 0.0
         self._exit = AsyncExitStack()
-        self._owner: asyncio.Task[Any] | None = None  # runs the block; a fixture's may have ended before
+        # The task that entered the block; that of a fixture may end before the block does.
+        self._owner: asyncio.Task[Any] | None = None
         self._cancels_owner = False
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
-        """Called with all that comes in and goes out: the simulated second, the bytes, whether a vehicle sent them."""
+        """Called with every datagram in either direction: simulated time, bytes, and True if a vehicle sent it."""
         self.failure: Exception | None = None
-        """What a vehicle raised; nothing has happened since."""
+        """Exception raised by a vehicle; the simulation has stopped since."""
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """The addresses of its links, as they are once they are open."""
+        """Addresses of its links, resolved once they are open."""
         return tuple(link.address for link in self._links)
 
     @property
@@ -97,11 +97,11 @@ class SimulatorServer:
 
     async def __aenter__(self) -> Self:
         if self._loop is not None:
-            raise BusyError("this SimulatorServer was started before")
+            raise BusyError("this SimulatorServer was started before; create a new one")
         self._loop, self._owner = asyncio.get_running_loop(), asyncio.current_task()
         self._jump = getattr(self._loop, "jump", None)
-        if self._jump is None and len(self.vehicles) > _MANY:
-            self._shortest_wait_s = max(_SHORTEST_WAIT_S, _WAIT_OF_MANY_S / self._speedup)
+        if self._jump is None and len(self.vehicles) > _BATCH_THRESHOLD:
+            self._min_wait_s = max(_MIN_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
         self._started_at = self._loop.time()
         try:
             async with AsyncExitStack() as opening:
@@ -129,24 +129,24 @@ class SimulatorServer:
         self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Raise what a vehicle raised in the place of what it caused."""
+        """Raise a vehicle's exception in place of the one that it caused."""
         self._stop()
         owner, self._owner = self._owner, None
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
-            _take_cancellation_back(owner)
+            _uncancel(owner)
         if self.failure is not None and self.failure is not error:
             raise self.failure from self.failure.__cause__
 
     def wake(self) -> None:
-        """Let everything happen that is due; call it after a fault or a value was changed by hand.
+        """Run everything that is due. Call it after changing a fault or value.
 
-        Raises what a vehicle raises, now or before.
+        Raises the exception that a vehicle raises or has raised.
         """
         if self.failure is not None:
             raise self.failure
         if self._loop is None:
             return
-        self._leave_out_lateness()
+        self._skip_lateness()
         try:
             self._dues = [vehicle.next_due for vehicle in self.vehicles]
             self._run(self.now)
@@ -155,15 +155,15 @@ class SimulatorServer:
             raise
 
     def _on_timer(self) -> None:
-        self._leave_out_lateness()
+        self._skip_lateness()
         self._timer = None
         try:
-            self._run_on(max(self.now, self._timer_due))  # a timer may fire a hair early
+            self._run_ahead(max(self.now, self._timer_due))  # A timer may fire slightly early.
         except Exception as error:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """Whoever waits for a vehicle is told at once; on the loop's own stack nobody would hear of it."""
+        """Close the links and cancel the owner, because nobody sees an exception raised in a loop callback."""
         self.failure = error
         self._stop()
         for link in self._links:
@@ -183,39 +183,39 @@ class SimulatorServer:
         self._flush()
         self._schedule()
 
-    def _run_on(self, now: float) -> None:
-        """The same, and on virtual time also what comes next, as long as nothing else happens in between."""
+    def _run_ahead(self, now: float) -> None:
+        """Like `_run`; on virtual time also runs what follows until another callback or timer of the loop is due."""
         self._step(now)
         while not self._flush():
-            if (due := self._leap()) is None:
+            if (due := self._jump_ahead()) is None:
                 self._schedule()
                 return
             self._step(due)
         loop = self._loop
-        if self._jump is None or loop is None or self._when(min(self._dues)) < loop.time() + _INSTANT_S:
+        if self._jump is None or loop is None or self._loop_time(min(self._dues)) < loop.time() + _INSTANT_S:
             self._schedule()
-        else:  # after those who hear what was sent: they may have nothing to say to it
-            loop.call_soon(self._go_on, _TURNS)
+        else:  # The receivers of what was sent run first; they may not answer.
+            loop.call_soon(self._continue_run, _EXTRA_TURNS)
 
-    def _go_on(self, turns: int) -> None:
-        """On virtual time, in place of a timer; who was woken by what was sent gets so many turns before."""
+    def _continue_run(self, turns: int) -> None:
+        """Replace a timer on virtual time, after ``turns`` more turns of the loop for receivers that were woken."""
         loop = self._loop
         if loop is None:
             return
         try:
-            if (due := self._leap()) is not None:
-                self._run_on(due)
+            if (due := self._jump_ahead()) is not None:
+                self._run_ahead(due)
             elif turns and self._timer is None:
-                loop.call_soon(self._go_on, turns - 1)
+                loop.call_soon(self._continue_run, turns - 1)
             else:
                 self._schedule()
         except Exception as error:
             self._fail(error)
 
-    def _leap(self) -> float | None:
-        """On virtual time: go to what is due next, unless something else comes before; when that is."""
+    def _jump_ahead(self) -> float | None:
+        """On virtual time, advance the clock to the next event; return its time, or None if something else is first."""
         due = min(self._dues)
-        if self._jump is None or due == math.inf or not self._jump(self._when(due)):
+        if self._jump is None or due == math.inf or not self._jump(self._loop_time(due)):
             return None
         return max(self.now, due)
 
@@ -227,11 +227,11 @@ class SimulatorServer:
                 vehicle.step(now)
                 dues[number] = vehicle.next_due
 
-    def hear(self, data: bytes, peer: Peer, port: _Port) -> None:
-        """Bytes came in on a link."""
+    def on_bytes(self, data: bytes, peer: Peer, port: _Port) -> None:
+        """Pass bytes of a link to its vehicles."""
         if self._loop is None:
             return
-        self._leave_out_lateness()
+        self._skip_lateness()
         now = self.now
         if self.on_datagram is not None:
             self.on_datagram(now, data, False)
@@ -239,14 +239,14 @@ class SimulatorServer:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
-            port.hearing.forget()
+            port.reader.forget()
             self._flush()
             self._schedule()
         except Exception as error:
             self._fail(error)
 
     def _flush(self) -> bool:
-        """Send what is to be sent; whether there was something."""
+        """Send the outbox; return True if it was not empty."""
         has_sent = False
         for port in self._ports:
             for datagram in port.take_datagrams(together=self._jump is None):
@@ -266,28 +266,28 @@ class SimulatorServer:
             if self._timer_due == due:
                 return
             self._timer.cancel()
-        when = self._when(due)
-        if self._shortest_wait_s:
-            when = max(when, loop.time() + self._shortest_wait_s)
+        when = self._loop_time(due)
+        if self._min_wait_s:
+            when = max(when, loop.time() + self._min_wait_s)
         self._timer_due, self._timer_at = due, when
         self._timer = loop.call_at(when, self._on_timer)
 
-    def _leave_out_lateness(self) -> None:
-        """The timer should have come before now; in real time nothing is left out."""
+    def _skip_lateness(self) -> None:
+        """Shift the start time by the delay of the timer, except in real time."""
         if self._loop is None or self._timer is None or self._speedup == 1.0:
             return
-        late = self._loop.time() - self._timer_at - _LONGEST_LEAP_S / self._speedup
+        late = self._loop.time() - self._timer_at - _MAX_CATCH_UP_S / self._speedup
         if late > 0:
             self._started_at += late
             self._timer_at += late
 
-    def _when(self, due: float) -> float:
-        """By the loop's clock."""
+    def _loop_time(self, due: float) -> float:
+        """Convert simulated time to loop time."""
         return self._started_at + (due - self._now_at_start) / self._speedup
 
 
 class _Port:
-    """One link, the vehicles on it, and their channels there."""
+    """A link with its vehicles and their channels."""
 
     def __init__(
         self,
@@ -300,45 +300,43 @@ class _Port:
         self.link = link
         self.vehicles: Sequence[SimulatedVehicle] = vehicles
         self.channels: Sequence[Channel] = channels
-        self.hearing: SharedHearing = SharedHearing()
+        self.reader: SharedMessageReader = SharedMessageReader()
         if len(channels) > 1:
             for channel in channels:
-                channel.hearing = self.hearing
+                channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """What is to be sent; of many vehicles ``together``, whose frames then share datagrams as behind a router."""
-        speaking = [channel for channel in self.channels if channel.has_output]
-        if together and len(self.channels) > _MANY:
-            return datagrams(piece for channel in speaking for piece in channel.take_pieces())
-        return [datagram for channel in speaking for datagram in channel.take_datagrams()]
+        """Return the datagrams to send. With ``together``, many vehicles share datagrams, as behind a router."""
+        active = [channel for channel in self.channels if channel.has_output]
+        if together and len(self.channels) > _BATCH_THRESHOLD:
+            return datagrams(piece for channel in active for piece in channel.take_pieces())
+        return [datagram for channel in active for datagram in channel.take_datagrams()]
 
     def hang_up(self) -> None:
-        """Cut off the clients of a TCP port whose only vehicle reboots."""
-        if len(self.channels) == 1 and self.channels[0].hangs_up:
-            self.channels[0].hangs_up = False
+        """Disconnect the clients of a TCP port whose only vehicle reboots."""
+        if len(self.channels) == 1 and self.channels[0].closes_clients:
+            self.channels[0].closes_clients = False
             if isinstance(self.link, TcpListen):
                 self.link.close_clients()
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """See `Receiver`."""
-        self._server.hear(data, peer, self)
+        self._server.on_bytes(data, peer, self)
 
     def link_lost(self, error: LinkLost) -> None:
-        """The client has gone; the vehicles fly on, as vehicles do."""
+        """Does nothing: vehicles continue to fly without a client."""
 
     async def close(self) -> None:
-        """Close the link and wait until it is gone."""
         self.link.close()
         await self.link.wait_closed()
 
 
-def _take_cancellation_back(task: asyncio.Task[Any]) -> None:
+def _uncancel(task: asyncio.Task[Any]) -> None:
     if sys.version_info >= (3, 11):
         task.uncancel()
 
 
 def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:
-    """A channel of each vehicle: its first one on the first of its links, a new one on every other."""
+    """Return a channel of each vehicle: its first channel on its first link, a new one on each other link."""
     channels = []
     for vehicle in vehicles:
         is_first = id(vehicle) not in connected
@@ -351,9 +349,9 @@ def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list
 async def simulated_link(
     vehicles: SimulatedVehicle | Iterable[SimulatedVehicle], *, speedup: float = 1.0, latency_s: float = 0.0
 ) -> AsyncIterator[MemoryLink]:
-    """Vehicles in memory: gives the client's end of the link, to be opened by the caller.
+    """Simulate vehicles in memory; yields the client's end of the link, which the caller opens.
 
-    ``latency_s`` seconds, by the loop's clock, pass between sending and receiving in both directions.
+    ``latency_s`` delays both directions, in seconds of the loop's clock.
     """
     near, far = memory_link_pair(latency_s=latency_s)
     async with SimulatorServer(vehicles, far, speedup=speedup):

@@ -1,8 +1,7 @@
-"""What every simulated vehicle is made of: a clock that is fed, channels, timers, status texts, faults.
+"""Base of all simulated vehicles: simulated time, channels, timers, status texts, faults.
 
-Nothing here knows an event loop. ``now`` is simulated seconds, given by the caller, never going back.
-Whatever happens in between happens at its own instant and in the same order however large the steps are, so
-the same calls with the same seed always give the same bytes.
+It uses no event loop. The caller passes the time, in simulated seconds that never decrease. Events run at their own
+times and in the same order for any step size, so that equal calls with an equal seed produce equal bytes.
 """
 
 from __future__ import annotations
@@ -20,75 +19,98 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import Heartbeat, Statustext
 from aerokit.sim.channel import Channel
 from aerokit.sim.faults import Faults
-from aerokit.sim.journal import Journal
 
 TICK_S = 0.02
-"""Motion, modes and failsafes run at 50 Hz while anything moves."""
+"""Interval of motion, modes and failsafes (50 Hz) while the vehicle moves."""
 
 _TEXT_SIZE = 50
 Handler = Callable[[Any, Channel], None]
 
 
-class Component(Protocol):
-    """Another MAVLink component on this vehicle's links: `ExtraComponent`, or a device of `aerokit.sim.components`."""
+class MessageHost(Protocol):
+    """A vehicle or component, as its protocol servers use it."""
+
+    faults: Faults
+
+    @property
+    def now(self) -> float: ...
+
+    def on(self, message_class: type[Message], handler: Handler) -> None: ...
+
+    def send(self, message: Message, channel: Channel | None = None) -> None: ...
+
+    def send_text(self, severity: int, text: str) -> None: ...
+
+    def call_at(self, when: float, action: Callable[[], None]) -> None: ...
+
+    def call_later(self, delay: float, action: Callable[[], None]) -> None: ...
+
+
+class VehicleJournal(Protocol):
+    """Records what a vehicle receives and reports, such as `aerokit.testing.Journal`. Times are simulated seconds."""
+
+    def on_text_sent(self, time_s: float, severity: int, text: str) -> None: ...
+
+    def on_message_received(self, time_s: float, message: Message) -> None: ...
+
+
+class AttachableComponent(Protocol):
+    """A MAVLink component that can be added to a vehicle: `ExtraComponent`, or a device of `aerokit.sim.components`."""
 
     @property
     def component_id(self) -> int:
-        """Its MAV_COMPONENT."""
+        """MAV_COMPONENT."""
         ...
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Called once by the vehicle that it is given to."""
+        """Called once by the vehicle it is added to."""
         ...
 
 
 @dataclass(frozen=True)
 class ExtraComponent:
-    """A component that shows up with a heartbeat once a second, and says and hears nothing else."""
+    """A component that only sends a heartbeat once a second."""
 
     component_id: int
     type: int = MavType.GIMBAL
     autopilot: int = MavAutopilot.INVALID
     system_id: int | None = None
-    """None: of the vehicle's own system."""
+    """None uses the vehicle's system id."""
     base_mode: int = MavModeFlag(0)
     custom_mode: int = 0
     system_status: int = MavState.ACTIVE
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Send heartbeats from the vehicle's next start on."""
-        heartbeat = Heartbeat(
-            self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3
-        )
+        """Send heartbeats from the next power-on."""
+        heartbeat = Heartbeat(self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, 3)
         system_id = vehicle.system_id if self.system_id is None else self.system_id
         sender = (system_id, self.component_id)
-        vehicle.when_powered_on(lambda: vehicle.every(1.0, lambda: vehicle.send(heartbeat, sender=sender)))
+        vehicle.on_power_on(lambda: vehicle.every(1.0, lambda: vehicle.send(heartbeat, sender=sender)))
 
 
 class SimulatedVehicle:
-    """The sans-IO frame of a vehicle; a subclass says what it hears, what it streams and how it moves.
+    """Sans-I/O base of a vehicle; subclasses define its messages, streams and motion.
 
-    `receive` and `step` take the time, `take_outbox` gives the bytes; `next_due` says when `step` has
-    something to do. They speak for the first channel; `open_channel` gives more, one for each link.
+    `receive` and `step` take the time, `take_outbox` returns bytes, and `next_due` is the time of the next event.
+    They use the first channel; `open_channel` adds one for each further link.
     """
 
     def __init__(
-        self, *, system_id: int, component_id: int, seed: int, components: Iterable[Component]
+        self, *, system_id: int, component_id: int, seed: int, components: Iterable[AttachableComponent]
     ) -> None:
         self.system_id = system_id
         self.component_id = component_id
         self.faults: Faults = Faults()
         self.rng: Random = random.Random(seed)
         self.now: float = 0.0
-        """Simulated seconds of the latest thing that happened."""
+        """Simulated seconds of the latest event."""
         self.booted_at: float = math.nan
-        """When it was switched on or last rebooted."""
-        self.components: tuple[Component, ...] = tuple(components)
-        self.journal: Journal | None = None
-        """What it hears and says is written down here if somebody wants it."""
+        """Time of the power-on or last reboot."""
+        self.components: tuple[AttachableComponent, ...] = tuple(components)
+        self.journal: VehicleJournal | None = None
         self.handlers: dict[int, Handler] = {}
-        """Message id → what is done with such a message."""
-        self._overheard: dict[int, list[Handler]] = {}
+        """Message id → handler."""
+        self._observers: dict[int, list[Handler]] = {}
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0
         self._ticks_from = self._next_tick = math.inf
@@ -102,7 +124,7 @@ class SimulatedVehicle:
             component.join(self)
 
     def open_channel(self, *, version: int = 2) -> Channel:
-        """Another port with its own stream rates; ``version`` is the MAVLink version it speaks."""
+        """Open another port with stream rates of its own; ``version`` is its MAVLink version."""
         channel = Channel(self.system_id, self.component_id, self.handlers, version=version)
         self.channels.append(channel)
         if self._is_on:
@@ -110,7 +132,7 @@ class SimulatedVehicle:
         return channel
 
     def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
-        """Hear bytes from somebody. What they cause is in the outbox afterwards."""
+        """Process bytes of a peer; replies are put into the outbox."""
         self.step(now)
         channel = self._channel if channel is None else channel
         if self.faults.frozen or self.faults.silent or not self._is_on:
@@ -123,7 +145,7 @@ class SimulatedVehicle:
             self.step(now)
 
     def step(self, now: float) -> None:
-        """Let everything happen that is due up to ``now``."""
+        """Run everything that is due up to ``now``."""
         if not self._is_on and math.isnan(self.booted_at):
             self.now = now
             self.power_on()
@@ -133,17 +155,17 @@ class SimulatedVehicle:
         while (due := self.next_due) <= now:
             if due > self.now:
                 self.now = due
-            self._happen(due)
+            self._run_due(due)
         if now > self.now:
             self.now = now
 
     @property
     def next_due(self) -> float:
-        """The time at which ``step`` has something to do; infinity while nothing is planned."""
+        """Time of the next event; infinity if there is none."""
         if not self._is_on and math.isnan(self.booted_at):
             return self.now
         if self.faults.frozen:
-            return self.now + TICK_S  # nothing happens, but time is to be followed
+            return self.now + TICK_S  # Nothing happens, but the time must be followed.
         due = self._next_tick
         if self._timers and self._timers[0][0] < due:
             due = self._timers[0][0]
@@ -153,26 +175,24 @@ class SimulatedVehicle:
         return due
 
     def take_outbox(self) -> bytes:
-        """Everything the first channel wants to send, in order."""
+        """Return and clear the outbox of the first channel."""
         return self._channel.take_outbox()
 
     @property
     def uptime(self) -> float:
-        """Seconds since it was switched on or rebooted, as ``time_boot_ms`` counts them."""
+        """Seconds since the power-on or last reboot, as ``time_boot_ms`` counts."""
         return self.now - self.booted_at
 
     @property
     def time_boot_ms(self) -> int:
-        """For the messages."""
         return int((self.now - self.booted_at) * 1000.0) & 0xFFFFFFFF
 
     @property
     def time_boot_us(self) -> int:
-        """For the messages."""
         return int((self.now - self.booted_at) * 1e6)
 
     def power_on(self) -> None:
-        """Start booting now."""
+        """Boot now."""
         self.booted_at = self.now
         self._is_on = True
         self.boot()
@@ -181,14 +201,14 @@ class SimulatedVehicle:
         for action in self._at_power_on:
             action()
 
-    def when_powered_on(self, action: Callable[[], None]) -> None:
-        """Do something at every start, after a reboot too; at once when it is on already."""
+    def on_power_on(self, action: Callable[[], None]) -> None:
+        """Call a function at each power-on, including reboots; immediately if the vehicle is on."""
         self._at_power_on.append(action)
         if self._is_on:
             action()
 
     def reboot(self, silence_s: float) -> None:
-        """Go silent at once, forget rates and timers, and boot anew after ``silence_s`` seconds."""
+        """Stop sending, clear rates and timers, and boot after ``silence_s`` seconds."""
         self._is_on = False
         self._timers.clear()
         self.set_ticking(False)
@@ -197,53 +217,53 @@ class SimulatedVehicle:
         self.call_at(self.now + silence_s, self.power_on)
 
     def boot(self) -> None:
-        """What this kind of vehicle does when it is switched on."""
+        """Called at power-on."""
         raise NotImplementedError
 
     def start_channel(self, channel: Channel) -> None:
-        """What a port sends without being asked."""
+        """Start the default streams of a port."""
         raise NotImplementedError
 
     def build(self, message_id: int) -> Message | None:
-        """The message to be streamed now; None when the vehicle has nothing to say."""
+        """Return the current message of this id; None if there is none."""
         raise NotImplementedError
 
     def tick(self, dt: float) -> None:
-        """Move on by one tick."""
+        """Advance by one tick."""
         raise NotImplementedError
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Do something at a time; a reboot forgets it."""
+        """Call a function at a simulated time; a reboot cancels it."""
         self._timer_count += 1
         heappush(self._timers, (when, self._timer_count, action))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Do something after ``delay`` seconds; a reboot forgets it."""
+        """Call a function after ``delay`` simulated seconds; a reboot cancels it."""
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
-        """Do something again and again, until a reboot."""
+        """Call a function periodically until a reboot."""
         start = self.now + (interval if first is None else first)
         boot = self.booted_at
         count = 0
 
-        def again() -> None:
+        def repeat() -> None:
             nonlocal count
             count += 1
             if boot == self.booted_at:
-                self.call_at(start + count * interval, again)
+                self.call_at(start + count * interval, repeat)
             action()
 
-        self.call_at(start, again)
+        self.call_at(start, repeat)
 
     def set_ticking(self, ticking: bool) -> None:
-        """Run ``tick`` at 50 Hz from now on, or not."""
+        """Start or stop calling ``tick`` at 50 Hz."""
         if ticking == (self._ticks_from != math.inf):
             return
         self._ticks_from, self._ticks_done = (self.now, 1) if ticking else (math.inf, 0)
         self._next_tick = self._ticks_from + self._ticks_done * TICK_S
 
-    def _happen(self, due: float) -> None:
+    def _run_due(self, due: float) -> None:
         if self._next_tick <= due:
             self._ticks_done += 1
             self._next_tick = self._ticks_from + self._ticks_done * TICK_S
@@ -258,7 +278,7 @@ class SimulatedVehicle:
                         self.send(message, channel)
 
     def _skip_to(self, now: float) -> None:
-        """Frozen: whatever was due is late, as in a program that hung."""
+        """Delay everything that is due, as in a program that hung."""
         late = now - self.now
         if late <= 0:
             return
@@ -270,52 +290,50 @@ class SimulatedVehicle:
             channel.streams.postpone(late)
 
     def on(self, message_class: type[Message], handler: Handler) -> None:
-        """Hear such messages from now on, when they are for this vehicle."""
+        """Handle messages of a class that are addressed to this vehicle."""
         self.handlers[message_class.ID] = handler
 
-    def overhear(self, message_class: type[Message], handler: Handler) -> None:
-        """Hear such messages whoever they are for, besides what the vehicle does with them."""
-        self._overheard.setdefault(message_class.ID, []).append(handler)
-        self.handlers.setdefault(message_class.ID, _do_nothing)
+    def observe(self, message_class: type[Message], handler: Handler) -> None:
+        """Call a handler for messages of a class with any target, in addition to the vehicle's own."""
+        self._observers.setdefault(message_class.ID, []).append(handler)
+        self.handlers.setdefault(message_class.ID, _ignore)
 
-    def is_for_me(self, message: Message) -> bool:
-        """Whether a message is addressed to this component or to everybody."""
+    def is_addressed(self, message: Message) -> bool:
+        """Return True if a message is addressed to this component or broadcast."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and component in (0, self.component_id)
 
-    def send(
-        self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None
-    ) -> None:
-        """Send on one channel, or on all; faults may stop it after it got its sequence number."""
+    def send(self, message: Message, channel: Channel | None = None, sender: tuple[int, int] | None = None) -> None:
+        """Send on one channel, or on all if None; a frame that `Faults` drop leaves a gap in the sequence."""
         for port in self.channels if channel is None else (channel,):
             data = port.encode(message, sender)
-            if not self._is_lost(message):
+            if not self.faults.drops_outgoing(message, self.rng):
                 port.write(data)
 
     def send_built(self, message_id: int, channel: Channel | None = None) -> None:
-        """Send what would be streamed now, if there is such a message."""
+        """Send the current message of this id, if there is one."""
         message = self.build(message_id)
         if message is not None:
             self.send(message, channel)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT on every channel; a text of more than 50 characters goes out in chunks."""
+        """Send a STATUSTEXT on every channel; more than 50 characters are sent in chunks."""
         text = text.encode("ascii", "replace").decode()
         if len(text) <= _TEXT_SIZE:
-            self._note_text(severity, text)
+            self._record_text(severity, text)
             self.send_parts([Statustext(severity, text, 0, 0)])
             return
         self._text_id = self._text_id % 0xFFFF + 1
         self.send_chunks(severity, text, self._text_id)
 
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:
-        """Send STATUSTEXTs of one id; only a chunk that is not full ends the text."""
-        self._note_text(severity, text)
+        """Send STATUSTEXTs with a common id; a chunk that is not full ends the text."""
+        self._record_text(severity, text)
         chunks = [text[start : start + _TEXT_SIZE] for start in range(0, len(text) + 1, _TEXT_SIZE)]
         self.send_parts([Statustext(severity, chunk, text_id, number) for number, chunk in enumerate(chunks)])
 
     def send_parts(self, chunks: list[Statustext]) -> None:
-        """Send a text, in one part or several."""
+        """Send the chunks of a text."""
         for chunk in chunks:
             self.send(chunk)
 
@@ -325,40 +343,26 @@ class SimulatedVehicle:
 
     def _handle(self, message: Message, channel: Channel) -> None:
         handler = self.handlers.get(message.ID)
-        for overhear in self._overheard.get(message.ID, ()):
-            overhear(message, channel)
-        if handler is None or not self.is_for_me(message):
+        for observer in self._observers.get(message.ID, ()):
+            observer(message, channel)
+        if handler is None or not self.is_addressed(message):
             return
-        if self.faults.drop_incoming > 0:
-            self.faults.drop_incoming -= 1
-            return
-        if self.faults.loss_incoming > 0.0 and self.rng.random() < self.faults.loss_incoming:
+        if self.faults.drops_incoming(self.rng):
             return
         if self.journal is not None:
-            self.journal.heard(self.now, message)
+            self.journal.on_message_received(self.now, message)
         handler(message, channel)
 
-    def _note_text(self, severity: int, text: str) -> None:
+    def _record_text(self, severity: int, text: str) -> None:
         if self.journal is not None:
-            self.journal.said(self.now, severity, text)
-
-    def _is_lost(self, message: Message) -> bool:
-        faults = self.faults
-        if faults.silent or (faults.heartbeats_stopped and message.ID == Heartbeat.ID):
-            return True
-        if faults.lost_messages and faults.loses(message):
-            return True
-        if faults.drop_outgoing > 0:
-            faults.drop_outgoing -= 1
-            return True
-        return faults.loss > 0.0 and self.rng.random() < faults.loss
+            self.journal.on_text_sent(self.now, severity, text)
 
 
-def _do_nothing(_message: Message, _channel: Channel) -> None:
+def _ignore(_message: Message, _channel: Channel) -> None:
     pass
 
 
 def sender_of(message: Message) -> tuple[int, int]:
-    """System and component id of who sent a received message; zeros for one that was not received."""
+    """Return system and component id of the sender; zeros if the message was not received."""
     frame = message.received_frame
     return (0, 0) if frame is None else (frame.system_id, frame.component_id)

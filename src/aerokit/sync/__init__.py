@@ -11,13 +11,12 @@ with aerokit.sync.connect("udpin:0.0.0.0:14550") as vehicle:
     vehicle.land()
 ```
 
-One event loop runs on a thread of its own for each connection and ends with it: heartbeats go out and
-messages come in whatever the program does meanwhile. Reading a value (``.value``, ``.latest``, ``.age``,
-``.fresh(within=1)``) takes a snapshot and never crosses a thread. Everything that waits does so on the loop,
-and Ctrl-C ends it there: a take-off or a flight somewhere that is interrupted leaves the vehicle holding its
-place. Exceptions come through as they are. Any thread may call; functions that are handed in (predicates,
-``on_progress``) run on the loop's thread, so they must be quick and cannot call anything that blocks
-(:class:`aerokit.errors.BusyError`).
+Each connection has an event loop on a thread of its own, so that it sends heartbeats and receives messages while the
+program does other things. Reading a value (``.value``, ``.latest``, ``.age``, ``.fresh(within=1)``) takes a snapshot
+without waiting for the loop. Calls that wait run on the loop. Ctrl-C cancels them: an interrupted take-off or ``go_to``
+leaves the vehicle holding position. Exceptions are those of the asynchronous API. All objects can be used from any
+thread. Functions passed as arguments (predicates, ``on_progress``) run on the loop's thread: they must be quick, and
+blocking calls in them raise :class:`aerokit.errors.BusyError`.
 """
 
 from __future__ import annotations

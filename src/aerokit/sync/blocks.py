@@ -1,4 +1,4 @@
-"""What the generated twins are made of: how each is opened, entered, iterated and left."""
+"""Base classes of the generated twins: how each is opened, entered, iterated and closed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
 from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import ConnectionClosed
-from aerokit.sync.loop_thread import Held, LoopThread
-from aerokit.vehicle.connect import tell_how_it_is_left
+from aerokit.sync.loop_thread import LoopThread, OpenContext
+from aerokit.vehicle.connect import warn_if_left_flying
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
-    from types import TracebackType
 
     from typing_extensions import Self
 
@@ -22,41 +21,38 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import Changes, StateCell  # noqa: F401
     from aerokit.connection.connection import Connection
     from aerokit.events import VehicleFound
-    from aerokit.fleets.formations import Following
+    from aerokit.fleets.formation import Following
     from aerokit.vehicle.camera.capture import Capture
-    from aerokit.vehicle.camera.part import CameraBlock
-    from aerokit.vehicle.camera.shooting import PhotoInterval
+    from aerokit.vehicle.camera.link import CameraBlock
+    from aerokit.vehicle.camera.photos import PhotoInterval
     from aerokit.vehicle.commanding.guided import SetpointStream
     from aerokit.vehicle.gimbal.control import GimbalControl
     from aerokit.vehicle.gimbal.gimbal import Gimbals  # noqa: F401
     from aerokit.vehicle.gimbal.rates import GimbalRates
-    from aerokit.vehicle.parameters.transaction import Temporarily, Transaction
+    from aerokit.vehicle.parameters.transaction import TemporaryParameters, Transaction
     from aerokit.vehicle.parameters.writing import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
 
-class BlockingBlock:
-    """A base of what :mod:`aerokit.sync` opens. Nobody else would close it then, so it is closed first."""
+class BlockingContext:
+    """Base of objects that functions of :mod:`aerokit.sync` open.
 
-    _opened_by: str
-    """The function that makes one."""
+    Using one with ``await`` or ``async with`` closes it and raises TypeError.
+    """
+
+    _opened_by: str  # name of the function
 
     def close(self) -> None:
-        """End it; idempotent."""
+        """Close it. Idempotent."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self.close()
 
-    if not TYPE_CHECKING:  # type checkers know that they are not there
+    if not TYPE_CHECKING:  # type checkers report the misuse themselves
 
         def __await__(self) -> NoReturn:
             self._misused("await")
@@ -65,14 +61,14 @@ class BlockingBlock:
             self._misused("async with")
 
         async def __aexit__(self, *_: object) -> None:
-            """Never: it cannot be entered so. Python looks for it first."""
+            """Unused; Python looks it up before ``__aenter__``."""
 
     def _misused(self, word: str) -> NoReturn:
         self.close()
         name = self._opened_by
         raise TypeError(
-            f"aerokit.sync.{name}(…) blocks, and is not for `{word}`: write `with aerokit.sync.{name}(…) as …:`, or"
-            f" `async with aerokit.{name}(…) as …:` in an async function; what was opened is closed again"
+            f"aerokit.sync.{name}(…) does not support `{word}`: write `with aerokit.sync.{name}(…) as …:`, or"
+            f" `async with aerokit.{name}(…) as …:` in an async function; the connection was closed"
         )
 
 
@@ -82,18 +78,18 @@ T = TypeVar("T")
 
 EnteredT = TypeVar("EnteredT")
 
-LeftT = TypeVar(
-    "LeftT",
+BlockT = TypeVar(
+    "BlockT",
     bound="CameraBlock | Following | GimbalControl | GimbalRates | PhotoInterval | SetpointStream[Any]",
 )
 
-BlockT = TypeVar("BlockT", bound="Temporarily | Transaction")
+ShieldedT = TypeVar("ShieldedT", bound="TemporaryParameters | Transaction")
 
 TwinT = TypeVar("TwinT", bound="ConnectionTwin | VehicleTwin")
 
 
 class TwinOf(ReadOnly, Generic[A]):
-    """A twin: the loop that it calls, and the asynchronous object that it stands for."""
+    """Blocking twin of an asynchronous object, whose methods it calls on the loop thread."""
 
     def __init__(self, loop: LoopThread, aio: A) -> None:
         self._loop, self._aio = loop, aio
@@ -106,8 +102,7 @@ class TwinOf(ReadOnly, Generic[A]):
 
     @contextmanager
     def _block(self, block: AbstractContextManager[T]) -> Iterator[T]:
-        """Enter and leave a block of the loop's."""
-        entered = self._loop.enter_at_once(block)
+        entered = self._loop.enter_sync(block)
         try:
             yield entered
         finally:
@@ -118,30 +113,29 @@ class TwinOf(ReadOnly, Generic[A]):
     def _twin_block(
         self, twin: Callable[[LoopThread, T], EnteredT], block: AbstractContextManager[T]
     ) -> Iterator[EnteredT]:
-        """A block that gives something that has a twin."""
         with self._block(block) as entered:
             yield twin(self._loop, entered)
 
 
 class CellTwin(TwinOf["StateCell[T]"], Generic[T]):
-    """Reading takes a snapshot on the caller's thread: it neither talks to the vehicle nor waits for the loop."""
+    """Reading takes a snapshot on the caller's thread; it sends nothing and does not wait for the loop."""
 
     def __repr__(self) -> str:
         return repr(self.aio)
 
     def __bool__(self) -> bool:
-        return bool(self.aio)  # which says what to write instead
+        return bool(self.aio)  # raises TypeError with a hint
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name.startswith("_"):  # as copy asks for them before anything is made
+            if name.startswith("_"):  # copy looks these up before __init__
                 raise AttributeError(name)
-            return getattr(self.aio, name)  # which says what was perhaps meant
+            return getattr(self.aio, name)  # raises AttributeError with a suggestion
 
 
 class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):
-    """An iterator."""
+    """Iterator over changes."""
 
     def __iter__(self) -> Self:
         return self
@@ -151,9 +145,9 @@ class ChangesTwin(TwinOf["Changes[T]"], Generic[T]):
 
 
 def _next_of(loop: LoopThread, items: AsyncIterator[T]) -> T:
-    """The next one; StopIteration at their end: StopAsyncIteration cannot leave a coroutine."""
+    """Return the next item, or raise StopIteration."""
 
-    async def read() -> tuple[T, ...]:
+    async def read() -> tuple[T, ...]:  # a coroutine cannot raise StopAsyncIteration
         try:
             return (await items.__anext__(),)
         except StopAsyncIteration:
@@ -166,19 +160,14 @@ def _next_of(loop: LoopThread, items: AsyncIterator[T]) -> T:
 
 
 class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
-    """Registered on entry of its ``with``, gone at its exit; an iterator."""
+    """Iterator over received items; subscribed while its ``with`` block runs."""
 
     def __enter__(self) -> Self:
-        self._loop.enter_at_once(self.aio)
+        self._loop.enter_sync(self.aio)
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        with contextlib.suppress(ConnectionClosed):  # then it has been closed already
+    def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
+        with contextlib.suppress(ConnectionClosed):  # it is closed already
             self._loop.call(self.aio.close)
 
     def __iter__(self) -> Self:
@@ -188,38 +177,31 @@ class SubscriptionTwin(TwinOf["Subscription[T]"], Generic[T]):
         return _next_of(self._loop, self.aio)
 
 
-class BlockTwin(TwinOf[LeftT]):
-    """What holds while its ``with`` lasts."""
+class BlockTwin(TwinOf[BlockT]):
+    """Active while its ``with`` block runs."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self._loop.run(self.aio.__aexit__, exc_type, exc, traceback)
 
 
 class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):
-    """Set-points are sent while its ``with`` lasts."""
+    """Sends set-points while its ``with`` block runs."""
 
 
 class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
-    """They are found by their ids; an iterable of ``T``, the twin of a gimbal."""
+    """Gimbals by device id; ``T`` is the twin of a gimbal."""
 
     if TYPE_CHECKING:  # generated
 
         @property
         def ids(self) -> tuple[int, ...]:
-            """Of those that were heard of."""
             raise NotImplementedError
 
         def get(self, device_id: int) -> T:
-            """The gimbal of this id."""
             raise NotImplementedError
 
     def __getitem__(self, device_id: int) -> T:
@@ -233,7 +215,7 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
 
 
 class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
-    """Pictures are taken while its ``with`` lasts; an iterator over them."""
+    """Takes pictures while its ``with`` block runs; an iterator over them."""
 
     def __iter__(self) -> Self:
         return self
@@ -242,44 +224,39 @@ class PhotoIntervalTwin(BlockTwin["PhotoInterval"]):
         return _next_of(self._loop, self.aio)
 
 
-class ToItsEndTwin(TwinOf[BlockT]):
-    """Its ``with`` is left to the end, whatever comes: a Ctrl-C does not leave half of it."""
+class ShieldedBlockTwin(TwinOf[ShieldedT]):
+    """Ctrl-C does not interrupt the exit of its ``with`` block."""
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._loop.run_to_its_end(self.aio.__aexit__, exc_type, exc, traceback)
+    def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
+        self._loop.run_shielded(self.aio.__aexit__, exc_type, exc, traceback)
 
 
-class TemporarilyTwin(ToItsEndTwin["Temporarily"]):
-    """Its ``with`` gives the results of the writes; the values before are put back, whatever comes."""
+class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):
+    """Its ``with`` block yields the results of the writes; the exit restores the previous values."""
 
     def __enter__(self) -> dict[str, ParameterWrite]:
         return self._loop.enter(self.aio)
 
 
-class TransactionTwin(ToItsEndTwin["Transaction"]):
-    """Taken back at the end of its ``with`` if an error leaves it, whatever comes."""
+class TransactionTwin(ShieldedBlockTwin["Transaction"]):
+    """Rolled back if its ``with`` block raises."""
 
     def __enter__(self) -> Self:
         self._loop.enter(self.aio)
         return self
 
 
-class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
-    """A context manager; the loop's thread ends with it if it was opened for it."""
+class ConnectionTwin(TwinOf["Connection"], BlockingContext):
+    """Context manager; also ends the loop thread that was started for it."""
 
     _opened_by = "open_connection"
 
-    def __init__(self, loop: LoopThread, aio: Connection, held: Held[Connection] | None = None) -> None:
+    def __init__(self, loop: LoopThread, aio: Connection, held: OpenContext[Connection] | None = None) -> None:
         super().__init__(loop, aio)
         self._held = held
 
     def vehicles(self) -> Iterator[VehicleFound]:
-        """Each autopilot once: those that were heard already, then those that will be, until the connection ends.
+        """Yield each autopilot once: those found so far, then new ones, until the connection ends.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
@@ -293,9 +270,9 @@ class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
                 self._loop.run(found.aclose)
 
     def close(self) -> None:
-        """End it, its link, its loop and its thread; idempotent. Calls that wait raise ConnectionClosed.
+        """Close the connection and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
-        The connection of a vehicle that was connected by an address is closed with the vehicle.
+        A connection that ``connect`` opened for a vehicle closes with the vehicle.
         """
         if self._held is not None:
             try:
@@ -304,18 +281,18 @@ class ConnectionTwin(TwinOf["Connection"], BlockingBlock):
                 self._loop.close()
 
 
-class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
-    """A context manager. The connection that it is on is closed with it if it was opened for it."""
+class VehicleTwin(TwinOf["Vehicle"], BlockingContext):
+    """Context manager; also closes the connection that was opened for it."""
 
     _opened_by = "connect"
 
-    def __init__(self, loop: LoopThread, held: Held[Vehicle], *, owns_loop: bool) -> None:
+    def __init__(self, loop: LoopThread, held: OpenContext[Vehicle], *, owns_loop: bool) -> None:
         super().__init__(loop, held.value)
         self._held, self._owns_loop = held, owns_loop
 
     def _part(self, name: str, twin: Callable[[LoopThread, Any], T]) -> T:
-        """A part, made on the loop's thread when it is first read. No lock: what runs there may read it, too."""
-        key = f"_part_{name}"
+        """Return a part of the vehicle, created on the loop thread on first access."""
+        key = f"_part_{name}"  # no lock, because code on the loop thread reads parts, too
         if key not in vars(self):
 
             def read() -> Any:
@@ -324,15 +301,15 @@ class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
             try:
                 original = read() if self._loop.is_current else self._loop.call(read)
             except ConnectionClosed:
-                original = read()  # nothing runs there any more
+                original = read()  # the loop has ended
             vars(self).setdefault(key, twin(self._loop, original))
         made: T = vars(self)[key]
         return made
 
     def close(self) -> None:
-        """Let the vehicle go: link, loop and thread end, calls that wait raise ConnectionClosed. Idempotent.
+        """Disconnect: close the link and end the loop thread. Idempotent. Waiting calls raise ConnectionClosed.
 
-        Nothing is sent: a vehicle in the air goes on with what it does. A connection that was handed in stays open.
+        Sends nothing: a vehicle in the air continues what it does. A connection passed to ``connect`` stays open.
         """
         try:
             self._held.close()
@@ -340,16 +317,11 @@ class VehicleTwin(TwinOf["Vehicle"], BlockingBlock):
             if self._owns_loop:
                 self._loop.close()
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        was_told = self.aio.is_told_to_hold
+    def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
+        holds = self.aio.is_hold_pending
         self.close()
-        if exc is not None and not was_told:  # the loop's side knows of no exception
-            tell_how_it_is_left(self.aio)
+        if exc is not None and not holds:  # the asynchronous side did not see the exception
+            warn_if_left_flying(self.aio)
 
     def __repr__(self) -> str:
         return repr(self.aio).removesuffix(">") + ", blocking>"
@@ -361,18 +333,18 @@ def opened(
     address: Any,
     **options: Any,
 ) -> TwinT:
-    """Open a block on a loop of its own, or on that of the connection that is given as the address."""
+    """Open a context on a new loop thread, or on that of the connection passed as address."""
     is_connection = isinstance(address, ConnectionTwin)
     loop = address._loop if is_connection else LoopThread()
     try:
-        held: Held[Any] = loop.hold_open(open_async(address.aio if is_connection else address, **options))
+        held: OpenContext[Any] = loop.open_context(open_async(address.aio if is_connection else address, **options))
     except BaseException:
         if not is_connection:
             loop.close()
         raise
     if not is_connection:
         connection: Connection = getattr(held.value, "connection", held.value)
-        connection._prove_life_by(loop.proof)
+        connection._use_activity_monitor(loop.activity)
     if issubclass(twin, VehicleTwin):
         return twin(loop, held, owns_loop=not is_connection)
     return twin(loop, held.value, held)

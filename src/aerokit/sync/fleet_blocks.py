@@ -1,4 +1,4 @@
-"""What the twins of fleets are made of, beside ``blocks.py``."""
+"""Base classes of the generated twins of fleets."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from aerokit.errors import InvalidArgument
-from aerokit.sync.blocks import BlockingBlock, ConnectionTwin, TwinOf, VehicleTwin
-from aerokit.sync.loop_thread import Held, LoopThread
+from aerokit.sync.blocks import BlockingContext, ConnectionTwin, TwinOf, VehicleTwin
+from aerokit.sync.loop_thread import LoopThread, OpenContext
 from aerokit.sync.twins import Vehicle
-from aerokit.vehicle.connect import tell_how_it_is_left
+from aerokit.vehicle.connect import warn_if_left_flying
 
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
-    from types import TracebackType
 
     from aerokit.fleets.fleet import Fleet as AsyncFleet
     from aerokit.fleets.fleet import Selection as AsyncSelection
@@ -25,18 +24,18 @@ SelectionT = TypeVar("SelectionT", bound="AsyncSelection")
 FleetT = TypeVar("FleetT", bound="FleetTwin")
 
 
-class _Lent(Generic[T]):
-    """In the place of what is held: the fleet lets its vehicles go."""
+class _Borrowed(Generic[T]):
+    """Stands in for an OpenContext: the fleet, not its vehicle twins, closes the vehicles."""
 
     def __init__(self, value: T) -> None:
         self.value = value
 
     def close(self) -> None:
-        """Nothing: it goes with the fleet."""
+        pass
 
 
 class SelectionTwin(TwinOf[SelectionT]):
-    """Vehicles by their names are blocking ones; members are as they are: ``member.vehicle`` is for the loop."""
+    """``vehicles`` are blocking twins; ``member.vehicle`` is asynchronous, for code on the loop."""
 
     @cached_property
     def vehicles(self) -> Mapping[str, Vehicle]:
@@ -54,16 +53,16 @@ class SelectionTwin(TwinOf[SelectionT]):
 
 
 def _vehicle(loop: LoopThread, vehicle: Any) -> Vehicle:
-    lent: Any = _Lent(vehicle)
-    return Vehicle(loop, lent, owns_loop=False)
+    borrowed: Any = _Borrowed(vehicle)
+    return Vehicle(loop, borrowed, owns_loop=False)
 
 
-class FleetTwin(TwinOf["AsyncFleet"], BlockingBlock):
-    """What a fleet has beside a selection: a context manager. What was opened for it is closed with it."""
+class FleetTwin(TwinOf["AsyncFleet"], BlockingContext):
+    """Context manager; also closes the connections that were opened for it."""
 
     _opened_by = "fleet"
 
-    def __init__(self, loop: LoopThread, held: Held[AsyncFleet], *, owns_loop: bool) -> None:
+    def __init__(self, loop: LoopThread, held: OpenContext[AsyncFleet], *, owns_loop: bool) -> None:
         super().__init__(loop, held.value)
         self._held, self._owns_loop = held, owns_loop
 
@@ -71,9 +70,9 @@ class FleetTwin(TwinOf["AsyncFleet"], BlockingBlock):
         return name in self.aio.members
 
     def close(self) -> None:
-        """Let all of them go; calls that wait raise ConnectionClosed. Idempotent.
+        """Disconnect all vehicles. Idempotent. Waiting calls raise ConnectionClosed.
 
-        Nothing is sent: who is in the air goes on with what it does. What was handed in stays open.
+        Sends nothing: vehicles in the air continue what they do. Connections passed to ``fleet`` stay open.
         """
         try:
             self._held.close()
@@ -81,17 +80,12 @@ class FleetTwin(TwinOf["AsyncFleet"], BlockingBlock):
             if self._owns_loop:
                 self._loop.close()
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        left = [each for each in self.aio.vehicles.values() if not each.is_told_to_hold]
+    def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
+        left = [each for each in self.aio.vehicles.values() if not each.is_hold_pending]
         self.close()
-        if exc is not None:  # the loop's side knows of no exception
+        if exc is not None:  # the asynchronous side did not see the exception
             for each in left:
-                tell_how_it_is_left(each)
+                warn_if_left_flying(each)
 
 
 def opened_fleet(
@@ -100,24 +94,22 @@ def opened_fleet(
     sources: tuple[Any, ...],
     **options: Any,
 ) -> FleetT:
-    """Open a fleet on a loop of its own, or on that of what is given: connections and vehicles, by name or not."""
-    given = [
-        each for source in sources for each in (source.values() if isinstance(source, Mapping) else (source,))
-    ]
+    """Open a fleet on a new loop thread, or on that of the connections and vehicles passed as sources."""
+    given = [each for source in sources for each in (source.values() if isinstance(source, Mapping) else (source,))]
     loops = {each._loop for each in given if isinstance(each, (ConnectionTwin, VehicleTwin))}
     if len(loops) > 1:
         raise InvalidArgument(
-            "sources: these were opened apart, each on a loop of its own: open one connection for them"
+            "sources: these connections run on different loops; pass addresses, or open all vehicles on one connection"
         )
     loop = next(iter(loops), None) or LoopThread()
     try:
-        held: Held[Any] = loop.hold_open(open_async(*map(_original, sources), **options))
+        held: OpenContext[Any] = loop.open_context(open_async(*map(_original, sources), **options))
     except BaseException:
         if not loops:
             loop.close()
         raise
-    for connection in held.value._crew.networks.values():
-        connection._prove_life_by(loop.proof)
+    for connection in held.value._context.networks.values():
+        connection._use_activity_monitor(loop.activity)
     return twin(loop, held, owns_loop=not loops)
 
 

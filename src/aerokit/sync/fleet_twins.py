@@ -3,8 +3,8 @@
 # pyright: reportIncompatibleMethodOverride=false
 """The classes of :mod:`aerokit.sync`: methods, arguments, errors and documentation of the asynchronous ones.
 
-Methods block, properties never do. Any thread may use them. ``aio`` is the asynchronous object, for code that runs on
-the loop; functions that are handed in (``on_progress``, predicates) run on the loop's thread.
+Methods block, properties never do. Objects can be used from any thread. ``aio`` is the asynchronous object, for code
+that runs on the loop. Functions passed as arguments (``on_progress``, predicates) run on the loop's thread.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ if TYPE_CHECKING:
 
     from aerokit.connection.bus import Overflow
     from aerokit.events import Event
-    from aerokit.fleets.events import FleetEvent, StateTold
+    from aerokit.fleets.events import FleetEvent, StateUpdate
     from aerokit.fleets.fleet import Selection as AsyncSelection
+    from aerokit.fleets.formation import Following as AsyncFollowing
     from aerokit.fleets.formation import Formation
-    from aerokit.fleets.formations import Following as AsyncFollowing
     from aerokit.fleets.members import Member
-    from aerokit.fleets.opening import WhenTooClose
-    from aerokit.fleets.policy import Failure, FleetResult, PolicyName, PolicyOrder
+    from aerokit.fleets.opening import TooCloseAction
+    from aerokit.fleets.policy import FleetResult, MemberFailure, PolicyDecision, PolicyName
     from aerokit.fleets.separation import Deconfliction
-    from aerokit.fleets.shows.show import Show, ShowReport
-    from aerokit.fleets.travel import WayApart
+    from aerokit.fleets.show import Show
+    from aerokit.fleets.show_flight import ShowReport
+    from aerokit.fleets.travel import SeparationMethod
     from aerokit.mavlink.message import Message
     from aerokit.missions.mission import Mission
     from aerokit.position import Position
@@ -48,51 +49,51 @@ __all__ = [
 
 
 class Following(BlockTwin["AsyncFollowing"]):
-    """In its block the followers keep their places; leaving it, in any way, tells them to hold.
+    """Keeps followers at their places while its ``async with`` block runs. Leaving the block makes them hold.
 
-    It stops by itself when the leader is lost or taken over, and as the fleet's policy says when a follower is. The
-    event :class:`FollowingStopped` tells it at once, and so does ``wait_stopped``; the block's program runs on, and
+    Following stops early if the leader is lost or taken over, or if the fleet's policy stops it because a follower
+    failed. Then :class:`FollowingStopped` is published and ``wait_stopped`` returns. The block continues to run;
     ``raise_if_stopped`` and leaving the block raise :class:`SetpointStreamStopped`.
     """
 
     @property
     def is_running(self) -> bool:
-        """Whether the followers follow."""
+        """True while the followers follow."""
         return self.aio.is_running
 
     @property
-    def why(self) -> str:
-        """Why it has stopped by itself, in words; empty while it has not."""
-        return self.aio.why
+    def reason(self) -> str:
+        """Reason for an early stop; empty if there was none."""
+        return self.aio.reason
 
     def error_m(self, name: str) -> float:
-        """Metres between where a follower is and where its place is now; infinite while that is not known."""
+        """Return the distance of a follower from its place in metres; infinite if unknown."""
         return self.aio.error_m(name)
 
     def wait_stopped(self) -> str:
-        """Wait until it stops by itself, and return why; empty once the block was left."""
+        """Wait for an early stop and return its reason; an empty string after the block has ended."""
         return self._loop.run(self.aio.wait_stopped)
 
     def raise_if_stopped(self) -> None:
-        """For loops of the block's program: ``while True: following.raise_if_stopped(); …``.
+        """Raise if following has stopped early. For loops in the block.
 
         Raises:
-            SetpointStreamStopped: it has stopped by itself; the text says why.
+            SetpointStreamStopped: it has stopped; the text has the reason.
         """
         self._loop.call(self.aio.raise_if_stopped)
 
 
 class Selection(SelectionTwin["AsyncSelection"]):
-    """Members that are ordered something in common: ``fleet``, ``fleet.group("alpha")``, ``fleet["north/*"]``.
+    """Some members of a fleet: ``fleet.group("alpha")``, ``fleet["north/*"]``.
 
-    Every action goes to all of them at once that take part at that moment (not lost, not taken over), and returns a
-    :class:`FleetResult` when each has come to its own end. When one fails, the others are told what the fleet's policy
-    says, and the action ends when they have done that. Cancelled, all of them hold at once.
+    Every action goes to all available members at once (not lost, taken over or released), and returns a
+    :class:`FleetResult` when each of them is done. If one fails, the fleet's policy decides what the others do, and the
+    action ends when they have done it. If the action is cancelled, all of them hold.
     """
 
     @property
     def members(self) -> Mapping[str, Member]:
-        """Name → member, in the order in which they were named or heard."""
+        """Name → member, in the order in which they were given or found."""
         return self.aio.members
 
     def go_to(
@@ -103,25 +104,26 @@ class Selection(SelectionTwin["AsyncSelection"]):
         max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
         stagger_s: float | None = None,
-        apart: Deconfliction | None = None,
+        separation: Deconfliction | None = None,
     ) -> FleetResult:
-        """Fly each to a place of its own; as :meth:`aerokit.Vehicle.go_to`.
+        """Fly each member to its own target; see :meth:`aerokit.Vehicle.go_to`.
 
-        In a fleet with a ``min_distance_m`` the ways are compared first, and flown in layers if they cross.
+        A fleet with a ``min_distance_m`` compares the paths first, and separates crossing paths by altitude.
 
         Args:
-            targets: name → place; who is not named stays where it is. Or a function that gives the place of a member.
-            speed_m_s: ground speed; None leaves it.
-            max_distance_m: metres from where each is; a place farther away is refused.
-            timeout: seconds that each of them has for a leg; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
-            apart: what :meth:`plan_apart` has decided about these targets.
+            targets: member's name → target; other members stay where they are. Or a function that returns a member's
+                target.
+            speed_m_s: ground speed; None: unchanged.
+            max_distance_m: reject targets farther than this from the vehicle.
+            timeout: seconds for each member and leg; None: no limit.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
+            separation: result of :meth:`plan_separation` for these targets.
 
         Raises:
-            InvalidArgument: a name is nobody's, or a place is too far away. Nothing was sent.
-            ValueUnknownError: it is not known where one of them is. Nothing was sent.
-            OperationRejected: their ways come too near, and no heights keep them apart: nothing was sent. Or one fell
-                out between two legs in layers: the others stay where they are.
+            InvalidArgument: a name is unknown, or a target is too far away. Nothing was sent.
+            ValueUnknownError: the position of a member is unknown. Nothing was sent.
+            OperationRejected: paths come too close and cannot be separated: nothing was sent. Or a member became
+                unavailable between two legs in layers: the others stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -130,58 +132,59 @@ class Selection(SelectionTwin["AsyncSelection"]):
             max_distance_m=max_distance_m,
             timeout=timeout,
             stagger_s=stagger_s,
-            apart=apart,
+            separation=separation,
         )
 
-    def plan_apart(
+    def plan_separation(
         self,
         targets: Mapping[str, Position] | Callable[[Member], Position],
         *,
         min_distance_m: float | None = None,
-        by: WayApart = "layers",
+        by: SeparationMethod = "layers",
         speed_m_s: float | None = None,
-        highest_m: float | None = None,
+        max_altitude_m: float | None = None,
         slack_s: float = 3.0,
     ) -> Deconfliction:
-        """Compare the straight ways to these places, and decide how they are flown. Nothing is sent.
+        """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Who is not named counts where it is. The event :class:`PathsDecided` tells what was decided.
+        Members without a target count at their current position. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
-            min_distance_m: metres that have to be between any two; None: the fleet's own.
-            by: ``"layers"``: heights of their own; ``"corridors"``: times of their own, for which ``speed_m_s`` is
-                needed; ``"refuse"``: ways that cross are not flown.
-            speed_m_s: of all of them.
-            highest_m: no layer is higher, in metres above the sea; None: no limit.
-            slack_s: for corridors: by how many seconds one may be early or late compared with another.
+            min_distance_m: minimum distance between any two members in metres; None: the fleet's own.
+            by: ``"layers"``: separate crossing paths by altitude; ``"corridors"``: by time, which needs ``speed_m_s``;
+                ``"refuse"``: refuse crossing paths.
+            speed_m_s: ground speed of all members.
+            max_altitude_m: highest layer in metres above sea level; None: no limit.
+            slack_s: for corridors: how early or late a member may be relative to another, in seconds.
 
         Raises:
-            InvalidArgument: a name is nobody's, or an argument is missing.
-            ValueUnknownError: it is not known where one of them is.
+            InvalidArgument: a name is unknown, or an argument is missing.
+            ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.call(
-            self.aio.plan_apart,
+            self.aio.plan_separation,
             targets,
             min_distance_m=min_distance_m,
             by=by,
             speed_m_s=speed_m_s,
-            highest_m=highest_m,
+            max_altitude_m=max_altitude_m,
             slack_s=slack_s,
         )
 
-    def show_starts(self, show: Show, origin: Position) -> dict[str, Position]:
-        """Where each has to be at the start of a show.
+    def show_start_positions(self, show: Show, origin: Position) -> dict[str, Position]:
+        """Return the position of each member at the start of a show.
 
         Args:
             show: the trajectories.
-            origin: where its metres count from; without an altitude above the sea it is at the home of the first.
+            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
+                member's home.
 
         Raises:
-            InvalidArgument: a track is nobody's.
-            ValueUnknownError: it is not known where the first of them is.
+            InvalidArgument: a track has no member.
+            ValueUnknownError: the position of the first member is unknown.
         """
-        return self._loop.call(self.aio.show_starts, show, origin)
+        return self._loop.call(self.aio.show_start_positions, show, origin)
 
     def fly_show(
         self,
@@ -193,27 +196,26 @@ class Selection(SelectionTwin["AsyncSelection"]):
         lead_s: float | None = 0.3,
         speed_m_s: float | None = None,
     ) -> ShowReport:
-        """Fly a show: all to their first points, all off at one instant, each along its track; they hold at its end.
+        """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
 
-        They have to be in the air. The clock of each is measured by TIMESYNC, so that the report says where each was at
-        which time of the show by its own clock, however late its telemetry came. When one fails, the others are told
-        what the fleet's policy says, as in any common action.
+        The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
+        count as deviation. If a member fails, the fleet's policy decides about the others, as in any action.
 
         Args:
-            show: member's name → track; :meth:`Show.renamed` gives tracks to members.
-            origin: where its metres count from; without an altitude above the sea it is at the home of the first.
-            rate_hz: set-points a second for each, 2 to 50.
-            start_in_s: seconds from when all are at their first points to the start.
-            lead_s: how much earlier each is told its velocity than the track has it: vehicles take a moment to obey,
-                and ``lag_s`` in the report says how long. None: not at all.
-            speed_m_s: ground speed on the way to the first points; None leaves it.
+            show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.
+            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
+                member's home.
+            rate_hz: set-points per second for each member, 2 to 50.
+            start_in_s: seconds from the arrival of the last member at its first point to the start.
+            lead_s: seconds by which velocities are sent ahead of the track, to compensate for the vehicles' reaction
+                time (``lag_s`` in the report); None: 0.
+            speed_m_s: ground speed to the first points; None: unchanged.
 
         Raises:
-            InvalidArgument: a track is nobody's, or an argument is out of range. Nothing was sent.
-            OperationRejected: tracks come nearer to each other than this fleet allows, or one of its members does not
-                take part. Nothing was sent.
-            FleetError: one of them did not answer TIMESYNC or did not get to its first point. The show was not begun.
-            ValueUnknownError: it is not known where one of them is.
+            InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
+            OperationRejected: tracks come too close, or a member is unavailable. Nothing was sent.
+            FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
+            ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.run(
             self.aio.fly_show,
@@ -233,18 +235,18 @@ class Selection(SelectionTwin["AsyncSelection"]):
         speed_m_s: float | None = None,
         timeout: float | None = None,
     ) -> FleetResult:
-        """Fly each to its place around the leader, who stays where it is; as :meth:`go_to`.
+        """Fly each follower to its place around the leader, which stays where it is; see :meth:`go_to`.
 
         Args:
-            formation: who flies where.
-            leader: the name of the member around whom it is; it is not in the formation itself.
-            speed_m_s: ground speed; None leaves it.
-            timeout: seconds that each of them has for a leg; None: as long as it takes.
+            formation: the places.
+            leader: name of the leading member; it has no offset in the formation.
+            speed_m_s: ground speed; None: unchanged.
+            timeout: seconds for each member and leg; None: no limit.
 
         Raises:
-            InvalidArgument: a name is nobody's, or two places are too near to each other. Nothing was sent.
-            OperationRejected: the leader does not take part, or the ways come too near. Nothing was sent.
-            ValueUnknownError: it is not known where the leader is, or one whose way is compared.
+            InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
+            OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
+            ValueUnknownError: the position of the leader or of a follower is unknown.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -256,20 +258,20 @@ class Selection(SelectionTwin["AsyncSelection"]):
         rate_hz: float = 5.0,
         max_speed_m_s: float = 10.0,
     ) -> Following:
-        """``async with fleet.following(formation, leader="north/1"):`` keep the places while the leader moves.
+        """Keep a formation while the leader moves: ``async with fleet.following(formation, leader="north/1"):``.
 
-        Each follower is flown by velocity set-points. When the leader is lost or taken over, the followers hold; when a
-        follower fails, the others are told what the fleet's policy says.
+        Each follower is flown by velocity set-points. If the leader is lost or taken over, the followers hold. If a
+        follower fails, the fleet's policy decides about the others.
 
         Args:
-            formation: who flies where.
-            leader: the name of the member whom they follow; somebody else flies it, such as the block's program.
-            rate_hz: set-points a second, 2 to 50.
-            max_speed_m_s: nobody is told to fly faster, in m/s.
+            formation: the places.
+            leader: name of the leading member; your program flies it, for example in the block.
+            rate_hz: set-points per second, 2 to 50.
+            max_speed_m_s: maximum speed of the followers in m/s.
 
         Raises:
-            InvalidArgument: a name is nobody's, or an argument is out of range.
-            OperationRejected: the leader does not take part.
+            InvalidArgument: a name is unknown, or an argument is out of range.
+            OperationRejected: the leader is unavailable.
         """
         return Following(
             self._loop,
@@ -286,52 +288,52 @@ class Selection(SelectionTwin["AsyncSelection"]):
         self,
         missions: Mapping[str, Mission],
         *,
-        at_once: int = 8,
+        max_concurrent: int = 8,
         max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
     ) -> FleetResult:
-        """Give each its mission, and read it back; as ``vehicle.mission.upload``.
+        """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        Only when all of them have theirs, :meth:`start_missions` starts them. In a fleet with a ``min_distance_m`` the
-        missions are compared first.
+        :meth:`start_missions` starts them only after all uploads succeeded. A fleet with a ``min_distance_m`` compares
+        the missions first.
 
         Args:
-            missions: name → mission.
-            at_once: so many transfers share a link at the same time, from 1.
-            max_distance_m: metres from where each is; a mission with a place farther away is refused.
-            timeout: seconds that each of them has; None: as long as something comes.
+            missions: member's name → mission.
+            max_concurrent: maximum number of simultaneous transfers on each network, from 1.
+            max_distance_m: reject missions with a position farther than this from the vehicle.
+            timeout: seconds for each member; None: no limit while data arrives.
 
         Raises:
-            InvalidArgument: a name is nobody's, or a mission cannot be right. Nothing was sent.
-            OperationRejected: one of them does not take part now, or the ways come too near. Nothing was sent.
-            FleetError: one of them did not take its mission: none of them will be started.
+            InvalidArgument: a name is unknown, or a mission is invalid. Nothing was sent.
+            OperationRejected: a member is unavailable, or paths come too close. Nothing was sent.
+            FleetError: an upload failed; ``start_missions`` will start none of them.
         """
         return self._loop.run(
             self.aio.upload,
             missions,
-            at_once=at_once,
+            max_concurrent=max_concurrent,
             max_distance_m=max_distance_m,
             timeout=timeout,
         )
 
     def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
-        """Start the missions that were uploaded together, all at once or nobody; as ``vehicle.mission.start``.
+        """Start the uploaded missions of all members, or of none; see ``vehicle.mission.start``.
 
         Args:
-            timeout: seconds until each tells its mission mode.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
+            timeout: seconds until each member reports its mission mode.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: there was no upload that all of them took, or one of them does not take part any more or
-                is not armed. Nothing was sent.
+            OperationRejected: no upload succeeded for all members, or a member is unavailable or not armed. Nothing was
+                sent.
         """
         return self._loop.run(self.aio.start_missions, timeout=timeout, stagger_s=stagger_s)
 
     def wait_missions_finished(self, *, timeout: float | None = None) -> FleetResult:
-        """Wait until each has flown its mission to its end; as ``vehicle.mission.wait_finished``.
+        """Wait until each member has finished its mission; see ``vehicle.mission.wait_finished``.
 
         Args:
-            timeout: seconds until all of them have; None: as long as it takes.
+            timeout: seconds until all of them have; None: no limit.
         """
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
@@ -341,18 +343,17 @@ class Selection(SelectionTwin["AsyncSelection"]):
         *,
         min_distance_m: float | None = None,
     ) -> Deconfliction:
-        """Compare the ways of missions, from place to place, whenever they are flown. Nothing is sent.
+        """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Items without a place and terrain heights are not known to this; a mission with jumps is compared as it stands.
-        The event :class:`PathsDecided` tells what came of it.
+        Ignores items without a position, terrain altitudes and jumps.
 
         Args:
-            missions: name → mission.
-            min_distance_m: metres that have to be between any two; None: the fleet's own.
+            missions: member's name → mission.
+            min_distance_m: minimum distance between any two paths in metres; None: the fleet's own.
 
         Raises:
-            InvalidArgument: a name is nobody's, or an argument is missing.
-            ValueUnknownError: it is not known where one of them is.
+            InvalidArgument: a name is unknown, or an argument is missing.
+            ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.call(self.aio.compare_missions, missions, min_distance_m=min_distance_m)
 
@@ -364,15 +365,15 @@ class Selection(SelectionTwin["AsyncSelection"]):
         stagger_s: float | None = None,
         **options: object,
     ) -> FleetResult:
-        """Do something with each of them at once.
+        """Execute any action with all members at once.
 
         Args:
-            action: a method of :class:`aerokit.Vehicle` by its name (``"set_speed"``, ``"mission.resume"``), or a
+            action: the name of a method of :class:`aerokit.Vehicle` (``"set_speed"``, ``"mission.resume"``), or a
                 coroutine function that is called with each :class:`Member`.
-            *arguments: of the method.
-            timeout: seconds that each of them has; None: what the action itself allows.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
-            **options: of the method.
+            *arguments: positional arguments of the method.
+            timeout: seconds for each member; None: the action's own limit.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
+            **options: keyword arguments of the method.
 
         Raises:
             InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
@@ -387,27 +388,27 @@ class Selection(SelectionTwin["AsyncSelection"]):
         )
 
     def wait_ready(self, *, timeout: float = 90.0) -> FleetResult:
-        """Wait until each could fly; as :meth:`aerokit.Vehicle.wait_ready`.
+        """Wait until each member is ready to fly; see :meth:`aerokit.Vehicle.wait_ready`.
 
         Args:
-            timeout: seconds that each of them has.
+            timeout: seconds for each member.
         """
         return self._loop.run(self.aio.wait_ready, timeout=timeout)
 
     def arm(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:
-        """Arm them: **propellers may start to turn**; as :meth:`aerokit.Vehicle.arm`.
+        """Arm: **propellers may start to turn**; see :meth:`aerokit.Vehicle.arm`.
 
         Args:
-            timeout: seconds that each of them has.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
+            timeout: seconds for each member.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
         """
         return self._loop.run(self.aio.arm, timeout=timeout, stagger_s=stagger_s)
 
     def disarm(self, *, timeout: float = 10.0) -> FleetResult:
-        """Disarm them; as :meth:`aerokit.Vehicle.disarm`: refused in the air.
+        """Disarm; refused in the air; see :meth:`aerokit.Vehicle.disarm`.
 
         Args:
-            timeout: seconds that each of them has.
+            timeout: seconds for each member.
         """
         return self._loop.run(self.aio.disarm, timeout=timeout)
 
@@ -418,12 +419,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
         timeout: float = 60.0,
         stagger_s: float | None = None,
     ) -> FleetResult:
-        """Take off and climb to ``altitude_m`` above home; as :meth:`aerokit.Vehicle.take_off`.
+        """Take off and climb to ``altitude_m`` above home; see :meth:`aerokit.Vehicle.take_off`.
 
         Args:
-            altitude_m: metres above the home of each, above 0, at most 10,000.
-            timeout: seconds that each of them has.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
+            altitude_m: metres above the home of each member, above 0, at most 10,000.
+            timeout: seconds for each member.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
@@ -431,11 +432,11 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, stagger_s=stagger_s)
 
     def land(self, *, timeout: float | None = 300.0, stagger_s: float | None = None) -> FleetResult:
-        """Land where they are; as :meth:`aerokit.Vehicle.land`. Nobody is stopped because another one has failed.
+        """Land at the current position; see :meth:`aerokit.Vehicle.land`. A failure does not stop the other members.
 
         Args:
-            timeout: seconds that each of them has; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
+            timeout: seconds for each member; None: no limit.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
         """
         return self._loop.run(self.aio.land, timeout=timeout, stagger_s=stagger_s)
 
@@ -445,27 +446,27 @@ class Selection(SelectionTwin["AsyncSelection"]):
         timeout: float | None = 600.0,
         stagger_s: float | None = None,
     ) -> FleetResult:
-        """Return to where each has started; as :meth:`aerokit.Vehicle.return_to_launch`, and as :meth:`land` here.
+        """Return to launch; see :meth:`aerokit.Vehicle.return_to_launch`. A failure does not stop the other members.
 
         Args:
-            timeout: seconds that each of them has; None: as long as it takes.
-            stagger_s: each begins so many seconds after the one before; None: all at once.
+            timeout: seconds for each member; None: no limit.
+            stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
         """
         return self._loop.run(self.aio.return_to_launch, timeout=timeout, stagger_s=stagger_s)
 
     def hold(self) -> FleetResult:
-        """Stop and stay; as :meth:`aerokit.Vehicle.hold`. Nobody is stopped because another one has failed."""
+        """Stop and hold position; see :meth:`aerokit.Vehicle.hold`. A failure does not stop the other members."""
         return self._loop.run(self.aio.hold)
 
     def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> FleetResult:
-        """Change the flight mode; as :meth:`aerokit.Vehicle.set_mode`.
+        """Change the flight mode; see :meth:`aerokit.Vehicle.set_mode`.
 
         Args:
-            mode: a name as the autopilot's own documentation spells it, or its number.
-            timeout: seconds that each of them has.
+            mode: name as in the autopilot's documentation, or its number.
+            timeout: seconds for each member.
 
         Raises:
-            InvalidArgument: one of them has no such mode. Nothing was sent.
+            InvalidArgument: a member has no such mode. Nothing was sent.
         """
         return self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -476,42 +477,47 @@ class Selection(SelectionTwin["AsyncSelection"]):
         timeout: float = 60.0,
         description: str = "barrier",
     ) -> FleetResult:
-        """Wait until something is true of each of them; who gets there first waits for the others.
+        """Wait until a condition is true for every member.
 
         Args:
-            condition: called with a member, four times a second and whenever it tells something.
-            timeout: seconds until it is true of all of them.
-            description: what is waited for, in error texts.
+            condition: called with a member, four times a second and when its state changes.
+            timeout: seconds until it is true for all members.
+            description: name of the barrier in errors.
 
         Raises:
-            FleetError: it did not become true of one, who then counts as failed in a common action.
+            FleetError: it did not become true for a member; this member has then failed, as in any action.
         """
         return self._loop.run(self.aio.barrier, condition, timeout=timeout, description=description)
 
-    def all_at_altitude(
+    def wait_at_altitude(
         self,
         altitude_m: float,
         *,
         tolerance_m: float = 1.0,
         timeout: float = 60.0,
     ) -> FleetResult:
-        """Wait until all of them are at an altitude above their homes, before anybody goes on.
+        """Wait until all members are at an altitude above their homes.
 
         Args:
-            altitude_m: metres above the home of each.
-            tolerance_m: how near is there.
-            timeout: seconds until they are.
+            altitude_m: metres above the home of each member.
+            tolerance_m: allowed difference in metres.
+            timeout: seconds until all of them are there.
 
         Raises:
-            FleetError: one of them did not get there.
+            FleetError: a member did not get there.
         """
-        return self._loop.run(self.aio.all_at_altitude, altitude_m, tolerance_m=tolerance_m, timeout=timeout)
+        return self._loop.run(
+            self.aio.wait_at_altitude,
+            altitude_m,
+            tolerance_m=tolerance_m,
+            timeout=timeout,
+        )
 
     def __getitem__(self, pattern: str) -> Selection:
         return Selection(self._loop, self.aio.__getitem__(pattern))
 
     def group(self, name: str) -> Selection:
-        """Those of one group.
+        """Select the members of one group.
 
         Raises:
             InvalidArgument: there is no such group.
@@ -519,47 +525,54 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return Selection(self._loop, self._loop.call(self.aio.group, name))
 
     def role(self, name: str) -> Selection:
-        """Those with one role.
+        """Select the members with one role.
 
         Raises:
-            InvalidArgument: nobody has it.
+            InvalidArgument: no member has this role.
         """
         return Selection(self._loop, self._loop.call(self.aio.role, name))
 
 
 class Fleet(FleetTwin, Selection):
-    """Made by :func:`aerokit.fleet`, for the time of its block. A selection of all, and what only the whole has."""
+    """All members, as yielded by :func:`aerokit.fleet`. Usable inside its block only."""
 
-    def take_back(self, name: str) -> None:
-        """Order a member again that a pilot, a failsafe or another program had taken over, or that was let go.
+    def reclaim(self, name: str) -> None:
+        """Make members available again that were taken over or released.
 
-        Nothing is sent: the next action goes to it, too. **Ask the pilot first.**
+        Sends nothing; the next action includes them. **Ask the pilot first.**
 
-        Raises:
-            InvalidArgument: there is no such member.
-        """
-        self._loop.call(self.aio.take_back, name)
-
-    def let_go(self, name: str, why: str = "the program let it go") -> None:
-        """Order a member nothing any more, until :meth:`take_back`. Nothing is sent: it goes on with what it does.
+        Args:
+            name: a member's name or a pattern.
 
         Raises:
-            InvalidArgument: there is no such member.
+            InvalidArgument: no member matches.
         """
-        self._loop.call(self.aio.let_go, name, why)
+        self._loop.call(self.aio.reclaim, name)
+
+    def release(self, name: str, reason: str = "released by the program") -> None:
+        """Exclude members from actions until :meth:`reclaim`. Sends nothing: they continue what they do.
+
+        Args:
+            name: a member's name or a pattern.
+            reason: appears in ``Member.reason`` and in results.
+
+        Raises:
+            InvalidArgument: no member matches.
+        """
+        self._loop.call(self.aio.release, name, reason)
 
     def send_corrections(self, rtcm: bytes) -> int:
-        """Send RTCM corrections (RTK, DGPS) to all of them: once for each link, whoever is on it (GPS_RTCM_DATA).
+        """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
 
         Args:
             rtcm: one or more RTCM 3 messages, each of 720 bytes at most.
 
         Returns:
-            How many messages were sent on each link.
+            The number of MAVLink messages sent on each link.
 
         Raises:
-            InvalidArgument: one is longer, or there is none. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended; the others before it have got them.
+            InvalidArgument: a message is longer, or ``rtcm`` is empty. Nothing was sent.
+            ConnectionClosed, LinkLost: a link has ended; the links before it got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
 
@@ -569,16 +582,16 @@ class Fleet(FleetTwin, Selection):
         capacity: int = 1000,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[FleetEvent]:
-        """One stream of what happens to all of them, for use in a ``with`` block.
+        """Subscribe to events of the fleet and its vehicles; use it in a ``with`` block.
 
         Args:
-            *types: events of the fleet (``MemberLost``, ``PolicyCarriedOut`` …), and of vehicles (``ModeChanged`` …),
-                which come as :class:`Told` with the member's name. None: all of both.
-            capacity: how many may wait to be read.
-            overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
+            *types: events of the fleet (``MemberLost``, ``PolicyCompleted`` …) and of vehicles (``ModeChanged`` …). The
+                latter arrive as :class:`MemberEvent` with the member's name. None: all of both.
+            capacity: maximum number of unread events.
+            overflow: what happens to an event that exceeds the capacity; ``missed`` of the stream counts them.
 
         Raises:
-            InvalidArgument: a type is no event.
+            InvalidArgument: a type is not an event.
         """
         return Subscription(
             self._loop,
@@ -591,17 +604,17 @@ class Fleet(FleetTwin, Selection):
         every_arrival: bool = False,
         capacity: int = 10000,
         overflow: Overflow = "drop_oldest",
-    ) -> Subscription[StateTold]:
-        """One stream of states of all of them, for use in a ``with`` block.
+    ) -> Subscription[StateUpdate]:
+        """Subscribe to states of all members; use it in a ``with`` block.
 
         Args:
-            *names: of docs/states.md: ``"position"``, ``"batteries"`` …
-            every_arrival: also what is told again without having changed.
-            capacity: how many may wait to be read.
-            overflow: what happens to one that finds no place; ``missed`` of the stream counts them.
+            *names: names of docs/states.md: ``"position"``, ``"batteries"`` …
+            every_arrival: also report values that arrive unchanged.
+            capacity: maximum number of unread updates.
+            overflow: what happens to an update that exceeds the capacity; ``missed`` of the stream counts them.
 
         Raises:
-            InvalidArgument: there is no such state, or none is named.
+            InvalidArgument: a name is unknown, or none is given.
         """
         return Subscription(
             self._loop,
@@ -622,42 +635,40 @@ def fleet(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None = None,
     groups: Mapping[str, Iterable[str]] | None = None,
     roles: Mapping[str, Iterable[str]] | None = None,
-    on_error: PolicyName | Callable[[Failure], PolicyName | Mapping[str, PolicyOrder] | None] = "hold_others",
-    on_error_of: Mapping[str, PolicyName | Callable[[Failure], PolicyName | Mapping[str, PolicyOrder] | None]]
-    | None = None,
+    on_error: PolicyName | Callable[[MemberFailure], PolicyDecision] = "hold_others",
+    on_error_by_group: Mapping[str, PolicyName | Callable[[MemberFailure], PolicyDecision]] | None = None,
     min_distance_m: float | None = None,
-    too_close: WhenTooClose = "hold",
+    on_too_close: TooCloseAction = "hold",
     timeout: float = 30.0,
     rates: Mapping[type[Message], float] | None = None,
 ) -> Fleet:
-    """Make many vehicles one fleet ; use it in a ``with`` block, or close it.
+    """Combine vehicles into a fleet for the duration of the ``with`` block.
 
-    Each connection is a network with a name, and a member is called by both: ``"north/7"`` is system 7 of the network
-    "north". So system ids, which end at 255, may be the same on several networks.
+    Each connection is a network with a name. A member is named after its network and its system id: ``"north/7"`` is
+    system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links, connections that are open already, on which all vehicles that are heard become
-            members; and vehicles. Networks without a name are called ``"1"``, ``"2"`` …; a mapping gives names: of
-            networks, and of vehicles.
-        count: how many vehicles are waited for, in all; None: at least one on each network, and who is heard in the
-            2.5 seconds after.
-        system_ids: those on the networks that belong to it, for all networks or by the network's name; None: all.
-        groups: group → names or patterns of its members (``"north/*"``). Who is in none has the group ``""``.
-        roles: role → names or patterns, likewise.
-        on_error: what the others do when one fails in a common action (docs/fleets.md).
-        on_error_of: group → the same when one of this group fails.
-        min_distance_m: metres between any two: ways are compared before they are flown, and in flight the event
-            ``TooClose`` tells who is nearer to whom; None: nobody looks.
-        too_close: what is done then: both ``"hold"``, as far as they take orders, or it is only told (``"tell"``).
-        timeout: seconds to wait for all of them; after five of them a warning of logger "aerokit" says who is missing.
-        rates: message class → Hz, asked of each instead of the default rates; ``{}`` asks for nothing.
+        *sources: addresses, links or open connections, on which all vehicles that are found become members; or
+            vehicles. A mapping names the networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        count: number of vehicles to wait for, in total; None: at least one on each network, plus those found in the
+            next 2.5 seconds.
+        system_ids: use these system ids only, on all networks or by network name; None: all that are found.
+        groups: group → names or patterns of its members (``"north/*"``). Other members have the group ``""``.
+        roles: role → names or patterns of its members.
+        on_error: policy for the other members when one fails in an action (docs/fleets.md).
+        on_error_by_group: group → policy when a member of this group fails.
+        min_distance_m: minimum distance between any two members in metres. Paths are compared before flight, and the
+            event ``TooClose`` reports violations in flight; None: no checks.
+        on_too_close: ``"hold"``: both members hold, if this program flies them; ``"report"``: event only.
+        timeout: seconds to wait for all members. After five seconds logger "aerokit" warns which are missing.
+        rates: message class → Hz, requested from each member instead of the default rates; ``{}`` requests nothing.
 
     Raises:
         InvalidArgument: an argument is wrong, or two vehicles have the same name.
-        BusyError: this program has a vehicle object of one of ``system_ids`` on that connection already.
+        BusyError: this program already has a vehicle object for one of ``system_ids`` on that connection.
         LinkOpenError: a link could not be opened.
-        LinkLost, ConnectionClosed: a link went down while waiting.
-        ConnectFailed: not all of them were heard in time; the text says which were.
+        LinkLost, ConnectionClosed: a link closed while waiting.
+        ConnectFailed: some members were not found in time; the text lists those that were.
     """
     return opened_fleet(
         Fleet,
@@ -668,9 +679,9 @@ def fleet(
         groups=groups,
         roles=roles,
         on_error=on_error,
-        on_error_of=on_error_of,
+        on_error_by_group=on_error_by_group,
         min_distance_m=min_distance_m,
-        too_close=too_close,
+        on_too_close=on_too_close,
         timeout=timeout,
         rates=rates,
     )

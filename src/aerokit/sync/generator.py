@@ -1,13 +1,13 @@
-"""Writes ``sync/twins.py``: each class of the asynchronous API once more, for programs without ``async``.
+"""Generates ``sync/twins.py``: blocking twins of the classes of the asynchronous API.
 
-Those of fleets are in ``sync/fleet_twins.py``: who has one vehicle does not import them.
+Fleets are in ``sync/fleet_twins.py``, which programs with a single vehicle do not import.
 
-    python -m aerokit.sync.generator            # write it
-    python -m aerokit.sync.generator --check    # compare: 0 the same, 1 different
+    python -m aerokit.sync.generator            # write both files
+    python -m aerokit.sync.generator --check    # compare; exit code 1 if they differ
 
-Two rules make a member: a coroutine runs on the loop, and anything else is called there. What is returned and has a
-twin is wrapped in it; what only reads is read where the program is. `originals.py` has the classes. Arguments,
-defaults and docstrings are those of the originals; names in annotations are imported from where the original has them.
+The twin of a coroutine method runs it on the loop; the twin of another method calls it there. A return value whose
+class has a twin is wrapped in it. ``originals.py`` lists the classes. Arguments, defaults and docstrings are copied;
+annotations are imported from the modules that the original class imports them from.
 """
 
 from __future__ import annotations
@@ -22,24 +22,31 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.sync.originals import TWINS, Member, Twin, decorators_of, function_node, imports_of, members_of
+from aerokit.sync.originals import (
+    TWINS,
+    ClassMember,
+    Twin,
+    decorators_of,
+    function_node,
+    imports_of,
+    members_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-WIDTH = 110
-"""Of a line; what is written is as `ruff format` would have it."""
+WIDTH = 110  # the line length of `ruff format`, whose style the output follows
 
 
 def outer(annotation: ast.expr | None) -> str:
-    """The name in an annotation, without what is in brackets behind it."""
+    """Return the name in an annotation, without its subscript."""
     while isinstance(annotation, ast.Subscript):
         annotation = annotation.value
     return annotation.id if isinstance(annotation, ast.Name) else ""
 
 
 def optional(annotation: ast.expr | None) -> ast.expr | None:
-    """What is in front of ``| None``, if that is how the annotation ends."""
+    """Return the part of an annotation before ``| None``, or None."""
     if isinstance(annotation, ast.BinOp) and isinstance(annotation.op, ast.BitOr):
         last = annotation.right
         return annotation.left if isinstance(last, ast.Constant) and last.value is None else None
@@ -47,7 +54,7 @@ def optional(annotation: ast.expr | None) -> ast.expr | None:
 
 
 def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
-    """The arguments as they are handed on, without ``self``."""
+    """Return the arguments of a forwarding call, without ``self``."""
     positional = [each.arg for each in (*node.args.posonlyargs, *node.args.args)]
     positional = [each for each in positional if each != "self"]
     star = [f"*{node.args.vararg.arg}"] if node.args.vararg else []
@@ -56,13 +63,12 @@ def forwarded(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
 
 
 def source(node: ast.expr) -> str:
-    """An expression as it is written, with double quotes."""
     text = ast.unparse(node)
     return text if '"' in text else text.replace("'", '"')
 
 
 def call(function: str, arguments: Sequence[str], indent: str = "        ") -> str:
-    """A call, one argument a line where it would be too long."""
+    """Return a call; one argument per line if it would be too long."""
     line = f"{function}({', '.join(arguments)})"
     if len(indent) + len(line) < WIDTH:  # a comma may follow
         return line
@@ -72,7 +78,6 @@ def call(function: str, arguments: Sequence[str], indent: str = "        ") -> s
 def function(
     node: ast.FunctionDef | ast.AsyncFunctionDef, returns: ast.expr | None, text: str | None, body: str
 ) -> str:
-    """A method whose body is one statement."""
     gives = "" if returns is None else f" -> {source(returns)}"
     line = f"    def {node.name}({', '.join(arguments_of(node.args))}){gives}:\n"
     if len(line) > WIDTH + 1:
@@ -82,7 +87,6 @@ def function(
 
 
 def arguments_of(arguments: ast.arguments) -> list[str]:
-    """Each as it is written, with its default."""
     positional = [*arguments.posonlyargs, *arguments.args]
     lacking: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
     found = [_argument(*each) for each in zip(positional, [*lacking, *arguments.defaults])]  # noqa: B905
@@ -95,7 +99,7 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
-    """One argument a line; what is too long for one continues before its ``| None``."""
+    """Return one argument per line; a longer one is wrapped before its ``| None``."""
     lines = ""
     for each in arguments:
         if len(indent) + len(each) + 1 > WIDTH:
@@ -112,7 +116,6 @@ def _argument(each: ast.arg, default: ast.expr | None) -> str:
 
 
 def docstring(text: str | None, indent: str = "        ") -> str:
-    """As it stands in the source; nothing for none."""
     if not text:
         return ""
     lines = text.splitlines()
@@ -123,30 +126,28 @@ def docstring(text: str | None, indent: str = "        ") -> str:
 
 
 FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fleet_twins")}
-"""What is written: page → file."""
 
 FILE = FILES["twins"]
-"""The first of them."""
 
-OF_ONE = ("TwinOf", "BlockTwin", "SelectionTwin")
-"""Bases that are told whose twin it is."""
+# Bases that take the asynchronous class as type argument.
+GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 
+# Functions that open a context, by page.
 FUNCTIONS: dict[str, tuple[str, ...]] = {
     "twins": ("aerokit.connection.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
 }
-"""Blocks that are opened by a function, by pages."""
 
-BLOCKS = {"SelectionTwin": "fleet_blocks", "FleetTwin": "fleet_blocks"}
-"""Where bases are that are not in ``blocks.py``."""
+# Bases that are not in blocks.py.
+BASE_MODULES = {"SelectionTwin": "fleet_blocks", "FleetTwin": "fleet_blocks"}
 
 HEAD = '''# Generated by aerokit.sync.generator from the asynchronous classes: do not edit.
 # ruff: noqa: B008, F401, RUF100 - defaults are those of the originals; bases are named in texts
 # pyright: reportIncompatibleMethodOverride=false
 """The classes of :mod:`aerokit.sync`: methods, arguments, errors and documentation of the asynchronous ones.
 
-Methods block, properties never do. Any thread may use them. ``aio`` is the asynchronous object, for code that runs on
-the loop; functions that are handed in (``on_progress``, predicates) run on the loop's thread.
+Methods block, properties never do. Objects can be used from any thread. ``aio`` is the asynchronous object, for code
+that runs on the loop. Functions passed as arguments (``on_progress``, predicates) run on the loop's thread.
 """
 
 from __future__ import annotations
@@ -157,10 +158,9 @@ from typing import TYPE_CHECKING, TypeVar
 '''
 
 
-# --------------------------------------------------------------------------------------- writing
 @dataclass
 class Page:
-    """What is written, and what it has to import."""
+    """A generated file, and its imports."""
 
     name: str = "twins"
     at_run_time: set[tuple[str, str]] = field(default_factory=set)
@@ -172,7 +172,7 @@ class Page:
         self._elsewhere = {each.name: each.page for each in TWINS if each.page != self.name}
 
     def need(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
-        """Have the names in an expression of these modules imported."""
+        """Import the names in an expression that comes from these modules."""
         for each in ast.walk(node) if node is not None else ():
             text = each.value if isinstance(each, ast.Constant) and isinstance(each.value, str) else None
             if isinstance(each, ast.Name):
@@ -187,18 +187,17 @@ class Page:
         if name in self._twins or name in TYPE_VARIABLES or hasattr(builtins, name):
             return
         where = next((found[name] for found in map(imports_of, modules) if name in found), (modules[0], name))
-        where = self._homes.setdefault(where[1] or name, where)  # a name may be exported by two modules
+        where = self._homes.setdefault(where[1] or name, where)  # several modules may export a name
         (self.at_run_time if at_run_time else self.for_types).add(where)
 
     def returned(self, expression: str, returns: ast.expr | None) -> str:
-        """The expression, wrapped where what it gives has a twin."""
+        """Return the expression, wrapped in a twin if its type has one."""
         name, maybe = outer(returns), outer(optional(returns))
         if maybe in self._twins:
             return f"None if {expression} is None else {maybe}(self._loop, {expression})"
         return f"{name}(self._loop, {expression})" if name in self._twins else expression
 
-    def member(self, twin: Twin, member: Member) -> str:
-        """The lines of one member."""
+    def member(self, twin: Twin, member: ClassMember) -> str:
         self.need(member.returns, member.module)
         node, name = member.node, member.name
         if node is None or not {"property", "cached_property"}.isdisjoint(decorators_of(node)):
@@ -215,11 +214,7 @@ class Page:
             kind = ast.Subscript(ast.Name("AbstractContextManager"), inner)
             block = f"self.aio.{name}({', '.join(arguments)})"
             is_twin = outer(inner) in self._twins
-            body = (
-                f"return self._twin_block({outer(inner)}, {block})"
-                if is_twin
-                else f"return self._block({block})"
-            )
+            body = f"return self._twin_block({outer(inner)}, {block})" if is_twin else f"return self._block({block})"
             return function(node, kind, member.text, body)
         called = f"self.aio.{name}"
         if name not in twin.direct:
@@ -233,7 +228,7 @@ class Page:
             body = call(called if is_none else f"return {called}", arguments)
         return function(node, node.returns, member.text, body)
 
-    def _value(self, twin: Twin, member: Member) -> str:
+    def _value(self, twin: Twin, member: ClassMember) -> str:
         name, read = member.name, f"self.aio.{member.name}"
         if name in twin.called:
             read = f"self._loop.call(lambda: {read})"
@@ -255,22 +250,16 @@ TYPE_VARIABLES = {
 }
 
 
-# --------------------------------------------------------------------------------------- the page
 def generate(name: str = "twins") -> str:
-    """The text of ``sync/twins.py``, or of another page."""
     page, twins = Page(name), [each for each in TWINS if each.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
     names = sorted((*(twin.name for twin in twins), *(path.rpartition(".")[2] for path in FUNCTIONS[name])))
-    page.at_run_time |= {(f"aerokit.sync.{BLOCKS.get(twin.base, 'blocks')}", twin.base) for twin in twins}
-    opener = (
-        ("aerokit.sync.blocks", "opened")
-        if name == "twins"
-        else ("aerokit.sync.fleet_blocks", "opened_fleet")
-    )
+    page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
+    opener = ("aerokit.sync.blocks", "opened") if name == "twins" else ("aerokit.sync.fleet_blocks", "opened_fleet")
     page.at_run_time |= {opener, ("aerokit._internal.arguments", "checked")}
     page.for_types |= {
-        (each.module, f"{each.name} as Async{each.name}") for each in twins if each.base in OF_ONE
+        (each.module, f"{each.name} as Async{each.name}") for each in twins if each.base in GENERIC_BASES
     }
     variables = TYPE_VARIABLES if name == "twins" else {}
     page.for_types |= {("aerokit.mavlink.message", "Message"), ("aerokit.events", "Event")}
@@ -292,7 +281,7 @@ def generate(name: str = "twins") -> str:
 def _class(page: Page, twin: Twin) -> str:
     original = getattr(importlib.import_module(twin.module), twin.name)
     base = f"{twin.base}[{twin.parameter}]" if twin.parameter else twin.base
-    if base in OF_ONE:
+    if base in GENERIC_BASES:
         base += f'["Async{twin.name}"]'
     if twin.inherits:
         base += f", {twin.inherits}"
@@ -313,10 +302,7 @@ def _opener(page: Page, path: str) -> str:
     lines = _lines(arguments_of(node.args), "    ")
     given = "".join(f"        {each.lstrip('*')},\n" for each in forwarded(node))
     opens = "opened" if page.name == "twins" else "opened_fleet"
-    text = ast.get_docstring(node) or ""
-    text = text.replace(
-        "for the time of the ``async with`` block", "; use it in a ``with`` block, or close it"
-    )
+    text = (ast.get_docstring(node) or "").replace("``async with``", "``with``")
     return (
         f"@checked\ndef {name}(\n{lines}) -> {kind}:\n{docstring(text, '    ')}"
         f"    return {opens}(\n        {kind},\n        {name}_async,\n{given}    )\n"
@@ -324,7 +310,7 @@ def _opener(page: Page, path: str) -> str:
 
 
 def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
-    """Sorted as ruff does: ours behind the standard library's, ``import x`` first, constants before classes."""
+    """Return import statements in the order of ruff."""
     parts: list[str] = []
     for is_ours in (False, True):
         modules = {module for module, _ in names if module.startswith("aerokit") == is_ours}
@@ -346,12 +332,10 @@ def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
 
 
 def _by_kind(name: str) -> tuple[bool, bool, str]:
-    """Constants, classes, others; each by the alphabet."""
     return not name.isupper(), name[0].islower(), name.lower()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m aerokit.sync.generator")
     parser.add_argument("--check", action="store_true", help="compare with the committed file, write nothing")
     is_check, code = parser.parse_args(arguments).check, 0

@@ -1,4 +1,4 @@
-"""An event loop on a thread of its own, and blocking calls into it that Ctrl-C can end."""
+"""An event loop on a thread of its own, and blocking calls into it that Ctrl-C can interrupt."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 import anyio
 
-from aerokit.connection.own_heartbeat import ProofOfLife
+from aerokit.connection.heartbeats import ActivityMonitor
 from aerokit.connection.tasks import Cancellation
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, LinkOpenError
-from aerokit.sync.reply import Reply
+from aerokit.sync.thread_future import ThreadFuture
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -27,31 +27,28 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 
-WAKE_S = 0.2
-"""On Windows, Ctrl-C is noticed only between waits."""
-INTERRUPTED_CALL_ENDS_S = 2.0
-CLOSED_MEANWHILE = "the connection was closed while this call waited"
-CLOSE_S = 5.0
-"""The longest that closing waits; every single step of it is bounded by itself."""
+SIGNAL_CHECK_INTERVAL_S = 0.2  # Windows raises KeyboardInterrupt only between waits
+INTERRUPTED_CALL_TIMEOUT_S = 2.0
+CLOSE_TIMEOUT_S = 5.0
+CLOSED_DURING_CALL = "the connection was closed while this call waited"
 
 
 class LoopThread:
-    """One asyncio loop on one thread. The thread does not keep the interpreter alive; at its exit it is closed.
+    """An asyncio event loop on a daemon thread. It is closed at interpreter exit.
 
-    Neither the loop nor its thread refer to this object: who can reach it can use the loop, see :meth:`when_dropped`.
-
-    What runs there sees the context variables of the loop, not those of its caller.
+    The loop and its thread do not refer to this object, so that it can be garbage collected while they run; see
+    :meth:`when_dropped`. Functions run with the loop's context variables rather than the caller's.
 
     Raises:
-        LinkOpenError: the system has no thread, or no file descriptors, for it.
+        LinkOpenError: the system is out of threads or file descriptors.
     """
 
     def __init__(self) -> None:
-        self.proof: ProofOfLife = ProofOfLife(time.monotonic)
-        """Of the program that calls."""
+        self.activity: ActivityMonitor = ActivityMonitor(time.monotonic)
+        """Evidence that the calling program is alive."""
         self._calls = _Calls()
-        started: Reply[asyncio.AbstractEventLoop] = Reply()
-        # In a context of its own: sniffio keeps there which library is running, and the caller's may be another one.
+        started: ThreadFuture[asyncio.AbstractEventLoop] = ThreadFuture()
+        # An empty context: sniffio stores the running async library there, and the caller may use another one.
         self._thread = threading.Thread(
             target=contextvars.Context().run,
             args=(_run, self._calls, started),
@@ -59,79 +56,81 @@ class LoopThread:
             daemon=True,
         )
         self._is_closed = False
-        self._if_dropped: weakref.finalize[Any, Any] | None = None
-        self._lock = threading.Lock()  # nothing waits while it is held: the loop's thread takes it, too
+        self._finalizer: weakref.finalize[Any, Any] | None = None
+        self._lock = threading.Lock()  # also acquired by the loop's thread: never wait while holding it
         try:
             self._thread.start()
-            while not started.wait(WAKE_S):
+            while not started.wait(SIGNAL_CHECK_INTERVAL_S):
                 pass
             self._loop = started.result()
             atexit.register(self._calls.finish, self._thread)
         except (OSError, RuntimeError) as error:
-            self._give_up()
-            # Thread.start waits at a Condition: see Reply
+            self._abort()
+            # Thread.start waits with a Condition: see ThreadFuture
             if isinstance(error.__context__, KeyboardInterrupt):
                 raise error.__context__ from None
             raise _not_started(error) from error
         except BaseException:
-            self._give_up()
+            self._abort()
             raise
 
     def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Await ``function(*args, **kwargs)`` on the loop and return its result or raise its exception, as it is.
+        """Await ``function(*args, **kwargs)`` on the loop; return its result or raise its exception.
 
-        Ctrl-C cancels it there, waits until it has cleaned up, and goes on as KeyboardInterrupt.
+        Ctrl-C cancels the function, waits for its clean-up and raises KeyboardInterrupt.
 
         Raises:
-            BusyError: called on the loop's own thread, which would wait for itself.
-            ConnectionClosed: the loop was closed, before or meanwhile.
+            BusyError: called on the loop's own thread, which would be a deadlock.
+            ConnectionClosed: the loop was closed before or during the call.
         """
-        return self._run(INTERRUPTED_CALL_ENDS_S, function, *args, **kwargs)
+        return self._run(INTERRUPTED_CALL_TIMEOUT_S, function, *args, **kwargs)
 
-    def run_to_its_end(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """As :meth:`run`, for what leaves something undone when it is cut short, and is bounded by itself.
+    def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
+        """Like :meth:`run`, for short clean-up functions that must not be interrupted.
 
-        Ctrl-C waits for it, and goes on as KeyboardInterrupt afterwards, its cause what it has raised; a second one
-        does not wait.
+        Ctrl-C waits for the function and then raises KeyboardInterrupt, with the function's error as its cause. A
+        second Ctrl-C does not wait.
         """
         return self._run(None, function, *args, **kwargs)
 
     def _run(
         self,
-        patience_s: float | None,
+        interrupt_timeout_s: float | None,
         function: Callable[P, Awaitable[T]],
         /,  # the function may have arguments of these names
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """``patience_s``: how long to wait for the end of an interrupted call; None: as long as it takes."""
+        """Run a function; after Ctrl-C wait ``interrupt_timeout_s`` for its end, or without limit if None."""
         call: _Call[T] | None = None
         try:
             call = _Call(functools.partial(function, *args, **kwargs))
-            self.proof.waiting.add(call)
+            self.activity.pending_calls.add(call)
             self._start(call)
             self.wait_for(call)
         except BaseException as error:
-            if patience_s is None and isinstance(error, KeyboardInterrupt):  # it may not have begun
+            is_shielded = interrupt_timeout_s is None
+            if is_shielded and isinstance(error, KeyboardInterrupt):  # perhaps before the function was started
                 call = call or _Call(functools.partial(function, *args, **kwargs))
                 with contextlib.suppress(AerokitError):
                     self._start(call)
             if call is not None:
                 self._cancel(call)
-                while call.was_started and not call.wait(WAKE_S if patience_s is None else patience_s):
-                    if patience_s is not None or not self._thread.is_alive():
+                wait_s = SIGNAL_CHECK_INTERVAL_S if interrupt_timeout_s is None else interrupt_timeout_s
+                while call.is_scheduled and not call.wait(wait_s):
+                    if not is_shielded or not self._thread.is_alive():
                         break
-                if patience_s is None and (failure := call.take_error()) is not None:
+                if is_shielded and (failure := call.pop_exception()) is not None:
                     raise error from failure
             raise
         finally:
-            self.proof.waiting.discard(call)
-            self.proof.feed()
+            self.activity.pending_calls.discard(call)
+            self.activity.feed()
         assert call is not None
         return call.result()
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that does not wait on the loop's thread; else as :meth:`run`."""
+        """Call a synchronous function on the loop's thread; otherwise like :meth:`run`."""
 
         async def call() -> T:
             return function(*args, **kwargs)
@@ -139,9 +138,9 @@ class LoopThread:
         return self.run(call)
 
     def enter(self, context: AbstractAsyncContextManager[T]) -> T:
-        """Enter a context manager for a ``with`` block of the program, which leaves it by :meth:`run_to_its_end`.
+        """Enter a context manager on the loop. The caller exits it with :meth:`run_shielded`.
 
-        Ctrl-C that comes when it is entered already, and before the block has begun, leaves it again.
+        If Ctrl-C arrives after it was entered, but before this method returns, it is exited.
         """
         is_entered = False
 
@@ -152,154 +151,143 @@ class LoopThread:
             return value
 
         try:
-            return self.run_to_its_end(enter)
+            return self.run_shielded(enter)
         except BaseException as error:
             if is_entered:
-                self.run_to_its_end(context.__aexit__, type(error), error, error.__traceback__)
+                self.run_shielded(context.__aexit__, type(error), error, error.__traceback__)
             raise
 
-    def enter_at_once(self, context: AbstractContextManager[T]) -> T:
-        """As :meth:`enter`, for one that does not wait."""
-        return self.enter(_Awaited(context))
+    def enter_sync(self, context: AbstractContextManager[T]) -> T:
+        """Like :meth:`enter`, for a synchronous context manager."""
+        return self.enter(_AsyncContext(context))
 
     def feed(self) -> None:
-        """The program has called, unless it is the loop's own thread that does."""
+        """Record that the program is alive, unless called on the loop's own thread."""
         if not self.is_current:
-            self.proof.feed()
+            self.activity.feed()
 
     def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Have a function that does not wait called on the loop, after those asked for before; from any thread.
-
-        Nobody waits for it or hears what it raises: it must not raise.
+        """Schedule a synchronous function on the loop, in order, from any thread. It must not raise.
 
         Raises:
             ConnectionClosed: the loop was closed.
         """
         self.feed()
         with self._lock:
-            self._check()
-            self._soon(functools.partial(function, *args, **kwargs))
+            self._check_open()
+            self._schedule(functools.partial(function, *args, **kwargs))
 
-    def hold_open(self, context: AbstractAsyncContextManager[T]) -> Held[T]:
-        """Enter an asynchronous context manager on the loop; it is left, in the same task, when it is closed."""
-        return Held(self, context)
+    def open_context(self, context: AbstractAsyncContextManager[T]) -> OpenContext[T]:
+        """Enter an asynchronous context manager on the loop. Closing it exits it in the same task."""
+        return OpenContext(self, context)
 
     def close(self) -> None:
-        """End whatever still runs on the loop, the loop and the thread; idempotent, and bounded in time."""
+        """Cancel all calls, and end the loop and its thread. Idempotent; waits at most five seconds."""
         with self._lock:
             if self._is_closed:
                 return
             self._calls.end_soon()
-            self._is_closed = True  # afterwards: interrupted before, it can be closed again
-        if self._if_dropped is not None:
-            self._if_dropped.detach()
+            self._is_closed = True  # set last, so that close() can be repeated after Ctrl-C
+        if self._finalizer is not None:
+            self._finalizer.detach()
         atexit.unregister(self._calls.finish)
         if not self.is_current:
-            self._thread.join(CLOSE_S)
+            self._thread.join(CLOSE_TIMEOUT_S)
 
     def when_dropped(self, function: Callable[[], object]) -> None:
-        """Have the loop end when nobody can reach this object any more, after calling a function there.
+        """Call ``function`` on the loop and end the loop when this object is garbage collected.
 
-        The function must not refer to this object, directly or through others. Not called once this was closed, nor
-        at the interpreter's exit.
+        The function must not refer to this object, directly or indirectly. It is not called after :meth:`close` or at
+        interpreter exit.
         """
-        self._if_dropped = weakref.finalize(self, self._calls.end_soon, function)
-        self._if_dropped.atexit = False
+        self._finalizer = weakref.finalize(self, self._calls.end_soon, function)
+        self._finalizer.atexit = False
 
     @property
     def is_current(self) -> bool:
-        """Whether the caller is on the loop's thread."""
+        """True if the caller runs on the loop's thread."""
         return threading.current_thread() is self._thread
 
-    def wait_for(self, reply: Reply[Any]) -> None:
-        """Wait until it is done, open to Ctrl-C on every system; ConnectionClosed when the loop ends first."""
-        while not reply.wait(WAKE_S):
-            if not self._thread.is_alive() and not reply.is_done:
-                raise ConnectionClosed(CLOSED_MEANWHILE)
+    def wait_for(self, future: ThreadFuture[Any]) -> None:
+        """Wait until it is done; Ctrl-C interrupts on every system. Raises ConnectionClosed if the loop ends first."""
+        while not future.wait(SIGNAL_CHECK_INTERVAL_S):
+            if not self._thread.is_alive() and not future.is_done:
+                raise ConnectionClosed(CLOSED_DURING_CALL)
 
     def _start(self, call: _Call[Any]) -> None:
         if self.is_current:
             raise BusyError(
-                "a blocking call on the loop's own thread would wait for itself: predicates and callbacks run there;"
-                " call it from another thread"
+                "a blocking call on the event loop's own thread would be a deadlock; predicates and callbacks run"
+                " there: make the call on another thread"
             )
         with self._lock:
-            self._check()
-            call.was_started = True
-            self._soon(self._calls.begin, call)
+            self._check_open()
+            call.is_scheduled = True
+            self._schedule(self._calls.begin, call)
 
     def _cancel(self, call: _Call[Any]) -> None:
-        if call.was_started:
+        if call.is_scheduled:
             with contextlib.suppress(RuntimeError):  # the loop is closed
-                self._soon(call.cancel)
+                self._schedule(call.cancel)
 
-    def _give_up(self) -> None:
-        """It was interrupted while it started: whenever it has, it ends."""
-        self._calls.is_over = True
+    def _abort(self) -> None:
+        self._calls.is_aborted = True
         self._calls.end_soon()
 
-    def _soon(self, function: Callable[..., object], *args: Any) -> None:
+    def _schedule(self, function: Callable[..., object], *args: Any) -> None:
         self._loop.call_soon_threadsafe(function, *args, context=self._calls.context)
 
-    def _check(self) -> None:
+    def _check_open(self) -> None:
         if self._is_closed:
             raise ConnectionClosed("the connection was closed")
         if not self._calls.is_of_this_process:
-            raise ConnectionClosed(
-                "the connection belongs to the process that opened it, and not to its children"
-            )
+            raise ConnectionClosed("the connection belongs to the parent process; open one in this process")
 
 
-class Held(Generic[T]):
+class OpenContext(Generic[T]):
     """An asynchronous context manager that is open on a :class:`LoopThread`, in a task of its own."""
 
     def __init__(self, loop: LoopThread, context: AbstractAsyncContextManager[T]) -> None:
-        self._loop, self._block = loop, _Block(context)
-        self._call = _Call(self._block.live)
-        opened = self._block.opened
+        self._loop, self._task = loop, _ContextTask(context)
+        self._call = _Call(self._task.run)
+        opened = self._task.opened
         try:
             loop._start(self._call)
             loop.wait_for(opened)
             if not opened.has_result:
                 loop.wait_for(self._call)
-                self._call.result()  # raises what entering it raised
+                self._call.result()  # raises what __aenter__ raised
         except BaseException:
             loop._cancel(self._call)
             raise
         self.value = opened.result()
-        """What the context manager gave."""
 
     def close(self) -> None:
-        """Leave the context manager and wait until that is done; idempotent."""
+        """Exit the context manager and wait for it. Idempotent."""
         if self._loop.is_current:
-            self._block.leave.set()
+            self._task.close.set()
         elif not self._call.is_done:
             with contextlib.suppress(ConnectionClosed):
-                self._loop.call(self._block.leave.set)
-                self._call.wait(CLOSE_S)
+                self._loop.call(self._task.close.set)
+                self._call.wait(CLOSE_TIMEOUT_S)
 
 
-class _Block(Generic[T]):
-    """What the loop has of a :class:`Held`."""
-
+class _ContextTask(Generic[T]):
     def __init__(self, context: AbstractAsyncContextManager[T]) -> None:
         self._context = context
-        self.opened: Reply[T] = Reply()
-        self.leave = asyncio.Event()
+        self.opened: ThreadFuture[T] = ThreadFuture()
+        self.close = asyncio.Event()
 
-    async def live(self) -> None:
-        """Enter the context manager, and leave it when that is asked for."""
+    async def run(self) -> None:
         try:
             async with self._context as value:
-                self.opened.give(value)
-                await self.leave.wait()
+                self.opened.set_result(value)
+                await self.close.wait()
         finally:
-            self.opened.end()
+            self.opened.finish()
 
 
-class _Awaited(AbstractAsyncContextManager[T]):
-    """A context manager that does not wait."""
-
+class _AsyncContext(AbstractAsyncContextManager[T]):
     def __init__(self, context: AbstractContextManager[T]) -> None:
         self._context = context
 
@@ -311,12 +299,11 @@ class _Awaited(AbstractAsyncContextManager[T]):
 
 
 class _Calls:
-    """What runs on the loop for other threads, until the end."""
+    """Calls of other threads that run on the loop. Does not refer to the LoopThread."""
 
     def __init__(self) -> None:
         self.context = contextvars.Context()
-        self.is_over = False
-        """Nobody has taken the loop that was started."""
+        self.is_aborted = False  # LoopThread.__init__ failed
         self._end = asyncio.Event()
         self._tasks: dict[asyncio.Task[None], _Call[Any]] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -324,39 +311,34 @@ class _Calls:
 
     @property
     def is_of_this_process(self) -> bool:
-        """Whether the loop's thread lives in this process, and not in the one it was forked from."""
+        """False in a forked child, where the loop's thread does not exist."""
         return self._process == os.getpid()
 
     def begin(self, call: _Call[Any]) -> None:
-        """Await it in a task; asked for twice, once."""
-        if call.has_begun:
+        if call.has_started:
             return
-        call.has_begun = True
-        task = asyncio.get_running_loop().create_task(call.live())
+        call.has_started = True
+        task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        task.add_done_callback(self._end_of)
-
-    def end(self) -> None:
-        """Begin the end."""
-        self._end.set()
+        # Finishes a call that was cancelled before its first step; others have finished already.
+        task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:
-        """Begin the end, after calling a function on the loop; from any thread, never blocks, idempotent."""
+        """Call a function on the loop, then end the loop. From any thread; does not block; idempotent."""
         if self._loop is not None and self.is_of_this_process:
-            with contextlib.suppress(RuntimeError):  # it has stopped by itself
+            with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._end_after, function, context=self.context)
 
     def finish(self, thread: threading.Thread) -> None:
-        """Begin the end and wait for that of the thread, at the interpreter's exit."""
+        """End the loop and wait for its thread, at interpreter exit."""
         self.end_soon()
-        thread.join(CLOSE_S)
+        thread.join(CLOSE_TIMEOUT_S)
 
-    async def live(self, started: Reply[asyncio.AbstractEventLoop]) -> None:
-        """Wait for the end, and then for that of everything that was begun."""
+    async def run(self, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
         self.context = contextvars.copy_context()
         self._loop = asyncio.get_running_loop()
-        started.give(self._loop)
-        if not self.is_over:
+        started.set_result(self._loop)
+        if not self.is_aborted:
             await self._end.wait()
         while self._tasks:
             for call in self._tasks.values():
@@ -368,53 +350,44 @@ class _Calls:
             if function is not None:
                 function()
         finally:
-            self.end()
-
-    def _end_of(self, task: asyncio.Task[None]) -> None:
-        self._tasks.pop(task).end()  # it has ended by itself, unless it was cancelled before its first step
+            self._end.set()
 
 
-class _Call(Reply[T]):
-    """A coroutine function that is awaited on the loop for another thread."""
+class _Call(ThreadFuture[T]):
+    """A coroutine function that runs on the loop for another thread."""
 
     def __init__(self, function: Callable[[], Awaitable[T]]) -> None:
         super().__init__()
         self._function = function
         self._cancellation = Cancellation()
-        self.was_started = False
-        """Whether the loop was asked to run it."""
-        self.has_begun = False
-        """Whether the loop runs it, or has."""
+        self.is_scheduled = False  # scheduled on the loop
+        self.has_started = False
 
     def cancel(self) -> None:
-        """Cancel it (loop thread); idempotent."""
         self._cancellation.cancel()
 
     def result(self) -> T:
-        """As of any reply; ConnectionClosed when it was cancelled."""
         if self._error is None and not self.has_result:
-            raise ConnectionClosed(CLOSED_MEANWHILE)
+            raise ConnectionClosed(CLOSED_DURING_CALL)
         return super().result()
 
-    async def live(self) -> None:
-        """Run it; never raises but when cancelled."""
+    async def run(self) -> None:
         with self._cancellation:
             try:
-                self.give(await self._function())
+                self.set_result(await self._function())
             except asyncio.CancelledError:
                 raise
-            except BaseException as error:  # sys.exit() too: it is the caller's, and not the loop's
-                self.fail(error)
+            except BaseException as error:  # including SystemExit, which is meant for the caller's thread
+                self.set_exception(error)
 
 
-def _run(calls: _Calls, started: Reply[asyncio.AbstractEventLoop]) -> None:
-    """What the thread does."""
+def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
     try:
-        anyio.run(calls.live, started)
+        anyio.run(calls.run, started)
     except BaseException as error:
         if started.is_done:
             raise
-        started.fail(error)
+        started.set_exception(error)
     finally:
         atexit.unregister(calls.finish)
 

@@ -1,4 +1,4 @@
-"""The classes of which twins are made, and their members as they stand in the sources."""
+"""The asynchronous classes that have a blocking twin, and their members as found in the source code."""
 
 from __future__ import annotations
 
@@ -17,12 +17,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Twin:
-    """One class to be made: ``base`` is what is written by hand for it, in ``blocks.py``.
+    """A twin class to generate.
 
-    ``inherits``: the twin of a base of the original, which has that one's members. ``only``: these members alone;
-    ``without``: all but these; ``special``: of methods like ``__getitem__``, these too. ``direct``: methods that only
-    read, and are called on the thread of the program; ``called``: properties that are read on the loop; ``parts``:
-    those that are made there when they are first read. ``page``: the file that it is written to.
+    Attributes:
+        path: the asynchronous class.
+        base: the hand-written base class in ``blocks.py``.
+        inherits: a generated twin that it inherits from; its members are not generated again.
+        only: generate only these members.
+        without: do not generate these members.
+        special: generate these dunder methods, too.
+        direct: methods that only read; called on the caller's thread.
+        called: properties that are read on the loop.
+        parts: properties whose value is created on the loop on first access.
+        parameter: type argument of the base class.
+        page: the file that it is written to.
     """
 
     path: str
@@ -39,12 +47,10 @@ class Twin:
 
     @property
     def name(self) -> str:
-        """Of the class; both have the same."""
         return self.path.rpartition(".")[2]
 
     @property
     def module(self) -> str:
-        """Where the original is."""
         return self.path.rpartition(".")[0]
 
 
@@ -52,6 +58,7 @@ def _names(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
+# All twins, each after those that its members return.
 TWINS = (
     Twin(
         "aerokit.connection.cells.StateCell",
@@ -78,14 +85,14 @@ TWINS = (
     Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.logs.Logs"),
-    Twin("aerokit.vehicle.parameters.transaction.Temporarily", "TemporarilyTwin"),
+    Twin("aerokit.vehicle.parameters.transaction.TemporaryParameters", "TemporarilyTwin"),
     Twin("aerokit.vehicle.parameters.transaction.Transaction", "TransactionTwin"),
     Twin("aerokit.vehicle.parameters.parameters.Parameters", direct=_names("load_metadata known")),
     Twin("aerokit.vehicle.missions.mission.MissionControl"),
     Twin("aerokit.vehicle.missions.plans.FenceControl"),
     Twin("aerokit.vehicle.missions.plans.RallyControl"),
-    Twin("aerokit.vehicle.camera.part.CameraBlock", "BlockTwin"),
-    Twin("aerokit.vehicle.camera.shooting.PhotoInterval", "PhotoIntervalTwin"),
+    Twin("aerokit.vehicle.camera.link.CameraBlock", "BlockTwin"),
+    Twin("aerokit.vehicle.camera.photos.PhotoInterval", "PhotoIntervalTwin"),
     Twin("aerokit.vehicle.camera.cameras.Camera"),
     Twin("aerokit.vehicle.components.settings.Settings", direct=_names("known")),
     Twin("aerokit.vehicle.components.component.Component", called=_names("files parameters settings")),
@@ -94,11 +101,9 @@ TWINS = (
         "VehicleTwin",
         without=_names("telemetry"),
         direct=_names("distance_to describe_now"),
-        parts=_names(
-            "camera cameras components guided gimbal gimbals files logs parameters mission fence rally"
-        ),
+        parts=_names("camera cameras components guided gimbal gimbals files logs parameters mission fence rally"),
     ),
-    Twin("aerokit.fleets.formations.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
+    Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
     Twin(
         "aerokit.fleets.fleet.Selection",
         "SelectionTwin",
@@ -109,7 +114,6 @@ TWINS = (
     ),
     Twin("aerokit.fleets.fleet.Fleet", "FleetTwin", inherits="Selection", page="fleet_twins"),
 )
-"""The classes that programs without ``async`` use, each below those that it gives."""
 
 
 @cache
@@ -119,7 +123,7 @@ def tree(module: str) -> ast.Module:
 
 @cache
 def imports_of(module: str) -> dict[str, tuple[str, str]]:
-    """Name in this module → where it is imported from, and by which name."""
+    """Return the imports of a module: local name → module and name there."""
     found: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -131,41 +135,35 @@ def imports_of(module: str) -> dict[str, tuple[str, str]]:
 
 def _class_node(cls: type) -> ast.ClassDef:
     return next(
-        node
-        for node in tree(cls.__module__).body
-        if isinstance(node, ast.ClassDef) and node.name == cls.__name__
+        node for node in tree(cls.__module__).body if isinstance(node, ast.ClassDef) and node.name == cls.__name__
     )
 
 
 def function_node(module: str, name: str) -> ast.AsyncFunctionDef:
-    """A function that opens a block."""
-    return next(
-        node for node in tree(module).body if isinstance(node, ast.AsyncFunctionDef) and node.name == name
-    )
+    return next(node for node in tree(module).body if isinstance(node, ast.AsyncFunctionDef) and node.name == name)
 
 
 @dataclass
-class Member:
-    """One member of a twin, and the modules that its annotations are to be understood in."""
+class ClassMember:
+    """A member of a class, and the modules whose imports its annotations use."""
 
     name: str
     module: tuple[str, ...]
     node: ast.FunctionDef | ast.AsyncFunctionDef | None
     returns: ast.expr | None
     text: str | None
-    is_cell: bool = False
-    """A declared state."""
+    is_cell: bool = False  # a declared state
 
 
-def members_of(twin: Twin) -> list[Member]:
-    """Those of the class and of what it inherits, each once, in the order of the oldest definition."""
+def members_of(twin: Twin) -> list[ClassMember]:
+    """Return the members to generate, inherited ones included, in the order of their first definition."""
     cls = _class_of(twin)
     inherited = next((_class_of(each).__mro__ for each in TWINS if each.name == twin.inherits), ())
-    found: dict[str, Member] = {}
-    filled = _filled(cls)
+    found: dict[str, ClassMember] = {}
+    fill = _type_argument_filler(cls)
     for each in reversed(cls.__mro__):
         if each.__module__.startswith("aerokit.") and each not in inherited:
-            found |= {member.name: filled(member) for member in _own(each)}
+            found |= {member.name: fill(member) for member in _own(each)}
     wanted = twin.only or {name for name in found if not name.startswith("_")} | twin.special
     return [each for name, each in found.items() if name in wanted and name not in twin.without]
 
@@ -175,20 +173,20 @@ def _class_of(twin: Twin) -> type:
     return original
 
 
-def _filled(cls: type) -> Callable[[Member], Member]:
-    """Puts what a class gives its generic base into the place of the base's type variable."""
-    given: dict[str, str] = {}
+def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
+    """Return a function that replaces the type variables of generic bases by their arguments."""
+    arguments: dict[str, str] = {}
     for base in getattr(cls, "__orig_bases__", ()):
         names = [each.__name__ for each in getattr(get_origin(base), "__parameters__", ())]
         values = [each.__forward_arg__ for each in get_args(base) if isinstance(each, ForwardRef)]
-        given |= dict(zip(names, values))  # noqa: B905 - none of them where it is no forward reference
+        arguments |= dict(zip(names, values))  # noqa: B905 - other arguments are no forward references
 
     class Fill(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.Name:
-            return ast.Name(given.get(node.id, node.id))
+            return ast.Name(arguments.get(node.id, node.id))
 
-    def fill(member: Member) -> Member:
-        if not given or member.node is None:
+    def fill(member: ClassMember) -> ClassMember:
+        if not arguments or member.node is None:
             return member
         node = Fill().visit(copy.deepcopy(member.node))
         return replace(member, node=node, returns=node.returns, module=(*member.module, cls.__module__))
@@ -196,25 +194,23 @@ def _filled(cls: type) -> Callable[[Member], Member]:
     return fill
 
 
-def _own(cls: type) -> Iterator[Member]:
+def _own(cls: type) -> Iterator[ClassMember]:
     body = _class_node(cls).body
     for index, node in enumerate(body):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             if node.name == "__init__" and isinstance(node, ast.FunctionDef):
                 yield from _attributes(node, (cls.__module__,))
             elif not _is_setter(node):
-                yield Member(node.name, (cls.__module__,), node, node.returns, ast.get_docstring(node))
-        elif isinstance(node, ast.AnnAssign) and _is_told(node.annotation):
+                yield ClassMember(node.name, (cls.__module__,), node, node.returns, ast.get_docstring(node))
+        elif isinstance(node, ast.AnnAssign) and _is_state(node.annotation):
             assert isinstance(node.target, ast.Name)
             assert isinstance(node.annotation, ast.Subscript)
             kind = ast.Subscript(ast.Name("StateCell"), node.annotation.slice)
-            yield Member(
-                node.target.id, (cls.__module__,), None, kind, _text_below(body, index), is_cell=True
-            )
+            yield ClassMember(node.target.id, (cls.__module__,), None, kind, _text_below(body, index), is_cell=True)
 
 
-def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[Member]:
-    """Public attributes, with their documentation below them; the type is annotated, or the class that is called."""
+def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[ClassMember]:
+    """Yield public attributes with the docstring below. The type is the annotation, or the class that is called."""
     for index, node in enumerate(init.body):
         target: ast.expr | None = node.target if isinstance(node, ast.AnnAssign) else None
         if isinstance(node, ast.Assign) and len(node.targets) == 1:
@@ -226,7 +222,7 @@ def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[Memb
             kind = node.annotation
         elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
             kind = node.value.func
-        yield Member(target.attr, module, None, kind, _text_below(init.body, index))
+        yield ClassMember(target.attr, module, None, kind, _text_below(init.body, index))
 
 
 def _text_below(body: Sequence[ast.stmt], index: int) -> str | None:
@@ -236,16 +232,15 @@ def _text_below(body: Sequence[ast.stmt], index: int) -> str | None:
     return None
 
 
-def _is_told(annotation: ast.expr) -> bool:
+def _is_state(annotation: ast.expr) -> bool:
     return (
         isinstance(annotation, ast.Subscript)
         and isinstance(annotation.value, ast.Name)
-        and annotation.value.id == "Told"
+        and annotation.value.id == "StateField"
     )
 
 
 def decorators_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
-    """Their texts."""
     return {ast.unparse(each) for each in node.decorator_list}
 
 

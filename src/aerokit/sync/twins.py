@@ -3,8 +3,8 @@
 # pyright: reportIncompatibleMethodOverride=false
 """The classes of :mod:`aerokit.sync`: methods, arguments, errors and documentation of the asynchronous ones.
 
-Methods block, properties never do. Any thread may use them. ``aio`` is the asynchronous object, for code that runs on
-the loop; functions that are handed in (``on_progress``, predicates) run on the loop's thread.
+Methods block, properties never do. Objects can be used from any thread. ``aio`` is the asynchronous object, for code
+that runs on the loop. Functions passed as arguments (``on_progress``, predicates) run on the loop's thread.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
 from aerokit._internal.arguments import checked
+from aerokit.connection.heartbeats import OwnHeartbeat
 from aerokit.connection.opening import open_connection as open_connection_async
-from aerokit.connection.own_heartbeat import OwnHeartbeat
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
-from aerokit.protocols.exchange import PATIENCE_S
+from aerokit.protocols.exchange import IDLE_TIMEOUT_S
 from aerokit.sync.blocks import (
     BlockTwin,
     CellTwin,
@@ -33,8 +33,8 @@ from aerokit.sync.blocks import (
     VehicleTwin,
     opened,
 )
-from aerokit.vehicle.camera.controls import FORMATTING_S
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, MAX_DISTANCE_M
+from aerokit.vehicle.camera.controls import FORMAT_TIMEOUT_S
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S
 from aerokit.vehicle.commanding.setpoints import AccelerationSetpoint, BodyVelocitySetpoint, VelocitySetpoint
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
@@ -69,20 +69,20 @@ if TYPE_CHECKING:
     from aerokit.position import Position
     from aerokit.protocols.exchange import OnProgress
     from aerokit.transport.link import Link
-    from aerokit.transport.sockets import Peers
+    from aerokit.transport.sockets import PeerFilter
     from aerokit.vehicle.camera.cameras import Camera as AsyncCamera
     from aerokit.vehicle.camera.capture import Capture
     from aerokit.vehicle.camera.controls import AutoFocus
-    from aerokit.vehicle.camera.part import CameraBlock as AsyncCameraBlock
+    from aerokit.vehicle.camera.link import CameraBlock as AsyncCameraBlock
     from aerokit.vehicle.camera.values import (
         CameraInformation,
         CameraStatus,
+        CameraStorage,
+        CameraStream,
         ModeName,
-        Storage,
         ThermalRange,
         TrackedPlace,
         TrackingStatus,
-        VideoStream,
     )
     from aerokit.vehicle.camera.videos import SourceName
     from aerokit.vehicle.commanding.guided import Guided as AsyncGuided
@@ -94,11 +94,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.components.settings import Settings as AsyncSettings
     from aerokit.vehicle.files.files import FileEntry
     from aerokit.vehicle.files.files import Files as AsyncFiles
-    from aerokit.vehicle.files.log_paths import LogEntry
-    from aerokit.vehicle.files.logs import LogMethod
+    from aerokit.vehicle.files.logs import LogEntry, LogMethod
     from aerokit.vehicle.files.logs import Logs as AsyncLogs
     from aerokit.vehicle.gimbal.control import GimbalControl as AsyncGimbalControl
-    from aerokit.vehicle.gimbal.device import Frame, GimbalControllers, GimbalInformation
+    from aerokit.vehicle.gimbal.device import GimbalControllers, GimbalInformation, YawFrame
     from aerokit.vehicle.gimbal.gimbal import Gimbal as AsyncGimbal
     from aerokit.vehicle.gimbal.rates import GimbalRates as AsyncGimbalRates
     from aerokit.vehicle.missions.mission import MissionControl as AsyncMissionControl
@@ -151,7 +150,7 @@ __all__ = [
     "Settings",
     "StateCell",
     "Subscription",
-    "Temporarily",
+    "TemporaryParameters",
     "Transaction",
     "Vehicle",
     "connect",
@@ -165,27 +164,26 @@ T = TypeVar("T")
 
 
 class StateCell(CellTwin[T]):
-    """The latest value of one thing: read it at once, ask for its age, wait for it, follow it.
+    """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
-    Reading never talks to the vehicle. ``clock`` gives the time in seconds (the event loop's), ``waits_for``
-    names the messages the value comes from, for error texts. A cell belongs to one event loop and its thread;
-    other threads may read it (never a torn value, and never one called younger than it is), but not wait or
-    write.
+    Reading never sends anything. ``clock`` returns seconds (event loop time); ``waits_for`` names the source messages
+    in error texts. A cell belongs to one event loop and its thread. Other threads may read it (values are never torn,
+    and ages never too small), but must not wait or write.
     """
 
     @property
     def name(self) -> str:
-        """What it is the value of."""
+        """Name of the value, for error texts."""
         return self.aio.name
 
     @property
     def waits_for(self) -> str:
-        """The messages that the value comes from."""
+        """Names of the messages that carry the value."""
         return self.aio.waits_for
 
     @property
     def value(self) -> T:
-        """The latest value, however old; :class:`ValueUnknownError` before the first."""
+        """The latest value, of any age; raises :class:`ValueUnknownError` before the first."""
         return self.aio.value
 
     @property
@@ -195,28 +193,30 @@ class StateCell(CellTwin[T]):
 
     @property
     def is_known(self) -> bool:
-        """Whether a value has come."""
+        """True once a value has been received."""
         return self.aio.is_known
 
     @property
     def updated_at(self) -> float:
-        """When the latest value came, in seconds of the cell's clock; −inf before the first."""
+        """Time of the latest value, in seconds of the cell's clock; −inf before the first."""
         return self.aio.updated_at
 
     @property
     def age(self) -> float:
-        """Seconds since the latest value came; inf before the first."""
+        """Seconds since the latest value was received; inf before the first."""
         return self.aio.age
 
     @property
     def source(self) -> Source | None:
-        """Who sent the latest value, and in which message; None before the first."""
+        """Sender and message of the latest value; None before the first."""
         return self.aio.source
 
     def fresh(self, within: float) -> T:
-        """The latest value if it is at most ``within`` seconds old.
+        """Return the latest value if it is at most ``within`` seconds old.
 
-        Raises :class:`StaleValueError` when it is older, :class:`ValueUnknownError` when there is none.
+        Raises:
+            StaleValueError: the value is older.
+            ValueUnknownError: no value has been received.
         """
         return self.aio.fresh(within)
 
@@ -228,11 +228,13 @@ class StateCell(CellTwin[T]):
         timeout: float | None = None,
         description: str = "",
     ) -> T:
-        """Wait until ``predicate(value)`` is true, ``held_for`` seconds on end, and return the value.
+        """Wait until ``predicate(value)`` has been true for ``held_for`` seconds, and return the value.
 
-        The predicate is tried on the present value and on every value that comes, so one that lasted a single
-        message is not missed; an exception of it is raised here. After ``timeout`` seconds
-        :class:`OperationTimeout` says what was waited for (``description``) and what was seen meanwhile.
+        The predicate is checked for the current value and for every value received, so a condition that lasts a
+        single message is not missed. Exceptions of the predicate are raised here.
+
+        Raises:
+            OperationTimeout: not reached within ``timeout`` seconds; the text has ``description`` and the last values.
         """
         return self._loop.run(
             self.aio.wait_until,
@@ -243,90 +245,89 @@ class StateCell(CellTwin[T]):
         )
 
     def changes(self) -> Changes[T]:
-        """Follow the values that differ from the one before; a slow reader gets the latest only.
+        """Iterate over values that differ from their predecessor, starting with the current one if there is one.
 
-        The present value, when there is one, comes first. Nothing is left behind when the loop is left early.
+        A slow reader gets only the latest value. The loop can be left at any time.
         """
         return Changes(self._loop, self._loop.call(self.aio.changes))
 
     def updates(self) -> Changes[T]:
-        """Like :meth:`changes`, but each value that comes counts, also when it equals the one before."""
+        """Like :meth:`changes`, but yield each received value, even if it equals its predecessor."""
         return Changes(self._loop, self._loop.call(self.aio.updates))
 
 
 class Changes(ChangesTwin[T]):
-    """An endless asynchronous iterator over a cell; the latest value wins.
+    """Endless asynchronous iterator over the values of a cell.
 
-    Raises the error that the cell was closed with. It is registered at the cell only while it waits. Until it is
-    dropped, each value is decoded as it comes.
+    Raises the error that the cell was closed with. Until the iterator is garbage-collected, every received message of
+    the cell is decoded.
     """
 
     @property
     def missed(self) -> int:
-        """How many values were overwritten before this reader came to them."""
+        """Number of values that were replaced before this reader got them."""
         return self.aio.missed
 
 
 class Subscription(SubscriptionTwin[ItemT]):
-    """Items as they come, for one reader: registered on entry of its ``with``, gone at its exit.
+    """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
-    ``capacity=1`` with ``drop_oldest``, the default, is "always the latest": a reader slower than the stream never
-    sees an old value, and ``missed`` counts what it did not see. When the connection ends, what is queued can still
-    be read; then reading raises the reason.
+    The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped ones.
+    When the connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     @property
     def missed(self) -> int:
-        """How many items were dropped because the reader was slow."""
+        """Number of items dropped because the reader was slow."""
         return self.aio.missed
 
     def get(self, timeout: float | None = None) -> ItemT:
         """Return the next item.
 
         Raises:
-            OperationTimeout: none came within ``timeout`` seconds.
+            OperationTimeout: no item arrived within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
-            InvalidArgument: it is read outside its ``with``.
+            InvalidArgument: the subscription is closed; read it inside its ``with`` block.
         """
         return self._loop.run(self.aio.get, timeout)
 
     def get_nowait(self) -> ItemT | None:
-        """Return the next item if there is one."""
+        """Return the next item, or None if the queue is empty."""
         return self._loop.call(self.aio.get_nowait)
 
     def close(self, error: Exception | None = None) -> None:
-        """Take no more items; a waiting reader gets ``error``, or the end of the iteration without one."""
+        """Stop taking items. A waiting reader gets ``error``, or the end of the iteration if there is none."""
         self._loop.call(self.aio.close, error)
 
 
 class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
-    Frames come in through ``bytes_received``, are checked by one framer for each remote peer, and go to ``bus``. Who
-    may speak in whose name is said in :class:`aerokit.connection.routes.Routes`; ``may_move`` is its own.
-    ``send`` numbers a message and writes it to where its target was last heard. Everything runs on the loop's thread.
+    Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
+    ``send`` writes a message to the peer behind which its target was last received; :class:`Routes` decides which peer
+    that is, and when it may change (``may_move``). Everything runs on the event loop's thread.
     """
 
     @cached_property
     def link_state(self) -> StateCell[LinkState]:
-        """Whether frames come at all, from whomever; ``vehicle.link_state`` is about one vehicle."""
+        """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
         return StateCell(self._loop, self.aio.link_state)
 
     @property
     def signing(self) -> Signing | None:
-        """What signs the frames that we send and checks those that we receive; None: neither.
+        """Key that signs sent frames and verifies received ones; None: frames are neither signed nor verified.
 
-        It has the time stamp to keep (``signing.timestamp``) and counts refused frames (``signing.refused``). May be
-        set while the connection is open; InvalidArgument while we send MAVLink 1, which has no signatures.
+        ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
+        the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
         """
         return self.aio.signing
 
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Number, frame and write a message; never blocks.
+        """Number, frame and write a message. Never blocks.
 
-        It goes to where its ``target_component`` of the system ``to`` (None: its ``target_system``) was last heard;
-        to every peer with components of that system when it names none of them; and to every peer when it is for all
-        or for one that was never heard.
+        It goes to the peer behind which its ``target_component`` of system ``to`` (None: its ``target_system``) was
+        last received; if it names no component, to every peer with components of that system; if its target is
+        broadcast or unknown, to every peer.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -336,22 +337,23 @@ class Connection(ConnectionTwin):
 
     @cached_property
     def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
-        """How each of several links does; None where there is one link only. Told once a second, and at each change."""
+        """Status of each of several links, updated once a second and on every change; None with a single link."""
         return None if self.aio.links is None else StateCell(self._loop, self.aio.links)
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that were sent and have not left this machine, as far as the link can tell: they may still arrive.
+        """Bytes sent but still on this machine, as far as the link can tell; they may still be transmitted.
 
-        Above 0 for longer than a moment when a link does not drain (TCP without a network, a serial port that is held
-        up): :class:`LinkStalled`. 0 for UDP.
+        A value that stays above 0 means that the link does not drain (TCP without a network, a serial port with flow
+        control asserted): :class:`LinkStalled`. Always 0 for UDP.
         """
         return self._loop.call(lambda: self.aio.unsent_bytes)
 
     def discard_unsent(self) -> None:
-        """Take back what was sent and has not left, as far as that is possible: an order that is not wanted any more.
+        """Discard data that was sent but has not left this program, e.g. an outdated command.
 
-        All that waits goes, whoever it is for. What the system has of a TCP connection stays in :attr:`unsent_bytes`.
+        This applies to all waiting data, for all targets. Data in the system's TCP buffer cannot be discarded and stays
+        in :attr:`unsent_bytes`.
         """
         self._loop.call(self.aio.discard_unsent)
 
@@ -362,10 +364,10 @@ class Connection(ConnectionTwin):
         capacity: int = 1,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
-        """Return a stream of these messages or events, of one system (or of all: 0), for use in a ``with`` block.
+        """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
 
         Raises:
-            InvalidArgument: no type, or a type that the dialect does not hold.
+            InvalidArgument: no type is given, or the dialect does not have it.
         """
         return Subscription(
             self._loop,
@@ -380,43 +382,43 @@ class Connection(ConnectionTwin):
 
     @property
     def is_open(self) -> bool:
-        """Whether messages can still be sent and received."""
+        """True while messages can be sent and received."""
         return self.aio.is_open
 
     def now(self) -> float:
-        """Seconds on the event loop's clock, the one that all ages and deadlines are measured on."""
+        """Return the event loop's time in seconds; all ages and deadlines use this clock."""
         return self.aio.now()
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Frames of this system that were received, and frames that its sequence numbers say were lost."""
+        """Return how many frames of this system were received, and how many were lost by sequence number."""
         return self._loop.call(self.aio.counts, system_id)
 
 
 class SetpointStream(StreamTwin[SetpointT]):
-    """Sends the latest set-point at a rate for as long as the ``async with`` block feeds it.
+    """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
-    Entering puts the vehicle into its mode for set-points (GUIDED, OFFBOARD) with the initial set-point. Leaving, in
-    any way, tells it to hold. When the stream has stopped by itself, ``set`` and leaving the block raise
-    :class:`SetpointStreamStopped`; a vehicle that should move and does not for twelve seconds stops it, too. When it
-    stopped because the mode changed (a pilot, a failsafe), the vehicle is left to whoever changed it.
+    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
+    way tells the vehicle to hold. If the stream stops by itself, ``set`` and leaving the block raise
+    :class:`SetpointStreamStopped`; a vehicle that does not move for twelve seconds although it should stops it as
+    well. If it stopped because a pilot or a failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     @property
     def is_running(self) -> bool:
-        """Whether set-points are being sent."""
+        """True while set-points are being sent."""
         return self.aio.is_running
 
     def set(self, setpoint: SetpointT) -> None:
-        """Take a new set-point; it is sent at the next tick, and resent until ``valid_for_s`` has passed.
+        """Replace the set-point; it is sent at the next tick and resent until ``valid_for_s`` has passed.
 
         Raises:
-            InvalidArgument: a value is out of range; the one before stays in force until it is too old.
+            InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
         self._loop.call(self.aio.set, setpoint)
 
     def fly(self, setpoint: SetpointT, duration_s: float) -> None:
-        """Feed one set-point for ``duration_s`` seconds.
+        """Send one set-point for ``duration_s`` seconds.
 
         Raises:
             SetpointStreamStopped: the stream ended meanwhile.
@@ -427,10 +429,10 @@ class SetpointStream(StreamTwin[SetpointT]):
 class Guided(TwinOf["AsyncGuided"]):
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (how often the latest set-point is sent, 2 to 100), ``valid_for_s`` (how long a
+    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not obey. Rates and seconds are ours: a simulation that runs ten
-    times as fast, and does not wait longer for it, wants ten times as many set-points.
+    raised for a kind that this type of vehicle does not obey. Rates and seconds are in real time: a simulation at ten
+    times the speed needs ten times the rate.
     """
 
     def velocity(
@@ -461,7 +463,7 @@ class Guided(TwinOf["AsyncGuided"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[BodyVelocitySetpoint]:
-        """Stream velocities as seen from the vehicle (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
+        """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
         return SetpointStream(
             self._loop,
             self._loop.call(
@@ -501,7 +503,7 @@ class Guided(TwinOf["AsyncGuided"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[LocalPositionSetpoint]:
-        """Stream places in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
+        """Stream positions in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
         return SetpointStream(
             self._loop,
             self._loop.call(
@@ -521,7 +523,7 @@ class Guided(TwinOf["AsyncGuided"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[PositionSetpoint]:
-        """Stream places on the globe (SET_POSITION_TARGET_GLOBAL_INT)."""
+        """Stream global positions (SET_POSITION_TARGET_GLOBAL_INT)."""
         return SetpointStream(
             self._loop,
             self._loop.call(
@@ -555,131 +557,130 @@ class Guided(TwinOf["AsyncGuided"]):
 
 
 class GimbalControl(BlockTwin["AsyncGimbalControl"]):
-    """We are in control of a gimbal while its ``async with`` lasts (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
+    """Control of a gimbal for the duration of its ``async with`` block (MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE).
 
-    Entering claims it, from whoever has it, and returns when the manager tells that we have it. Leaving gives it back,
-    in any way: without waiting when the block is left by an error or cancelled. When somebody else takes it, that is
-    the event ``GimbalControlLost``; orders to the gimbal, those under way too, raise :class:`GimbalTaken`, and so does
-    leaving the block if nothing in it was told. Nothing is given back then. A station with our own system and component
-    id is not told from us.
+    Entering takes control from any other station and returns when the manager confirms it. Leaving releases it, without
+    waiting if the block exits by an error or cancellation. When another station takes control, aerokit publishes
+    ``GimbalControlLost``; orders to the gimbal, including running ones, raise :class:`GimbalTaken`, and so does leaving
+    the block unless your program has seen the loss. Control is not released then. Another station that uses your own
+    system and component id cannot be detected.
 
     Entering raises:
-        NotSupported: the vehicle has no gimbal manager, or its manager knows no secondary control.
-        BusyError: a block of this program has that control already. Nothing was sent.
+        NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
+        BusyError: your program already has this control in another block. Nothing was sent.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
-        OperationTimeout: it was accepted, and the manager does not tell that we have it.
+        OperationTimeout: it was accepted, but the manager does not confirm that you are in control.
     """
 
     @property
     def is_primary(self) -> bool:
-        """Whether it is the primary control."""
+        """True for primary control, False for secondary."""
         return self.aio.is_primary
 
     @property
     def is_held(self) -> bool:
-        """Whether we are in control."""
+        """True while your program is in control."""
         return self.aio.is_held
 
     @property
     def is_taken(self) -> bool:
-        """Whether it was lost."""
+        """True if another station has taken control, or released yours."""
         return self.aio.is_taken
 
     def until_lost(self) -> tuple[int, int]:
-        """Wait until somebody else has taken control; their system and component id, (0, 0): nobody has it.
+        """Wait until control is lost; return the system and component id of the new controller, (0, 0) for none.
 
         Raises:
-            OperationRejected: the block was left meanwhile.
+            OperationRejected: the block ended.
             ConnectionClosed, LinkLost: the connection ended.
         """
         return self._loop.run(self.aio.until_lost)
 
     def raise_if_taken(self) -> None:
-        """Raise what tells who has it now; nothing while we have it.
+        """Raise GimbalTaken if control was lost.
 
         Raises:
-            GimbalTaken: somebody else has taken control, or nobody has it any more.
+            GimbalTaken: another station is in control, or none.
         """
         self._loop.call(self.aio.raise_if_taken)
 
 
 class GimbalRates(BlockTwin["AsyncGimbalRates"]):
-    """Turns a gimbal at the latest rates for as long as its ``async with`` block feeds them.
+    """Turns a gimbal at the latest rates while its ``async with`` block feeds them.
 
     Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; then they are sent at ``rate_hz``
-    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero: it
-    stays where it points. The stream stops by itself, with a rate of zero, when nothing new was set for
-    ``valid_for_s``, the event loop was blocked for ``max_lag_s``, or the vehicle is silent; and is left to others when
-    another order was given to the gimbal, or control was lost. Then ``set`` and leaving the block raise.
+    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
+    the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
+    ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
+    rate of zero if another order is given to the gimbal, or control is lost. Then ``set`` and leaving the block raise.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
-        NotSupported: the vehicle has no gimbal manager: mounts of old turn to angles only.
+        NotSupported: the vehicle has no gimbal manager; older mounts turn to angles only.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
-        GimbalTaken: control was lost in the block that has it.
+        GimbalTaken: your program had control and lost it.
     """
 
     @property
     def is_running(self) -> bool:
-        """Whether rates are being sent."""
+        """True while rates are being sent."""
         return self.aio.is_running
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
-        """Take new rates; they are sent at the next tick, and resent until ``valid_for_s`` has passed.
+        """Set new rates; they are sent at the next tick, and repeated until ``valid_for_s`` has passed.
 
         Args:
             pitch_deg_s: degrees per second, −720 to 720; positive is up.
             yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
 
         Raises:
-            InvalidArgument: a rate is out of range; those before stay in force until they are too old.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
-            GimbalTaken: control was lost in the block that has it.
+            InvalidArgument: a rate is out of range; the previous rates stay valid.
+            SetpointStreamStopped: the stream has stopped, or the block has ended.
+            GimbalTaken: your program had control and lost it.
         """
         self._loop.call(self.aio.set, pitch_deg_s, yaw_deg_s)
 
     def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Feed one pair of rates for ``duration_s`` seconds.
+        """Feed one pair of rates for a time.
 
         Args:
             pitch_deg_s: degrees per second, −720 to 720; positive is up.
             yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
-            duration_s: for so long.
+            duration_s: time in seconds.
 
         Raises:
             InvalidArgument: a rate is out of range.
-            SetpointStreamStopped: the stream ended meanwhile.
-            GimbalTaken: control was lost in the block that has it.
+            SetpointStreamStopped: the stream has stopped.
+            GimbalTaken: your program had control and lost it.
         """
         self._loop.run(self.aio.turn, pitch_deg_s, yaw_deg_s, duration_s)
 
 
 class Gimbal(TwinOf["AsyncGimbal"]):
-    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or the mount of a vehicle
-    that knows no better.
+    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal tells that it is
-    there, ends when another one is given, and is stayed with however the vehicle moves. Where a manager obeys only who
-    is in control, an order outside a block of :meth:`control` claims it, until :meth:`release`.
+    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports that it
+    points there, and ends when another one is given. The gimbal keeps the direction while the vehicle moves. If the
+    manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     @cached_property
     def attitude(self) -> StateCell[GimbalAttitude]:
-        """Where it points (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION,
-        MOUNT_STATUS). The autopilot is asked for it while somebody waits, follows or observes; reading asks nothing.
+        """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS). It
+        is requested from the autopilot while your program watches this cell; reading it requests nothing.
         """
         return StateCell(self._loop, self.aio.attitude)
 
     @cached_property
     def controllers(self) -> StateCell[GimbalControllers]:
-        """Who is in control of it, as its manager tells by itself (GIMBAL_MANAGER_STATUS)."""
+        """Stations in control, as reported by the manager (GIMBAL_MANAGER_STATUS)."""
         return StateCell(self._loop, self.aio.controllers)
 
     @property
     def device_id(self) -> int:
-        """Its gimbal device id: 1 to 6 behind its manager, or its component id; 0 while none is heard of."""
+        """Gimbal device id: 1 to 6 if attached to its manager, or the component id; 0 until one is discovered."""
         return self._loop.call(lambda: self.aio.device_id)
 
     def look_at(
@@ -690,25 +691,26 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 5.0,
         timeout: float = 15.0,
     ) -> None:
-        """Keep it pointed at a place, and return when it points there; without an altitude, at the vehicle's own.
+        """Keep it pointed at a position; returns when it points there.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION. A copter whose gimbal does not pan turns its nose.
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. Without an altitude, it is taken to be at the vehicle's own. A copter whose
+        gimbal does not pan turns its nose.
 
         Args:
-            target: the place.
+            target: the position.
             wait: False: return when it was accepted.
-            tolerance_deg: how near in each axis is there, above 0 to 45.
-            timeout: seconds until it has to be there.
+            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            timeout: seconds to wait.
 
         Raises:
             InvalidArgument: the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager can do that with its first gimbal only. Nothing was sent.
-            ValueUnknownError: home, or the vehicle's altitude, is not known and is needed here. Nothing was sent.
+            NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
+            ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.look_at, target, wait=wait, tolerance_deg=tolerance_deg, timeout=timeout)
@@ -721,25 +723,24 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         tolerance_deg: float = 5.0,
         timeout: float = 15.0,
     ) -> None:
-        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID), and return when it points there.
+        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
 
-        Both have to hear where the other vehicle is (its GLOBAL_POSITION_INT): the gimbal's manager to point at it,
-        and this connection to notice.
+        The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
 
         Args:
             system_id: its MAVLink system id, 1 to 255.
             wait: False: return when it was accepted.
-            tolerance_deg: how near in each axis is there, above 0 to 45.
-            timeout: seconds until it has to be there.
+            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            timeout: seconds to wait.
 
         Raises:
-            InvalidArgument: there is no such system id, or the tolerance is out of range. Nothing was sent.
-            NotSupported: the manager cannot do that. Nothing was sent.
+            InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager does not support it. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(
@@ -751,12 +752,12 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         )
 
     def stop_looking(self) -> None:
-        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Where it turns then is its manager's business.
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). The manager decides where the gimbal turns then.
 
         Raises:
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
         """
         self._loop.run(self.aio.stop_looking)
 
@@ -766,35 +767,35 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         yaw_deg: float,
         *,
         roll_deg: float = 0.0,
-        frame: Frame = "earth",
+        frame: YawFrame = "earth",
         wait: bool = True,
         tolerance_deg: float = 3.0,
         timeout: float = 10.0,
     ) -> None:
-        """Turn it, and return when it tells that it points there.
+        """Point it at angles; returns when it reports that it points there.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
-            yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the vehicle's nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. If it is not 0, only the mount's command can do it, which turns the
-                camera with the vehicle: a yaw from north is right at the moment of the order.
-            frame: what the yaw counts from, and keeps to.
+            yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
+            roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
+                with the vehicle: a yaw from north is right only at the time of the order.
+            frame: reference of the yaw, which it keeps afterwards.
             wait: False: return when it was accepted.
-            tolerance_deg: how near in each axis is there, above 0 to 45.
-            timeout: seconds until it has to be there.
+            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            timeout: seconds to wait.
 
-        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; control is claimed when that is denied, until :meth:`release`.
-        MAV_CMD_DO_MOUNT_CONTROL to a vehicle without a gimbal manager, and MOUNT_CONTROL, which has no answer, to one
-        that does not know that either.
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If it is denied, aerokit claims control until :meth:`release`. A
+        vehicle without a gimbal manager gets MAV_CMD_DO_MOUNT_CONTROL, and one that does not support that either gets
+        MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
             InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
-                asked for. Nothing was sent.
+                called before. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(
@@ -809,42 +810,42 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         )
 
     def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Turn it to its neutral position, mostly level and straight ahead, and return when it rests there.
+        """Turn it to its neutral position, usually level and straight ahead; returns when it rests there.
 
         Args:
             wait: False: return when it was accepted.
-            timeout: seconds until it has to be there.
+            timeout: seconds to wait.
 
         Raises:
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.neutral, wait=wait, timeout=timeout)
 
     def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Put it away, and return when it rests there.
+        """Retract it; returns when it rests there.
 
         Args:
             wait: False: return when it was accepted.
-            timeout: seconds until it has to be there.
+            timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager takes the order and does nothing (PX4). Nothing was sent.
+            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         self._loop.run(self.aio.retract, wait=wait, timeout=timeout)
 
     def release(self) -> None:
-        """Give it back to the pilot's sticks, and the control that was claimed without a block to whoever wants it.
+        """Return it to the pilot's sticks, and release control that was claimed outside of a control block.
 
         Raises:
             CommandRejected: the vehicle refused.
@@ -853,21 +854,21 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         self._loop.run(self.aio.release)
 
     def information(self) -> GimbalInformation:
-        """Ask what it is, what it can do, and its limits (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
+        """Request capabilities, limits and identity (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
 
-        From then on angles beyond its limits are refused before anything is sent.
+        Afterwards, angles beyond its limits are refused before anything is sent.
 
         Raises:
-            CommandRejected: there is no gimbal manager, or it does not tell.
+            CommandRejected: there is no gimbal manager, or it does not support the messages.
             CommandTimeout: there was no answer.
         """
         return self._loop.run(self.aio.information)
 
     def control(self, *, secondary: bool = False) -> GimbalControl:
-        """Be in control of it for the time of an ``async with`` block; see :class:`GimbalControl`.
+        """Control the gimbal for the duration of an ``async with`` block; see :class:`GimbalControl`.
 
         Args:
-            secondary: take the secondary control, beside whoever has the primary.
+            secondary: take secondary control, alongside the station that has primary control.
         """
         return GimbalControl(self._loop, self._loop.call(self.aio.control, secondary=secondary))
 
@@ -876,20 +877,20 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         pitch_deg_s: float = 0.0,
         yaw_deg_s: float = 0.0,
         *,
-        frame: Frame = "vehicle",
+        frame: YawFrame = "vehicle",
         rate_hz: float = 10.0,
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn it at rates for the time of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn it at rates for the duration of an ``async with`` block that feeds them; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: whether its yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``) meanwhile.
+            frame: whether the yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``).
             rate_hz: how often the latest rates are sent, 2 to 100.
-            valid_for_s: how long rates may be resent without new ones.
-            max_lag_s: how late the event loop may be.
+            valid_for_s: stop if no new rates are set for this time.
+            max_lag_s: stop if the event loop is blocked for this time.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
@@ -909,38 +910,39 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
 
 class Gimbals(GimbalsTwin["Gimbal"]):
-    """The gimbals that were heard of: ``vehicle.gimbals[154]``; ``for gimbal in vehicle.gimbals``.
+    """The discovered gimbals: ``vehicle.gimbals[154]``; ``for gimbal in vehicle.gimbals``.
 
-    A gimbal is known by its gimbal device id: its component id (154, 171 to 175), or 1 to 6 behind the autopilot.
+    A gimbal is identified by its gimbal device id: its component id (154, 171 to 175), or 1 to 6 if attached to the
+    autopilot.
     """
 
     @cached_property
     def first(self) -> Gimbal:
-        """The first one, whichever that is: one behind the autopilot goes before those with ids of their own."""
+        """The first gimbal; one attached to the autopilot takes precedence over those with their own component id."""
         return Gimbal(self._loop, self.aio.first)
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """The gimbal device ids of those that were heard of, the first one first."""
+        """Gimbal device ids of the discovered gimbals, the first gimbal first."""
         return self._loop.call(lambda: self.aio.ids)
 
     def get(self, device_id: int) -> Gimbal:
-        """The gimbal of this id, whether it was heard of or not.
+        """Return the gimbal of this id, whether or not it has been discovered.
 
         Args:
-            device_id: 1 to 6 behind the autopilot, or a component id up to 255.
+            device_id: 1 to 6 if attached to the autopilot, or a component id up to 255.
 
         Raises:
-            InvalidArgument: there is no such id.
-            BusyError: too many gimbals were heard of already.
+            InvalidArgument: the id is out of range.
+            BusyError: the maximum number of gimbals is reached.
         """
         return Gimbal(self._loop, self._loop.call(self.aio.get, device_id))
 
     def discover(self, *, timeout: float = 2.0) -> tuple[int, ...]:
-        """Ask everybody on the vehicle which gimbals they manage (GIMBAL_MANAGER_INFORMATION); :attr:`ids` afterwards.
+        """Ask all components which gimbals they manage (GIMBAL_MANAGER_INFORMATION); return :attr:`ids` afterwards.
 
         Args:
-            timeout: seconds in which they have to answer; this takes so long.
+            timeout: seconds to wait for answers; the call always takes this time.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
@@ -949,28 +951,29 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
 
 class PostedOrder(TwinOf["AsyncPostedOrder"]):
-    """An order that others may follow before it is answered; made by :meth:`aerokit.Vehicle.posted`."""
+    """An order that need not be waited for; created by :meth:`aerokit.Vehicle.posted`."""
 
     @property
     def end(self) -> str:
-        """Why nothing of it is sent again, as a clause; empty while it may be."""
+        """The reason why none of its commands is sent again, as a clause; empty while they may be."""
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; return when it is answered, or the order's effect is told.
+        """Send a COMMAND_LONG of this order; returns when it is acknowledged or the order's effect is reported.
 
-        A second one is not sent when a newer order is about its subject, or somebody else has changed the mode, since.
+        It is not sent again after a newer order about the same subject, or after another party changed the mode.
 
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
-            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
+            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
+                counts.
 
         Raises:
-            InvalidArgument: a parameter is no number or does not fit, or the block was left. Nothing was sent.
-            OperationRejected: the order has ended: a newer one was given, or somebody else steers.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+            InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
+            OperationRejected: the order has ended: it was superseded or taken over.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
         self._loop.run(self.aio.command, command, *params, component_id=component_id)
 
@@ -984,9 +987,9 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         z: float = 0.0,
         component_id: int | None = None,
     ) -> None:
-        """The same as COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` metres in ``frame``.
+        """Send a COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` in metres in ``frame``.
 
-        The rest is as for :meth:`command`.
+        All else as for :meth:`command`.
         """
         self._loop.run(
             self.aio.command_int,
@@ -1000,72 +1003,72 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         )
 
     def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
-        """Order a mode, and wait until HEARTBEAT tells the order's effect.
+        """Order a mode and wait until HEARTBEAT reports the order's effect.
 
-        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. Where the vehicle says
-        that it is too early, as PX4 does while it checks a mission, it is asked again when a HEARTBEAT that has come
-        since says that the order still stands.
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it. If the vehicle answers
+        TEMPORARILY_REJECTED, as PX4 does while it checks a mission, the command is sent again after a HEARTBEAT that
+        confirms that the order is still valid.
 
         Args:
-            mode: one of those that the order was posted with; its ``base_mode`` is sent with it.
-            timeout: seconds for HEARTBEAT to tell it after each answer.
+            mode: one of the modes of the order; its ``base_mode`` is sent with it.
+            timeout: seconds for HEARTBEAT to report the effect after each ack.
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the order was not posted with it, or the block was left. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer.
-            OperationTimeout: it accepted, and stays in another mode.
+            InvalidArgument: the mode is not one of the order's, or the block was left. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: it accepted and stayed in another mode.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout, component_id=component_id)
 
-    def until_told(self, timeout: float) -> None:
-        """Wait until HEARTBEAT tells the order's effect, or that it was there before.
+    def wait_confirmed(self, timeout: float) -> None:
+        """Wait until HEARTBEAT reports the order's effect, or that it was in effect before.
 
         Raises:
-            CommandRejected: the vehicle took its acceptance back, as PX4 does.
-            OperationTimeout: it was not told within ``timeout`` seconds.
+            CommandRejected: the vehicle accepted first and refused then, as PX4 may do.
+            OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
-        self._loop.run(self.aio.until_told, timeout)
+        self._loop.run(self.aio.wait_confirmed, timeout)
 
 
 class Files(TwinOf["AsyncFiles"]):
-    """Reads, writes and lists files on the vehicle. Operations follow each other in the order of their calls.
+    """Reads, writes and lists files on the vehicle. Operations run one at a time, in the order of their calls.
 
     Paths are the vehicle's: ``/APM/LOGS`` and ``@PARAM/param.pck`` on ArduPilot, ``/fs/microsd/log`` on PX4.
 
-    Every method takes ``patience_s``, the seconds to go on while nothing comes, and ``timeout``, those for all of it
-    (None: no limit). Every method may be cancelled at any moment; the file is closed on the vehicle behind it.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
+    total; None for no limit). You can cancel any call; the file is then closed on the vehicle.
 
     Every method raises:
-        InvalidArgument: a path is empty, has a NUL, is not encodable, or is longer than 238 bytes. Nothing was sent.
-        FileError: the vehicle refused; ``code`` and ``errno`` say why.
-        FileTimeout: it did not end; ``missing`` has the ranges that did not arrive.
+        InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
+        FileError: the vehicle refused; see ``code`` and ``errno``.
+        FileTimeout: it did not finish; ``missing`` has the missing ranges.
 
     :meth:`is_supported` raises none of them.
     """
 
     def is_supported(self) -> bool:
-        """Whether the vehicle says that it has MAVFTP; False, too, when it says nothing within three seconds."""
+        """Return True if the vehicle reports MAVFTP; False also if it does not answer within three seconds."""
         return self._loop.run(self.aio.is_supported)
 
     def read(
         self,
         path: str,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> bytes:
         """Return the content of a file.
 
         Raises:
-            RemoteProtocolError: the vehicle's answers make no sense, or its file became shorter while it was read.
+            RemoteProtocolError: the vehicle's answers are invalid, or its file became shorter during the read.
         """
         return self._loop.run(
             self.aio.read,
             path,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1076,26 +1079,26 @@ class Files(TwinOf["AsyncFiles"]):
         to: str | os.PathLike[str],
         *,
         resume: bool = False,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a file to the disk of this computer. It grows as ``<to>.part``, and gets its name when it is complete.
+        """Copy a file to this computer. It is written to ``<to>.part`` and renamed when it is complete.
 
-        With ``resume``, what an interrupted download has left in ``<to>.part`` is kept when the vehicle's file is not
-        shorter, and the whole is compared by its CRC-32 afterwards, where the vehicle can compute it; when they differ,
-        all of it is fetched again. Files whose names begin with ``@`` are always fetched as a whole.
+        With ``resume``, the ``<to>.part`` of an interrupted download is kept if the vehicle's file is not shorter, and
+        the result is verified by CRC-32 if the vehicle can compute it; if it differs, the whole file is read again.
+        Files whose names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
-            OSError: the file cannot be written here.
+            OSError: the local file cannot be written.
         """
         self._loop.run(
             self.aio.download,
             path,
             to,
             resume=resume,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1104,25 +1107,31 @@ class Files(TwinOf["AsyncFiles"]):
         self,
         path: str,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> tuple[FileEntry, ...]:
-        """Return what is in a directory, without ``.`` and ``..``, in the vehicle's order.
+        """List a directory, without ``.`` and ``..``, in the vehicle's order.
 
         Raises:
-            RemoteProtocolError: the vehicle's list does not end.
+            RemoteProtocolError: the listing does not end.
         """
-        return self._loop.run(self.aio.list, path, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.list, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def crc32(self, path: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 that the vehicle computes of a file: polynomial 0x04C11DB7, nothing inverted.
+    def crc32(
+        self,
+        path: str,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> int:
+        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, nothing inverted.
 
         That is ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF``.
 
         Raises:
-            RemoteProtocolError: its answer is no CRC-32.
+            RemoteProtocolError: the answer is not a CRC-32.
         """
-        return self._loop.run(self.aio.crc32, path, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.crc32, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def write(
         self,
@@ -1130,25 +1139,25 @@ class Files(TwinOf["AsyncFiles"]):
         data: bytes,
         *,
         verify: bool = True,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Write a file, in place of the one that may be there; what was in that one is gone with the first message.
+        """Write a file. An existing file is replaced; its content is lost with the first message.
 
-        ``verify`` compares its CRC-32 afterwards, where the vehicle can compute it. Of files whose names begin with
-        ``@`` it cannot: they are taken over when they are closed, and what became of that is not said.
+        ``verify`` compares the CRC-32 afterwards, if the vehicle can compute it. It cannot for files whose names begin
+        with ``@``: the vehicle evaluates them when they are closed, and does not report the result.
 
         Raises:
-            VerificationFailed: all was acknowledged, and yet something else is in the file.
-            RemoteProtocolError: the CRC-32 that it tells is none.
+            VerificationFailed: the vehicle acknowledged everything, but the file has other content.
+            RemoteProtocolError: the answer is not a CRC-32.
         """
         self._loop.run(
             self.aio.write,
             path,
             data,
             verify=verify,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1159,22 +1168,22 @@ class Files(TwinOf["AsyncFiles"]):
         path: str,
         *,
         verify: bool = True,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a file of this computer to ``path`` on the vehicle, as :meth:`write` does.
+        """Copy a local file to ``path`` on the vehicle, as :meth:`write` does.
 
         Raises:
             VerificationFailed, RemoteProtocolError: as for :meth:`write`.
-            OSError: the file cannot be read here. Nothing was sent.
+            OSError: the local file cannot be read. Nothing was sent.
         """
         self._loop.run(
             self.aio.upload,
             source,
             path,
             verify=verify,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1184,66 +1193,77 @@ class Files(TwinOf["AsyncFiles"]):
         path: str,
         size: int,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> None:
-        """Cut a file to ``size`` bytes, or make it as long with zeros. PX4 can, ArduPilot cannot."""
-        self._loop.run(self.aio.truncate, path, size, patience_s=patience_s, timeout=timeout)
+        """Cut a file to ``size`` bytes, or extend it with zeros. Supported by PX4, not by ArduPilot."""
+        self._loop.run(self.aio.truncate, path, size, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def remove(self, path: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> None:
-        """Remove a file; on ArduPilot an empty directory, too."""
-        self._loop.run(self.aio.remove, path, patience_s=patience_s, timeout=timeout)
+    def remove(
+        self,
+        path: str,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> None:
+        """Remove a file; on ArduPilot also an empty directory."""
+        self._loop.run(self.aio.remove, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def remove_directory(
         self,
         path: str,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> None:
-        """Remove an empty directory; on ArduPilot a file, too."""
-        self._loop.run(self.aio.remove_directory, path, patience_s=patience_s, timeout=timeout)
+        """Remove an empty directory; on ArduPilot also a file."""
+        self._loop.run(self.aio.remove_directory, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def make_directory(
         self,
         path: str,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> None:
-        """Make a directory; the one that it is in must exist."""
-        self._loop.run(self.aio.make_directory, path, patience_s=patience_s, timeout=timeout)
+        """Create a directory; its parent must exist."""
+        self._loop.run(self.aio.make_directory, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def rename(
         self,
         path: str,
         new_path: str,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> None:
-        """Give a file or directory another name or place; both paths must fit into one message together."""
-        self._loop.run(self.aio.rename, path, new_path, patience_s=patience_s, timeout=timeout)
+        """Rename or move a file or directory; both paths together must fit into one message."""
+        self._loop.run(self.aio.rename, path, new_path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
 class Logs(TwinOf["AsyncLogs"]):
-    """Lists, downloads and erases flight logs. Operations follow each other in the order of their calls.
+    """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
-    Every method takes ``patience_s``, the seconds to go on while nothing comes, and ``timeout``, those for all of it
-    (None: no limit). Every method may be cancelled at any moment; the vehicle is told to stop sending.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
+    total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers to the LOG_* messages only while it is disarmed, and ends the log that it is writing when one is
-    read by them; by MAVFTP its logs can be read in flight, too. Of a log that is being written comes what it has when
-    it is asked for; if that is more than its entry says, logger "aerokit" tells so (INFO).
+    ArduPilot answers the LOG_* messages only while disarmed, and ends its current log when one is read by them; by
+    MAVFTP its logs can also be read in flight. A log that is still being written is read up to its current end; if that
+    exceeds the size in its entry, logger "aerokit" reports it (INFO).
     """
 
-    def list(self, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
-        """Return the logs that the vehicle has, the oldest first; an empty tuple when it has none.
+    def list(
+        self,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> tuple[LogEntry, ...]:
+        """Return the logs on the vehicle, oldest first; an empty tuple if there are none.
 
         Raises:
-            FileTimeout: not all entries came; the text names the missing ones.
+            FileTimeout: entries are missing; the text names them.
         """
-        return self._loop.run(self.aio.list, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.list, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def download(
         self,
@@ -1252,31 +1272,30 @@ class Logs(TwinOf["AsyncLogs"]):
         *,
         resume: bool = True,
         method: LogMethod = "auto",
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a log to the disk of this computer. It gets its name when it is complete.
+        """Copy a log to this computer. A log that is still being written is read up to its current end.
 
-        Of one that is being written, that is as far as it goes when it is asked for. Until then it is ``<to>.part`` by
-        MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
+        Until it is complete it is ``<to>.part`` by MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
 
         Args:
             log: an entry of :meth:`list`, or its id.
-            to: the file here.
-            resume: go on where an interrupted download of this log to this file has ended; by LOG_* only when the
-                vehicle tells its time.
-            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: what is faster with this autopilot, and
-                the other one where that does not work. By MAVFTP it must be certain which file the log is.
-            patience_s: see above.
-            timeout: see above.
-            on_progress: called with bytes, and the bytes there will be.
+            to: path of the local file.
+            resume: continue an interrupted download of this log to this file; by LOG_* only if the vehicle reports the
+                time of the log.
+            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster one for this autopilot, and the
+                other one if that fails. MAVFTP requires that the file of the log can be identified.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the bytes so far and in total.
 
         Raises:
-            InvalidArgument: an argument that cannot be right. Nothing was sent.
-            FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
-            FileTimeout: it did not arrive; ``missing`` has the ranges.
-            OSError: the file cannot be written here.
+            InvalidArgument: an argument is invalid. Nothing was sent.
+            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
+            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            OSError: the local file cannot be written.
         """
         self._loop.run(
             self.aio.download,
@@ -1284,7 +1303,7 @@ class Logs(TwinOf["AsyncLogs"]):
             to,
             resume=resume,
             method=method,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1294,119 +1313,117 @@ class Logs(TwinOf["AsyncLogs"]):
         log: LogEntry | int,
         *,
         method: LogMethod = "auto",
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> bytes:
         """Return the content of a log; arguments as for :meth:`download`.
 
         Raises:
-            InvalidArgument: an argument that cannot be right. Nothing was sent.
-            FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
-            FileTimeout: it did not arrive; ``missing`` has the ranges.
+            InvalidArgument: an argument is invalid. Nothing was sent.
+            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
+            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
         """
         return self._loop.run(
             self.aio.read,
             log,
             method=method,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def erase(self, *, patience_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
-        """Erase all logs, and wait until they are gone; that can take minutes on some boards.
+    def erase(self, *, idle_timeout_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
+        """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
-        LOG_ERASE is not acknowledged: the list tells. A log that the vehicle has begun meanwhile may be there.
+        LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
 
         Raises:
-            FileTimeout: there are still logs of before.
+            FileTimeout: some of the old logs still exist.
         """
-        self._loop.run(self.aio.erase, patience_s=patience_s, timeout=timeout)
+        self._loop.run(self.aio.erase, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
-class Temporarily(TemporarilyTwin):
-    """Other values for the time of a block; see :meth:`Parameters.temporarily`. Gives the results of the writes."""
+class TemporaryParameters(TemporarilyTwin):
+    """Other values for the duration of a block, which yields the results; see :meth:`Parameters.temporarily`."""
 
 
 class Transaction(TransactionTwin):
     """Several writes, all or none.
 
-    Every write is verified; one that fails or is clamped raises. When the block raises, for whatever reason, all that
-    was written is set back, as far as the link lives: what could not be set back is in
-    :class:`aerokit.errors.RollbackFailed`, and stays as it is, also when the link comes back. The block's own exception
-    comes out otherwise.
+    Every write is verified; one that fails or is clamped raises. If the block raises, all written parameters are
+    restored as far as possible: those that could not be restored are in :class:`aerokit.errors.RollbackFailed`, and
+    are not tried again when the link returns. Otherwise the exception of the block propagates.
 
-    What another station has changed meanwhile is left as it is, and a warning of logger "aerokit" names it. Other
-    tasks of this program are not kept from writing meanwhile: what a transaction puts back is what it found before its
-    own first write. Blocks about the same parameter may be nested and may overlap; an inner one that succeeds is undone
-    by an outer one that fails.
+    A value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it. Other tasks
+    of your program may write meanwhile: a transaction restores the values from before its own first write. Blocks with
+    the same parameter may be nested and may overlap; an outer block that fails also undoes an inner one that succeeded.
     """
 
     @property
     def changes(self) -> tuple[ParameterDifference, ...]:
-        """What was written so far and is another value than before, by the names on the vehicle."""
+        """Parameters that were written so far and have changed, by their names on the vehicle."""
         return self.aio.changes
 
     @property
     def needs_reboot(self) -> tuple[str, ...]:
-        """Those of the changes that take effect after a reboot; needs :meth:`Parameters.load_metadata`."""
+        """Names of changes that take effect after a reboot; needs :meth:`Parameters.load_metadata`."""
         return self.aio.needs_reboot
 
     def set(self, name: str, value: float) -> ParameterWrite:
-        """Set one parameter; errors are those of :meth:`Parameters.set`, and VerificationFailed when it is clamped."""
+        """Set one parameter; errors as for :meth:`Parameters.set`, and VerificationFailed if it is clamped."""
         return self._loop.run(self.aio.set, name, value)
 
     def set_many(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
-        """Set several; the first error is raised after all were tried."""
+        """Set several parameters; raises the first error after all were tried."""
         return self._loop.run(self.aio.set_many, values)
 
 
 class Parameters(TwinOf["AsyncParameters"]):
-    """The parameters of one autopilot. Coroutines talk to it; ``table`` is what is known, and never does.
+    """The parameters of one autopilot. Coroutines exchange messages with it; ``table`` is the local copy.
 
-    Every PARAM_VALUE of the autopilot keeps the table up to date, also when somebody else has changed something, and
-    is told as :class:`aerokit.events.ParameterChanged`. After a reboot nothing is known until it is read anew.
+    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations, and is published as
+    :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
-    method here takes the old and the new name with either firmware, and converts; an old name that the vehicle does
-    not have any more is answered with a :class:`aerokit.errors.ParameterRenamedWarning`, which names the new one.
+    method accepts the old and the new name with either firmware, and converts the value; an old name that the vehicle
+    no longer has causes an :class:`aerokit.errors.ParameterRenamedWarning` with the new one.
 
-    ArduPilot sees to parameters a few times a second. While more than five are read, or when it has not answered for
-    half a second whether it has some, it is asked to do so more often, by SET_MESSAGE_INTERVAL of PARAM_VALUE, and at
-    the end to go on as before.
+    ArduPilot handles parameters a few times a second. While more than five are read, or if it has not answered within
+    half a second whether it has a parameter, aerokit raises that rate by SET_MESSAGE_INTERVAL of PARAM_VALUE, and
+    restores it at the end.
 
-    All methods take ``patience_s`` (give up after so many seconds without anything new) and ``timeout`` (for all of it;
-    then OperationTimeout). Each can be cancelled at any moment.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
+    total; then OperationTimeout). You can cancel any call.
     """
 
     @property
     def table(self) -> ParameterTable:
-        """What is known now, in the vehicle's order; empty before anything was read, and after a reboot."""
+        """Known parameters in the vehicle's order; empty before the first read, and after a reboot."""
         return self.aio.table
 
     def known(self, name: str) -> Parameter | None:
-        """What was told last of the parameter that the vehicle calls so; as ``table.get(name)``, but makes no table."""
+        """Return the last known parameter of this name on the vehicle; ``table.get(name)`` without building a table."""
         return self.aio.known(name)
 
     @property
     def is_complete(self) -> bool:
-        """Whether the whole list was downloaded since the vehicle started."""
+        """True if the whole list was downloaded since the vehicle started."""
         return self.aio.is_complete
 
     @property
     def metadata(self) -> Metadata | None:
-        """Descriptions, units, ranges and bits by name, once :meth:`load_metadata` has read them."""
+        """Descriptions, units, ranges and bits by name, after :meth:`load_metadata`."""
         return self.aio.metadata
 
     def load_metadata(self, path: str | os.PathLike[str]) -> Metadata:
         """Read ArduPilot's ``apm.pdef.xml`` or ``apm.pdef.json``, or PX4's ``parameters.xml`` or ``parameters.json``.
 
-        Metadata are advice: a write outside the documented range is done, and its result has a ``note``; refused is
-        only what the type cannot hold. They also tell which changes need a reboot, and PX4's tell the defaults.
+        Metadata is advice: a write outside the documented range is done, and its result has a ``note``; only values
+        that the type cannot represent are refused. It also lists changes that need a reboot. PX4's has the defaults.
 
         Raises:
-            FileFormatError: the file is damaged or of another kind.
+            FileFormatError: the file is damaged, or of another kind.
         """
         return self.aio.load_metadata(path)
 
@@ -1416,26 +1433,26 @@ class Parameters(TwinOf["AsyncParameters"]):
         method: DownloadMethod = "auto",
         refresh: bool = False,
         cache: CacheChoice = False,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> ParameterTable:
-        """Return all parameters; at once when they were downloaded since the vehicle started.
+        """Return all parameters; immediately if they were downloaded since the vehicle started.
 
         Args:
-            method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` has the vehicle
-                send one message for each; ``"auto"`` takes the file where there is one.
-            refresh: download again, whatever is known or in the cache.
-            cache: keep the list on disk, and take it from there when the vehicle's own hash says that nothing has
-                changed: the second connect takes one request. True is the user's cache directory, or name one. Only PX4
-                has such a hash; parameters that it changes by itself are not in it, and may be older. Nothing is
-                written to disk by default.
-            patience_s: give up after so many seconds without anything new.
-            timeout: seconds for all of it.
+            method: ``"ftp"`` reads one small file with the defaults (``@PARAM/param.pck``), ``"list"`` requests one
+                message for each parameter; ``"auto"`` uses the file if there is one.
+            refresh: download again, even if the parameters are known or cached.
+            cache: keep the list on disk, and use it while the vehicle's parameter hash is unchanged: the second connect
+                takes one request. True means the user's cache directory, or pass one. Only PX4 has a hash; it does not
+                cover parameters that PX4 changes by itself, so they may be outdated. Off by default.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the number of parameters, or bytes of the file, so far and in total.
             on_progress: called with parameters, or bytes of the file, done and in total.
 
         Raises:
-            ParameterTimeout: the list did not come whole; ``missing`` has the indices. What did come is in ``table``.
+            ParameterTimeout: the list is incomplete; ``missing`` has the indices, ``table`` what has arrived.
             FileError, FileTimeout, RemoteProtocolError: with ``method="ftp"`` only.
         """
         return self._loop.run(
@@ -1443,80 +1460,92 @@ class Parameters(TwinOf["AsyncParameters"]):
             method=method,
             refresh=refresh,
             cache=cache,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def get(self, name: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> int | float:
-        """Ask the vehicle for one value; the rest is as for :meth:`read`."""
-        return self._loop.run(self.aio.get, name, patience_s=patience_s, timeout=timeout)
+    def get(
+        self,
+        name: str,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> int | float:
+        """Request one value; for arguments and errors see :meth:`read`."""
+        return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def read(self, name: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> Parameter:
-        """Ask the vehicle for one parameter; ``table[name]`` is what is known without asking.
+    def read(
+        self,
+        name: str,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> Parameter:
+        """Request one parameter from the vehicle; ``table[name]`` has the local copy.
 
         Raises:
-            InvalidArgument: the name is none, or longer than 16 characters.
-            ParameterRejected: the vehicle has no such parameter. It may say so, or answer others and not this one.
-            ParameterTimeout: no answer.
+            InvalidArgument: the name is empty, or longer than 16 characters.
+            ParameterRejected: the vehicle has no such parameter: it answers so, or answers others but not this one.
+            ParameterTimeout: there was no answer.
         """
-        return self._loop.run(self.aio.read, name, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def probe(
         self,
         *names: str,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> dict[str, Parameter | ParameterRejected | ParameterTimeout]:
-        """Ask the vehicle for parameters that it may not have, all at once and by exactly these names.
+        """Request several parameters that the vehicle may not have, by exactly these names.
 
-        So it is found which of several names a firmware has; where ArduPilot renamed one, :meth:`get` does that.
+        Use it to find out which of several names a firmware has; for renamed ArduPilot parameters use :meth:`get`.
 
         Returns:
-            For each name the parameter, or what :meth:`get` would have raised; its ``code`` is None when the vehicle
-            did not say itself that it has none, but answered others and not this one.
+            For each name the parameter, or the error that :meth:`get` would have raised. Its ``code`` is None if the
+            vehicle did not deny the parameter, but answered others and not this one.
 
         Raises:
-            InvalidArgument: a name is none, or longer than 16 characters. Nothing was sent.
+            InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
         """
-        return self._loop.run(self.aio.probe, *names, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.probe, *names, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def set(
         self,
         name: str,
         value: float,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> ParameterWrite:
-        """Set one parameter, and return what the vehicle says it is then.
+        """Set one parameter; return the result as confirmed by the vehicle.
 
         Raises:
-            InvalidArgument: a name that cannot be, NaN, or a value that the parameter's type cannot hold.
-            ParameterRejected: the vehicle has no such parameter, or keeps the value it had; ``code`` says why.
-            ParameterTimeout: not confirmed. It may have been set all the same.
+            InvalidArgument: an invalid name, NaN, or a value that the parameter's type cannot represent.
+            ParameterRejected: the vehicle has no such parameter, or keeps the previous value; see ``code``.
+            ParameterTimeout: not confirmed, but it may have been set.
         """
-        return self._loop.run(self.aio.set, name, value, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.set, name, value, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def set_many(
         self,
         values: Mapping[str, float],
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set several parameters, some of them at a time, and return one result each; look at ``error``.
+        """Set several parameters concurrently; return one result each: check its ``error``.
 
-        A parameter that appears only when another one of them is set (ArduPilot's ``…_ENABLE``) is set after it.
+        Parameters that appear only when another one is set (ArduPilot's ``…_ENABLE``) are set after it.
 
         Raises:
-            InvalidArgument: one of the names or values cannot be; then none of them was set.
+            InvalidArgument: a name or value is invalid. Nothing was set.
         """
         return self._loop.run(
             self.aio.set_many,
             values,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1526,69 +1555,76 @@ class Parameters(TwinOf["AsyncParameters"]):
         parameters: ParameterSource,
         *,
         method: UploadMethod = "auto",
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Bring the vehicle's parameters to those of a table, a dict or a parameter file; what is equal is not sent.
+        """Set the vehicle's parameters to those of a table, a dict or a parameter file; equal values are not sent.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
-        one, ``"auto"`` takes the file where the vehicle has one and there is much to change. Results are as for
-        :meth:`set_many`; parameters of other hardware or firmware in the file end as ``"failed"`` with
-        ParameterRejected, and do not keep the others from being set. Where a parameter is given under two names, the
-        vehicle's own counts, and the other has no result.
+        one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
+        :meth:`set_many`; parameters that the vehicle does not have end as ``"failed"`` with ParameterRejected, and the
+        others are set. If a parameter is given under two names, the vehicle's own counts, and the other has no result.
 
         Raises:
-            InvalidArgument, FileFormatError: a name, a value or the file cannot be; then nothing was set.
+            InvalidArgument, FileFormatError: a name, a value or the file is invalid. Nothing was set.
             ParameterTimeout: the vehicle's own parameters could not be downloaded.
         """
         return self._loop.run(
             self.aio.upload,
             parameters,
             method=method,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def temporarily(self, values: Mapping[str, float], *, patience_s: float = PATIENCE_S) -> Temporarily:
-        """Have other values for the time of an ``async with`` block: they are set, and put back at its end.
+    def temporarily(
+        self,
+        values: Mapping[str, float],
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+    ) -> TemporaryParameters:
+        """Set values for the duration of an ``async with`` block and restore the previous ones at its end.
 
-        Also when the block raises or is cancelled: then the end of the block takes up to ``patience_s`` seconds. When
-        one value cannot be set, those before are put back, and its error is raised. Blocks may be nested and may
-        overlap, also about the same parameter: it gets the value from before the first of them when the last one ends.
-        A value that another station has changed meanwhile is left as it is, and a warning of logger "aerokit" names it.
+        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If a
+        value cannot be set, the others are restored and its error is raised. Blocks may be nested and may overlap, for
+        the same parameter as well: it is restored to the value from before the first of them when the last one ends. A
+        value that another station has changed meanwhile stays, and a warning of logger "aerokit" names it.
 
         Raises:
-            RollbackFailed: values could not be put back; ``not_restored`` has them.
+            RollbackFailed: values could not be restored; ``not_restored`` has them.
         """
-        return Temporarily(self._loop, self._loop.call(self.aio.temporarily, values, patience_s=patience_s))
+        return TemporaryParameters(
+            self._loop,
+            self._loop.call(self.aio.temporarily, values, idle_timeout_s=idle_timeout_s),
+        )
 
-    def transaction(self, *, patience_s: float = PATIENCE_S) -> Transaction:
+    def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
         """Write several parameters, all or none: ``async with vehicle.parameters.transaction() as t: await t.set(…)``.
 
-        Each write is verified. When the block raises, or is cancelled, or one of the writes fails, what was written is
-        set back to what it was; see :class:`Transaction`.
+        Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are restored;
+        see :class:`Transaction`.
         """
-        return Transaction(self._loop, self._loop.call(self.aio.transaction, patience_s=patience_s))
+        return Transaction(self._loop, self._loop.call(self.aio.transaction, idle_timeout_s=idle_timeout_s))
 
     def diff(
         self,
         parameters: ParameterSource,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> tuple[ParameterDifference, ...]:
-        """How the vehicle (``before``) differs from a table, a dict or a file (``after``); it is downloaded if need be.
+        """Compare the vehicle (``before``) with a table, a dict or a file (``after``), downloading it if needed.
 
-        Parameters that are not in ``parameters`` do not count; those that the vehicle has not got have ``before``
-        None. Names and units are the vehicle's.
+        Only names in ``parameters`` are compared; ``before`` is None for those that the vehicle does not have. Names
+        and units are the vehicle's.
         """
         return self._loop.run(
             self.aio.diff,
             parameters,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1596,27 +1632,27 @@ class Parameters(TwinOf["AsyncParameters"]):
     def changed_from_default(
         self,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> ParameterTable:
-        """Return the parameters that differ from their default, as the vehicle tells it by MAVFTP, or the metadata.
+        """Return the parameters that differ from their default, according to MAVFTP or the metadata.
 
         Raises:
-            NotSupported: neither of them does.
+            NotSupported: neither of them has defaults.
         """
         return self._loop.run(
             self.aio.changed_from_default,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
 
 class MissionControl(TwinOf["AsyncMissionControl"]):
-    """``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
+    """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Items are counted from 0 and home is never one of them, whatever the autopilot. Starting, pausing and resuming are
+    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are
     orders like taking off: the newest one wins.
     """
 
@@ -1628,36 +1664,34 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         only_changes: bool = True,
         verify: bool = True,
         max_distance_m: float = MAX_DISTANCE_M,
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Have the vehicle hold this plan instead of the one it holds; an empty one clears it.
+        """Replace the plan on the vehicle by this one; an empty one clears it.
 
         Args:
-            plan: it is checked before anything is sent.
-            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or what the
-                vehicle has.
-            only_changes: when it is known what the vehicle holds, from an upload or a download and confirmed by the
-                vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
-            verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
-                as a file is always read back.
-            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
-                refused.
-            patience_s: give up after so many seconds without progress.
-            timeout: seconds for all of it.
-            on_progress: called with how far it is, in items, or in bytes of a file.
+            plan: checked before anything is sent.
+            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
+            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
+                nothing if it is equal, and only the items that differ if the vehicle supports that.
+            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+                read back.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites a mission and rally points one by one (a fence at the end), so that after a failure it
-        holds a part of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
+        a mixture of both: the error says so.
 
         Raises:
-            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
-            MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
-            MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, and holds something else.
-            NotSupported: ``"ftp"`` was asked for, and it has none.
+            InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
+            MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
+            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
+            VerificationFailed: it confirmed, but holds something else.
+            NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
@@ -1668,7 +1702,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             only_changes=only_changes,
             verify=verify,
             max_distance_m=max_distance_m,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1677,48 +1711,48 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self,
         *,
         method: PlanMethod = "auto",
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Mission:
-        """Read what the vehicle holds; arguments as for :meth:`upload`.
+        """Read the plan on the vehicle; arguments as for :meth:`upload`.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing in the end; ``missing`` has them.
-            RemoteProtocolError: what it sent makes no sense.
+            MissionTimeout: items are missing; ``missing`` has them.
+            RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
             method=method,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def clear(self, *, patience_s: float = 10.0, timeout: float | None = None) -> None:
-        """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
+    def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
+        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it fell silent.
-            VerificationFailed: it confirmed, and still holds items.
+            MissionTimeout: it stopped answering.
+            VerificationFailed: it confirmed, but still holds items.
             OperationTimeout: not done within ``timeout``.
         """
-        self._loop.run(self.aio.clear, patience_s=patience_s, timeout=timeout)
+        self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     @cached_property
     def current(self) -> StateCell[int | None]:
-        """The item it goes for (MISSION_CURRENT); None: it has not begun, or there is no mission."""
+        """Current item (MISSION_CURRENT); None before the start, and without a mission."""
         return StateCell(self._loop, self.aio.current)
 
     @cached_property
     def count(self) -> StateCell[int]:
-        """How many items it holds, by MISSION_CURRENT or by the last transfer."""
+        """Number of items, from MISSION_CURRENT or the last transfer."""
         return StateCell(self._loop, self.aio.count)
 
     @cached_property
@@ -1728,51 +1762,51 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
     @property
     def reached(self) -> int | None:
-        """The item that was reached last (MISSION_ITEM_REACHED), None before the first."""
+        """The last item that was reached (MISSION_ITEM_REACHED); None before the first."""
         return self.aio.reached
 
     def set_current(self, item: int, *, timeout: float = 5.0) -> None:
-        """Have it go for this item next; it does so at once when it is flying its mission.
+        """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
 
-        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which knows that alone. An item that is no
-        place to go to (a DO command) is run through: ``current`` then shows the one behind it.
+        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which supports only that. An item without a
+        position (a DO command) is executed; ``current`` then shows the next item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: somebody else steers, or a newer order was given, before it was confirmed.
+            OperationRejected: a pilot took over, or a newer order was given, before it was confirmed.
             OperationTimeout: MISSION_CURRENT did not confirm it.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 
     def start(self, item: int = 0, *, timeout: float = 10.0) -> None:
-        """Fly the mission from ``item`` on, its first one by default; returns when HEARTBEAT tells the mission mode.
+        """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
-        The vehicle must be armed: **it takes off** if the mission says so. A copter on the ground needs a take-off item
-        first. Cancelled half-way, the vehicle is told to hold.
+        The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
+        a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which takes off then also from the ground, and changes the mode of others.
+        Sends MISSION_START to ArduPilot, which then takes off from the ground, and changes the mode of others.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: it is not armed, or its mode changed meanwhile.
-            CommandRejected: the vehicle refused: it has no mission, no position, …; ``reasons`` tells.
-            OperationTimeout: it accepted and stayed in another mode.
-            NotSupported: this type of vehicle has no mode for missions.
+            CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
+            OperationTimeout: it accepted but stayed in another mode.
+            NotSupported: this type of vehicle has no mission mode.
         """
         self._loop.run(self.aio.start, item, timeout=timeout)
 
     def pause(self) -> None:
-        """Stop where it is and keep the place in the mission; returns when HEARTBEAT tells the mode for holding.
+        """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected when it does not fly its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if it is not flying its mission, else as :meth:`Vehicle.hold`.
         """
         self._loop.run(self.aio.pause)
 
     def resume(self, *, timeout: float = 10.0) -> None:
-        """Go on with the mission from the current item; also after a pilot or another order has interrupted it.
+        """Continue the mission from the current item; also after a pilot or another order has interrupted it.
 
-        ArduPilot begins anew if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
+        ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
         self._loop.run(self.aio.resume, timeout=timeout)
 
@@ -1780,38 +1814,38 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self,
         *,
         timeout: float | None = None,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Wait until the mission has been flown to its end; for a mission that ends with landing, until it has landed.
+        """Wait until the mission has been flown to its end; for one that ends with landing, until it has landed.
 
-        A :meth:`pause` from elsewhere in the program is waited through. Cancelled, the vehicle goes on.
+        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
 
         Args:
-            timeout: seconds until it is finished; None: as long as it takes.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            timeout: seconds to wait; None for no limit.
+            max_silence_s: fail after this many seconds without a heartbeat; None for no limit.
 
         Raises:
-            OperationRejected: it does not fly the mission any more: a pilot, a failsafe or another order has taken it
-                out of the mission's mode, or it disarmed on the way. ``reasons`` has what the vehicle said.
+            OperationRejected: it no longer flies the mission: a pilot, a failsafe or another order changed the mode, or
+                it disarmed on the way. ``reasons`` has what the vehicle reported.
             OperationTimeout: not finished in time.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
         self._loop.run(self.aio.wait_finished, timeout=timeout, max_silence_s=max_silence_s)
 
     @property
-    def explains_mode(self) -> bool:
-        """Whether the vehicle is in a mode in which its mission ends by itself: holding, returning or landing.
+    def has_ended(self) -> bool:
+        """True if the vehicle holds, returns or lands because its mission has ended.
 
-        That is so when the mission was ordered last, and is complete or at its last item; it is nobody else's doing.
+        This requires that the mission was the last order, and is complete or at its last item.
         """
-        return self.aio.explains_mode
+        return self.aio.has_ended
 
 
 class FenceControl(TwinOf["AsyncFenceControl"]):
-    """``await vehicle.fence.upload(Fence(polygons=[...]))``: where the vehicle may and may not be.
+    """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
-    Uploading does not switch it on for ArduPilot (:meth:`enable`, or the parameter FENCE_ENABLE); PX4 minds every fence
-    it holds, and does what GF_ACTION says.
+    For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
+    obeys its fence; GF_ACTION defines its reaction.
     """
 
     def upload(
@@ -1822,36 +1856,34 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         only_changes: bool = True,
         verify: bool = True,
         max_distance_m: float = MAX_DISTANCE_M,
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Have the vehicle hold this plan instead of the one it holds; an empty one clears it.
+        """Replace the plan on the vehicle by this one; an empty one clears it.
 
         Args:
-            plan: it is checked before anything is sent.
-            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or what the
-                vehicle has.
-            only_changes: when it is known what the vehicle holds, from an upload or a download and confirmed by the
-                vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
-            verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
-                as a file is always read back.
-            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
-                refused.
-            patience_s: give up after so many seconds without progress.
-            timeout: seconds for all of it.
-            on_progress: called with how far it is, in items, or in bytes of a file.
+            plan: checked before anything is sent.
+            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
+            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
+                nothing if it is equal, and only the items that differ if the vehicle supports that.
+            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+                read back.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites a mission and rally points one by one (a fence at the end), so that after a failure it
-        holds a part of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
+        a mixture of both: the error says so.
 
         Raises:
-            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
-            MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
-            MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, and holds something else.
-            NotSupported: ``"ftp"`` was asked for, and it has none.
+            InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
+            MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
+            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
+            VerificationFailed: it confirmed, but holds something else.
+            NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
@@ -1862,7 +1894,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             only_changes=only_changes,
             verify=verify,
             max_distance_m=max_distance_m,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1871,56 +1903,56 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         self,
         *,
         method: PlanMethod = "auto",
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Fence:
-        """Read what the vehicle holds; arguments as for :meth:`upload`.
+        """Read the plan on the vehicle; arguments as for :meth:`upload`.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing in the end; ``missing`` has them.
-            RemoteProtocolError: what it sent makes no sense.
+            MissionTimeout: items are missing; ``missing`` has them.
+            RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
             method=method,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def clear(self, *, patience_s: float = 10.0, timeout: float | None = None) -> None:
-        """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
+    def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
+        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it fell silent.
-            VerificationFailed: it confirmed, and still holds items.
+            MissionTimeout: it stopped answering.
+            VerificationFailed: it confirmed, but still holds items.
             OperationTimeout: not done within ``timeout``.
         """
-        self._loop.run(self.aio.clear, patience_s=patience_s, timeout=timeout)
+        self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def enable(self, on: bool = True) -> None:
-        """Have the vehicle mind its fence, or not (MAV_CMD_DO_FENCE_ENABLE), until it reboots.
+        """Enable or disable the fence (MAV_CMD_DO_FENCE_ENABLE) until the next reboot.
 
         See https://mavlink.io/en/messages/common.html#MAV_CMD_DO_FENCE_ENABLE.
 
         Raises:
-            CommandRejected: the vehicle refused; PX4 does not know the command.
+            CommandRejected: the vehicle refused; PX4 does not support the command.
             CommandTimeout: it did not answer.
         """
         self._loop.run(self.aio.enable, on)
 
 
 class RallyControl(TwinOf["AsyncRallyControl"]):
-    """``await vehicle.rally.upload(RallyPoints([...]))``: where the vehicle may return to instead of home.
+    """Rally points, alternatives to home for a return: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
-    PX4 calls them safe points, and returns to one of them when RTL_TYPE says so.
+    PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
     """
 
     def upload(
@@ -1931,36 +1963,34 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         only_changes: bool = True,
         verify: bool = True,
         max_distance_m: float = MAX_DISTANCE_M,
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Have the vehicle hold this plan instead of the one it holds; an empty one clears it.
+        """Replace the plan on the vehicle by this one; an empty one clears it.
 
         Args:
-            plan: it is checked before anything is sent.
-            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or what the
-                vehicle has.
-            only_changes: when it is known what the vehicle holds, from an upload or a download and confirmed by the
-                vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
-            verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
-                as a file is always read back.
-            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
-                refused.
-            patience_s: give up after so many seconds without progress.
-            timeout: seconds for all of it.
-            on_progress: called with how far it is, in items, or in bytes of a file.
+            plan: checked before anything is sent.
+            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
+            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
+                nothing if it is equal, and only the items that differ if the vehicle supports that.
+            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+                read back.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites a mission and rally points one by one (a fence at the end), so that after a failure it
-        holds a part of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
+        a mixture of both: the error says so.
 
         Raises:
-            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
-            MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
-            MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, and holds something else.
-            NotSupported: ``"ftp"`` was asked for, and it has none.
+            InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
+            MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
+            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
+            VerificationFailed: it confirmed, but holds something else.
+            NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
@@ -1971,7 +2001,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             only_changes=only_changes,
             verify=verify,
             max_distance_m=max_distance_m,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
@@ -1980,114 +2010,114 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         self,
         *,
         method: PlanMethod = "auto",
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> RallyPoints:
-        """Read what the vehicle holds; arguments as for :meth:`upload`.
+        """Read the plan on the vehicle; arguments as for :meth:`upload`.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing in the end; ``missing`` has them.
-            RemoteProtocolError: what it sent makes no sense.
+            MissionTimeout: items are missing; ``missing`` has them.
+            RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         return self._loop.run(
             self.aio.download,
             method=method,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def clear(self, *, patience_s: float = 10.0, timeout: float | None = None) -> None:
-        """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
+    def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
+        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it fell silent.
-            VerificationFailed: it confirmed, and still holds items.
+            MissionTimeout: it stopped answering.
+            VerificationFailed: it confirmed, but still holds items.
             OperationTimeout: not done within ``timeout``.
         """
-        self._loop.run(self.aio.clear, patience_s=patience_s, timeout=timeout)
+        self._loop.run(self.aio.clear, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
 class CameraBlock(BlockTwin["AsyncCameraBlock"]):
-    """Something that a camera does for the time of an ``async with`` block: it ends with it, whatever comes.
+    """An operation of a camera for the duration of an ``async with`` block.
 
-    The order to end leaves at once, also when the program is cancelled, and is sent again until it is answered. It
-    leaves with the vehicle's block, too, if that ends before. A newer order about the same is not undone by it.
+    The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
+    acknowledged. It is also sent when the block of the vehicle exits first. It does not undo a newer order.
     """
 
 
 class PhotoInterval(PhotoIntervalTwin):
-    """Pictures one after the other, for the time of an ``async with`` block; an iterator over them, in order.
+    """A series of photos for the duration of an ``async with`` block; an async iterator over its captures, in order.
 
-    Made by :meth:`Camera.photo_interval`. What was missed is asked for again; ``missed`` counts pictures of which the
-    camera could not tell any more (ArduPilot's and PX4's own know no more than the last one).
+    Returned by :meth:`Camera.photo_interval`. Missed captures are requested again; ``missed`` counts those that the
+    camera did not send (ArduPilot and PX4 keep only the last one of their own cameras).
     """
 
     @property
     def missed(self) -> int:
-        """How many pictures were taken of which nothing more is known."""
+        """Number of pictures that were taken, but whose captures are not available."""
         return self.aio.missed
 
 
 class Camera(TwinOf["AsyncCamera"]):
-    """One camera: pictures, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
+    """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first one that is heard, ``vehicle.camera_at(number)`` any: one with a component id of its
-    own (100 to 105), or behind the autopilot (1 to 6), which are ArduPilot's own drivers and PX4's trigger. What a
-    camera says that it cannot do is refused before anything is sent. Cells are asked for while somebody looks at them.
+    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any: one with its own component id (100 to
+    105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside its
+    reported capabilities are refused before anything is sent. Cells are polled only while your program uses them.
     """
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), which a camera tells when it changes; asked for
-        every 5 s while somebody looks at this cell, as the next two.
+        """``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your
+        program uses this cell, like the next two.
         """
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
     def zoom_percent(self) -> StateCell[float | None]:
-        """0 (widest) to 100; None while the camera does not know."""
+        """0 (widest) to 100; None if the camera does not know it."""
         return StateCell(self._loop, self.aio.zoom_percent)
 
     @cached_property
     def focus_percent(self) -> StateCell[float | None]:
-        """0 (nearest) to 100; None while the camera does not know."""
+        """0 (nearest) to 100; None if the camera does not know it."""
         return StateCell(self._loop, self.aio.focus_percent)
 
     @cached_property
-    def storage(self) -> StateCell[tuple[Storage, ...]]:
-        """Its storage media by their numbers; asked for every 5 s while somebody looks at this cell."""
+    def storage(self) -> StateCell[tuple[CameraStorage, ...]]:
+        """Storage media by number; polled every 5 s while your program uses this cell."""
         return StateCell(self._loop, self.aio.storage)
 
     def set_mode(self, mode: ModeName, *, timeout: float = 5.0) -> None:
-        """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera tells that it is in it.
+        """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera reports the new mode.
 
-        A camera that tells no mode (CAMERA_SETTINGS) is believed when it accepts.
+        If the camera does not report its mode (CAMERA_SETTINGS), returns when it has accepted.
 
         Args:
             mode: ``"photo"``, ``"video"`` or ``"survey"``.
-            timeout: seconds until it must be told.
+            timeout: seconds to wait for the report.
 
         Raises:
             NotSupported: the camera has no modes. Nothing was sent.
-            CommandRejected: the camera refused: it is busy, or does not know this one.
+            CommandRejected: the camera refused: it is busy, or does not support this mode.
             CommandTimeout: it did not answer.
-            OperationTimeout: it accepted, and tells another mode; or no camera was heard.
+            OperationTimeout: it accepted, but reports another mode; or no camera was found.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
-    def load_storage(self) -> tuple[Storage, ...]:
-        """Ask for the storage media (STORAGE_INFORMATION).
+    def load_storage(self) -> tuple[CameraStorage, ...]:
+        """Request the storage media (STORAGE_INFORMATION).
 
         Raises:
-            OperationTimeout: none was told of, or no camera was heard.
+            OperationTimeout: the camera reported no storage, or no camera was found.
         """
         return self._loop.run(self.aio.load_storage)
 
@@ -2095,61 +2125,61 @@ class Camera(TwinOf["AsyncCamera"]):
         self,
         number: int = 1,
         *,
-        timeout: float = FORMATTING_S,
+        timeout: float = FORMAT_TIMEOUT_S,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> None:
-        """Format a storage medium, and clear the log of pictures (MAV_CMD_STORAGE_FORMAT): what is on it is lost.
+        """Format a storage medium (MAV_CMD_STORAGE_FORMAT): all data on it is lost. Also clears the log of captures.
 
         Args:
-            number: of the medium, 1 to 255.
-            timeout: seconds to wait after the order, and after each sign of progress.
+            number: number of the medium, 1 to 255.
+            timeout: seconds to wait for the answer, and after each progress report.
             on_progress: called with 0–100, or None.
 
         Raises:
             InvalidArgument: ``number`` is out of range. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or there is no such medium.
             CommandTimeout: it did not answer; it may be formatting.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.format_storage, number, timeout=timeout, on_progress=on_progress)
 
     def reset_settings(self) -> None:
-        """Set everything as it came from the factory (MAV_CMD_RESET_CAMERA_SETTINGS).
+        """Restore the factory settings (MAV_CMD_RESET_CAMERA_SETTINGS).
 
         Raises:
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.reset_settings)
 
     @cached_property
     def tracking(self) -> StateCell[TrackingStatus]:
-        """What it tracks in its picture; asked for at a rate from :meth:`track_point` or :meth:`track_rectangle` on."""
+        """The tracked point or rectangle; requested at a rate by :meth:`track_point` and :meth:`track_rectangle`."""
         return StateCell(self._loop, self.aio.tracking)
 
     @cached_property
     def tracked_place(self) -> StateCell[TrackedPlace]:
-        """Where on earth that is, of a camera that can tell; asked for in the same way."""
+        """Position of the tracked object on earth, if the camera reports it; requested in the same way."""
         return StateCell(self._loop, self.aio.tracked_place)
 
     def track_point(self, x: float, y: float, *, radius: float = 0.0, status_hz: float = 5.0) -> None:
-        """Track what is at a point of the picture (MAV_CMD_CAMERA_TRACK_POINT), until :meth:`stop_tracking`.
+        """Track the object at a point of the image (MAV_CMD_CAMERA_TRACK_POINT) until :meth:`stop_tracking`.
 
-        Returns when the camera has accepted; ``camera.tracking`` tells whether it holds it.
+        Returns when the camera has accepted; ``camera.tracking`` reports whether it has found the object.
 
         Args:
             x: 0 (left) to 1 (right).
             y: 0 (top) to 1 (bottom).
-            radius: part of the picture's width, 0 (one pixel) to 1.
-            status_hz: how often it shall tell, above 0 to 50.
+            radius: part of the image width, 0 (one pixel) to 1.
+            status_hz: rate of ``camera.tracking``, above 0 to 50.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             NotSupported: the camera cannot track a point. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_point, x, y, radius=radius, status_hz=status_hz)
 
@@ -2162,39 +2192,39 @@ class Camera(TwinOf["AsyncCamera"]):
         *,
         status_hz: float = 5.0,
     ) -> None:
-        """Track what is in a rectangle of the picture (MAV_CMD_CAMERA_TRACK_RECTANGLE), until :meth:`stop_tracking`.
+        """Track the object in a rectangle of the image (MAV_CMD_CAMERA_TRACK_RECTANGLE) until :meth:`stop_tracking`.
 
         Args:
             left: 0 to 1.
             top: 0 to 1.
             right: 0 to 1, right of ``left``.
             bottom: 0 to 1, below ``top``.
-            status_hz: how often it shall tell, above 0 to 50.
+            status_hz: rate of ``camera.tracking``, above 0 to 50.
 
         Raises:
-            InvalidArgument: an argument is out of range, or the rectangle is none. Nothing was sent.
+            InvalidArgument: an argument is out of range, or the rectangle is empty. Nothing was sent.
             NotSupported: the camera cannot track a rectangle. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.track_rectangle, left, top, right, bottom, status_hz=status_hz)
 
     def stop_tracking(self) -> None:
-        """Track nothing any more (MAV_CMD_CAMERA_STOP_TRACKING).
+        """Stop tracking (MAV_CMD_CAMERA_STOP_TRACKING).
 
         Raises:
             NotSupported: the camera cannot track. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.stop_tracking)
 
     def zoom_step(self, steps: int) -> None:
-        """Zoom in by so many steps of the camera's own, out if negative (MAV_CMD_SET_CAMERA_ZOOM).
+        """Zoom in by a number of the camera's own steps, out if negative (MAV_CMD_SET_CAMERA_ZOOM).
 
-        Not sent again without an answer: a step would be made twice.
+        Not retried if unanswered, because the step could be made twice.
 
         Args:
             steps: −100 to 100.
@@ -2204,25 +2234,25 @@ class Camera(TwinOf["AsyncCamera"]):
             NotSupported: the camera has no zoom. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer; it may have zoomed.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.zoom_step, steps)
 
     def zoom_to(self, percent: float) -> None:
-        """Zoom to a part of the range: 0 (widest) to 100 %; errors are those of :meth:`zoom_step`."""
+        """Zoom to a part of the range: 0 (widest) to 100 %; errors as for :meth:`zoom_step`."""
         self._loop.run(self.aio.zoom_to, percent)
 
     def zoom_to_focal_length(self, millimetres: float) -> None:
-        """Zoom to a focal length, above 0 to 10,000 mm; errors are those of :meth:`zoom_step`."""
+        """Zoom to a focal length, above 0 to 10,000 mm; errors as for :meth:`zoom_step`."""
         self._loop.run(self.aio.zoom_to_focal_length, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for as long as an ``async with`` block lasts; it stops with it, also under cancellation.
+        """Zoom for the duration of an ``async with`` block; the end of the block stops it, also under cancellation.
 
         Entering raises what :meth:`zoom_step` does.
 
         Args:
-            speed: −1 (out) to 1 (in); most cameras know these two.
+            speed: −1 (out) to 1 (in); many cameras support only these two.
 
         Raises:
             InvalidArgument: ``speed`` is out of range. Nothing was sent.
@@ -2230,9 +2260,9 @@ class Camera(TwinOf["AsyncCamera"]):
         return CameraBlock(self._loop, self._loop.call(self.aio.zooming, speed))
 
     def focus_step(self, steps: int) -> None:
-        """Focus farther by so many steps of the camera's own, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
+        """Focus farther by a number of the camera's own steps, nearer if negative (MAV_CMD_SET_CAMERA_FOCUS).
 
-        Not sent again without an answer: a step would be made twice.
+        Not retried if unanswered, because the step could be made twice.
 
         Args:
             steps: −100 to 100.
@@ -2242,36 +2272,36 @@ class Camera(TwinOf["AsyncCamera"]):
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer; it may have moved.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.focus_step, steps)
 
     def focus_to(self, percent: float) -> None:
-        """Focus to a part of the range: 0 (nearest) to 100 %; errors are those of :meth:`focus_step`."""
+        """Focus to a part of the range: 0 (nearest) to 100 %; errors as for :meth:`focus_step`."""
         self._loop.run(self.aio.focus_to, percent)
 
     def focus_at(self, metres: float) -> None:
-        """Focus at a distance, above 0 to 100,000 m; errors are those of :meth:`focus_step`."""
+        """Focus at a distance, above 0 to 100,000 m; errors as for :meth:`focus_step`."""
         self._loop.run(self.aio.focus_at, metres)
 
     def auto_focus(self, kind: AutoFocus = "auto") -> None:
-        """Have the camera focus by itself: ``"auto"`` as it likes, ``"single"`` once, ``"continuous"`` from now on.
+        """Start the camera's auto focus: ``"auto"`` by its own rules, ``"single"`` once, ``"continuous"`` from now on.
 
         Raises:
             NotSupported: the camera cannot be focused. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.auto_focus, kind)
 
     def focusing(self, speed: float = 1.0) -> CameraBlock:
-        """Move the focus for as long as an ``async with`` block lasts; it stops with it, also under cancellation.
+        """Move the focus for the duration of an ``async with`` block; its end stops it, also under cancellation.
 
         Entering raises what :meth:`focus_step` does.
 
         Args:
-            speed: −1 (nearer) to 1 (farther); most cameras know these two.
+            speed: −1 (nearer) to 1 (farther); many cameras support only these two.
 
         Raises:
             InvalidArgument: ``speed`` is out of range. Nothing was sent.
@@ -2280,52 +2310,52 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def status(self) -> StateCell[CameraStatus]:
-        """What it does: recording and for how long, pictures taken, storage left (CAMERA_CAPTURE_STATUS). It is asked
-        every 2 s while somebody looks at this cell, as far as it does not tell by itself.
+        """Recording and its duration, pictures taken, free storage (CAMERA_CAPTURE_STATUS). Polled every 2 s while your
+        program uses this cell, unless the camera sends it by itself.
         """
         return StateCell(self._loop, self.aio.status)
 
     @cached_property
-    def streams(self) -> StateCell[tuple[VideoStream, ...]]:
-        """Its video streams by their numbers; asked for every 5 s while somebody looks at this cell."""
+    def streams(self) -> StateCell[tuple[CameraStream, ...]]:
+        """Video streams by number; polled every 5 s while your program uses this cell."""
         return StateCell(self._loop, self.aio.streams)
 
     @cached_property
     def thermal_range(self) -> StateCell[ThermalRange]:
-        """The coldest and hottest point of the last thermal picture; asked for once a second while somebody looks."""
+        """Coldest and hottest point of the thermal image; polled every second while your program uses this cell."""
         return StateCell(self._loop, self.aio.thermal_range)
 
     def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
-        """Begin to record (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera says that it records.
+        """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        A camera that does not tell what it does (such as those behind an autopilot) is believed when it accepts.
+        If the camera does not report its status (e.g. one attached to an autopilot), returns when it has accepted.
 
         Args:
-            status_hz: how often it tells its status meanwhile, 0 to 10.
-            timeout: seconds until it must be recording.
+            status_hz: rate at which the camera sends its status while recording, 0 to 10.
+            timeout: seconds to wait until it records.
 
         Raises:
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: it did not answer; it may be recording.
-            OperationTimeout: it accepted and does not record, or no camera was heard.
+            OperationTimeout: it accepted but does not record, or no camera was found.
         """
         self._loop.run(self.aio.start_video, status_hz=status_hz, timeout=timeout)
 
     def stop_video(self, *, timeout: float = 5.0) -> None:
-        """End the recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera says that it has.
+        """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
 
         Raises:
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: it accepted and goes on recording, or no camera was heard.
+            OperationTimeout: it accepted but still records, or no camera was found.
         """
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the time of an ``async with`` block; it ends with it, also under cancellation.
+        """Record for the duration of an ``async with`` block; its end stops recording, also under cancellation.
 
         Entering raises what :meth:`start_video` does.
 
@@ -2334,91 +2364,110 @@ class Camera(TwinOf["AsyncCamera"]):
         """
         return CameraBlock(self._loop, self._loop.call(self.aio.video, status_hz=status_hz))
 
-    def load_streams(self) -> tuple[VideoStream, ...]:
-        """Ask for the video streams (VIDEO_STREAM_INFORMATION), each by its number where they do not all come at once.
+    def load_streams(self) -> tuple[CameraStream, ...]:
+        """Request the video streams (VIDEO_STREAM_INFORMATION), one by one if the camera does not send all at once.
 
         Raises:
-            NotSupported: the camera has none. Nothing was sent.
-            OperationTimeout: they did not come, or no camera was heard.
+            NotSupported: the camera has no video streams. Nothing was sent.
+            OperationTimeout: not all of them arrived, or no camera was found.
         """
         return self._loop.run(self.aio.load_streams)
 
     def start_streaming(self, stream: int = 0) -> None:
-        """Have a stream sent (MAV_CMD_VIDEO_START_STREAMING).
+        """Start a video stream (MAV_CMD_VIDEO_START_STREAMING).
 
         Args:
-            stream: its number, 0 (all of them) to 255.
+            stream: number of the stream, 1 to 255, or 0 for all.
 
         Raises:
-            InvalidArgument: there can be no such stream. Nothing was sent.
+            InvalidArgument: the number is out of range. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
-            CommandRejected: the camera refused; there is no such stream.
+            CommandRejected: the camera refused, or has no such stream.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.start_streaming, stream)
 
     def stop_streaming(self, stream: int = 0) -> None:
-        """Have a stream end (MAV_CMD_VIDEO_STOP_STREAMING); errors are those of :meth:`start_streaming`."""
+        """Stop a video stream (MAV_CMD_VIDEO_STOP_STREAMING); errors as for :meth:`start_streaming`."""
         self._loop.run(self.aio.stop_streaming, stream)
 
     def select_stream(self, stream: int) -> None:
-        """Have this stream sent, and the others that run ended; errors are those of :meth:`start_streaming`.
+        """Start one stream and stop the others; errors as for :meth:`start_streaming`.
 
         Args:
-            stream: its number, 1 to 255.
+            stream: number of the stream, 1 to 255.
         """
         self._loop.run(self.aio.select_stream, stream)
 
     def select_source(self, primary: SourceName, secondary: SourceName = "default") -> None:
-        """Choose the sensor that is shown (MAV_CMD_SET_CAMERA_SOURCE), and one that is shown within its picture.
+        """Select the sensor to show (MAV_CMD_SET_CAMERA_SOURCE), and one to show as picture-in-picture.
 
         Args:
             primary: ``"default"``, ``"rgb"``, ``"ir"`` or ``"ndvi"``.
-            secondary: the same; ``"default"``: no picture within the picture.
+            secondary: the same; ``"default"`` shows no second picture.
 
         Raises:
-            CommandRejected: the camera refused; it has no such sensor.
+            CommandRejected: the camera refused, or has no such sensor.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
         self._loop.run(self.aio.select_source, primary, secondary)
 
     @cached_property
     def capture(self) -> StateCell[Capture]:
-        """The latest picture that was heard of."""
+        """The latest capture."""
         return StateCell(self._loop, self.aio.capture)
 
-    def take_photo(self, *, timeout: float = 10.0) -> Capture:
-        """Take one picture; returns when the camera has told of it.
+    @cached_property
+    def information(self) -> StateCell[CameraInformation]:
+        """Vendor, model, capabilities (CAMERA_INFORMATION); the first call requests it."""
+        return StateCell(self._loop, self.aio.information)
 
-        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), MAV_CMD_DO_DIGICAM_CONTROL to
-        PX4's trigger and to whoever knows nothing better. The order is never sent again blindly: only when the camera,
-        asked after it, says that it takes no picture and has taken none. CAMERA_IMAGE_CAPTURED that was lost is asked
-        for. Cancelled, it may still be taken.
+    @property
+    def number(self) -> int | None:
+        """1 to 6 if attached to the autopilot, otherwise the component id; None until a camera is found."""
+        return self.aio.number
+
+    def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
+        """Wait until the camera is found and has identified itself; other calls do so by themselves.
+
+        Raises:
+            CommandRejected: the camera refused to identify itself.
+            OperationTimeout: no camera was found, or it did not identify itself: PX4's trigger never does.
+        """
+        return self._loop.run(self.aio.wait_found, timeout=timeout)
+
+    def take_photo(self, *, timeout: float = 10.0) -> Capture:
+        """Take one photo; returns when the camera has reported it.
+
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL to
+        PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera then
+        reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If you
+        cancel the call, the camera may still take the picture.
 
         Args:
-            timeout: seconds until it must have been told.
+            timeout: seconds to wait for the report.
 
         Raises:
             NotSupported: the camera takes no pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: it did not answer; it may have taken the picture.
-            OperationRejected: it could not take the picture.
-            OperationTimeout: it told of no picture, or no camera was heard.
+            OperationRejected: it failed to take the picture.
+            OperationTimeout: it reported no picture, or no camera was found.
         """
         return self._loop.run(self.aio.take_photo, timeout=timeout)
 
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
-        """A picture every so many seconds for the time of an ``async with`` block, which gives them in order.
+        """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
-        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …``. Those of which
-        the message was lost are asked for again. MAV_CMD_IMAGE_STOP_CAPTURE at the end of the block, also when it is
-        cancelled; PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …`` gives the
+        captures in order; lost ones are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block,
+        also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 
         Args:
-            seconds: from one picture to the next, above 0 to 3600.
-            count: 0 (until the block ends) to 32767; after so many the iterator ends.
+            seconds: time between two pictures, above 0 to 3600.
+            count: number of pictures, after which the iterator ends: 1 to 32767, or 0 for no limit.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -2426,85 +2475,65 @@ class Camera(TwinOf["AsyncCamera"]):
         return PhotoInterval(self._loop, self._loop.call(self.aio.photo_interval, seconds, count))
 
     def captures(self) -> list[Capture]:
-        """The pictures that were heard of, by their index; at most 20,000, the newest."""
+        """Return the captures received so far, ordered by index: at most the newest 20,000."""
         return self._loop.call(self.aio.captures)
 
     def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """All pictures in the camera's log, also those that were taken before: what is not known yet is asked for.
+        """Return all captures in the camera's log, including earlier ones, after requesting the missing ones.
 
-        The newest 20,000 at most. A camera behind the autopilot tells of its newest one only. Where three on
-        end are not told, it ends.
+        At most the newest 20,000; of a camera attached to the autopilot only the newest one. Stops after three
+        successive captures that the camera does not send.
 
         Args:
-            timeout: seconds until all must have come; :meth:`captures` has those that came in time.
+            timeout: seconds to wait for all of them; :meth:`captures` has those that arrived in time.
 
         Raises:
-            OperationTimeout: the camera does not say how many there are, or what it is, or it took too long.
+            OperationTimeout: the camera did not report its count or identify itself, or it took too long.
         """
         return self._loop.run(self.aio.load_captures, timeout=timeout)
 
     def read_picture(self, capture: Capture) -> bytes:
-        """The file of a picture, by MAVFTP: for a ``file_url`` that begins with ``mftp:`` or ``/``, at most 16 MB.
+        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
 
         Raises:
-            NotSupported: its URL is another one, or it has none. Nothing was sent.
+            NotSupported: the capture has another URL, or none. Nothing was sent.
             FileError: the camera has no such file.
-            OperationTimeout: nothing came any more, or no camera was heard.
+            OperationTimeout: the transfer stopped, or no camera was found.
         """
         return self._loop.run(self.aio.read_picture, capture)
 
-    @cached_property
-    def information(self) -> StateCell[CameraInformation]:
-        """What it is (CAMERA_INFORMATION): asked for once, by the first call."""
-        return StateCell(self._loop, self.aio.information)
-
-    @property
-    def number(self) -> int | None:
-        """1 to 6 behind the autopilot, otherwise its component id; None before the first camera was heard."""
-        return self.aio.number
-
-    def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is heard and says what it is; other calls do so by themselves.
-
-        Raises:
-            CommandRejected: it does not say what it is.
-            OperationTimeout: none was heard, or it does not say what it is: PX4's trigger never does.
-        """
-        return self._loop.run(self.aio.wait_found, timeout=timeout)
-
 
 class Settings(TwinOf["AsyncSettings"]):
-    """The settings of one component. Coroutines talk to it; ``table`` is what is known, and never does.
+    """The settings of one component. Coroutines exchange messages with it; ``table`` is the local copy.
 
-    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component keeps the table up to date, also when somebody else has
-    changed something, and is told as :class:`aerokit.events.SettingChanged`. After a reboot of the vehicle nothing is
-    known until it is read anew.
+    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations,
+    and is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
 
-    A camera's settings are explained by its definition file: :meth:`fetch_definition` has it from the camera,
-    :meth:`load` takes one that is here. From then on options go by their names, and what is out of range or excluded
-    by other settings is refused before anything is sent. Without it each value is sent as it is.
+    A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load` from
+    a local file. From then on you can use the names of options, and values that are out of range or excluded by other
+    settings are refused before anything is sent. Without it, values are sent unchanged.
 
-    All methods take ``patience_s`` (give up after so many seconds without anything new) and ``timeout`` (for all of
-    it; then OperationTimeout), if they talk to the component. Each can be cancelled at any moment.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
+    total; then OperationTimeout), if they send anything. You can cancel any call.
     """
 
     @property
     def table(self) -> Mapping[str, Setting]:
-        """What is known now, by name; empty before anything was read, and after a reboot."""
+        """Known settings by name; empty before the first read, and after a reboot."""
         return self.aio.table
 
     @property
     def is_complete(self) -> bool:
-        """Whether the whole list was downloaded since the vehicle started."""
+        """True if the whole list was downloaded since the vehicle started."""
         return self.aio.is_complete
 
     def known(self, name: str) -> Setting | None:
-        """What was told last of a setting; None when nothing was."""
+        """Return the last known value of a setting; None if unknown."""
         return self.aio.known(name)
 
     @property
     def definition(self) -> CameraDefinition | None:
-        """What the camera's file says of its settings, once it is here."""
+        """The camera definition, once it is loaded."""
         return self.aio.definition
 
     def load(
@@ -2513,14 +2542,14 @@ class Settings(TwinOf["AsyncSettings"]):
         *,
         locale: str | None = None,
     ) -> CameraDefinition:
-        """Take a definition, or read it from a file (``.xml`` or ``.xml.xz``).
+        """Use a camera definition, or read it from a file (``.xml`` or ``.xml.xz``).
 
         Args:
-            definition: made by :func:`aerokit.parameters.parse_definition`, or the path of a file.
-            locale: language of descriptions and of the names of options, ``"de"`` or ``"de_DE"``, if the file has it.
+            definition: result of :func:`aerokit.parameters.parse_definition`, or the path of a file.
+            locale: language of descriptions and option names, ``"de"`` or ``"de_DE"``, if the file has it.
 
         Raises:
-            FileFormatError: the file is none, or has more than 16 MB. What was there before stays.
+            FileFormatError: the file is invalid, or has more than 16 MB. The previous definition stays.
         """
         return self._loop.call(self.aio.load, definition, locale=locale)
 
@@ -2529,122 +2558,134 @@ class Settings(TwinOf["AsyncSettings"]):
         uri: str | None = None,
         *,
         locale: str | None = None,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> CameraDefinition:
-        """Fetch the camera's own definition file and take it, as :meth:`load` does.
+        """Fetch the definition file that the camera names, and use it as :meth:`load` does.
 
         Args:
-            uri: where it is: ``mftp://`` is MAVFTP, ``mftp://[;comp=1]/…`` that of another component; ``http://`` and
-                ``https://`` are fetched from the web, wherever that is. By default what CAMERA_INFORMATION says.
+            uri: address of the file: ``mftp://`` is MAVFTP, ``mftp://[;comp=1]/…`` on another component; ``http://``
+                and ``https://`` are fetched from the web. The default is the address in CAMERA_INFORMATION.
             locale: as for :meth:`load`.
-            patience_s: give up after so many seconds without anything new.
-            timeout: seconds for all of it; from the web it takes a minute at most.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total; at most one minute from the web.
 
         Raises:
             NotSupported: the camera names no definition file.
-            CommandRejected, OperationTimeout: it did not tell what it is.
-            InvalidArgument: an address of another kind.
-            FileFormatError: what came is none, or has more than 16 MB.
+            CommandRejected, OperationTimeout: it did not send CAMERA_INFORMATION.
+            InvalidArgument: the address has another scheme.
+            FileFormatError: the file is invalid, or has more than 16 MB.
             FileError, FileTimeout, RemoteProtocolError: as for :meth:`aerokit.vehicle.files.files.Files.read`.
-            OperationRejected: the web server does not give it.
+            OperationRejected: the web server failed.
         """
         return self._loop.run(
             self.aio.fetch_definition,
             uri,
             locale=locale,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """The options that a setting has now, name → value, as the other settings allow it by what is known of them.
+        """Return the options of a setting, name → value, as far as the known other settings allow them.
 
-        Empty where any value in its range may be set, and without a definition.
+        Empty without a definition, and for settings without options.
         """
         return self._loop.call(self.aio.options, name)
 
     def excluded_by(self, name: str) -> tuple[str, ...]:
-        """What makes a setting mean nothing now, by what is known of the others: ``("CAM_EXPMODE = Auto",)``."""
+        """Return the settings that make a setting ineffective now, e.g. ``("CAM_EXPMODE = Auto",)``."""
         return self._loop.call(self.aio.excluded_by, name)
 
     def download(
         self,
         *,
         refresh: bool = False,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> Mapping[str, Setting]:
-        """Return all settings by name, in the component's order; at once when they were downloaded before.
+        """Return all settings by name, in the component's order; immediately if they were downloaded before.
 
         Raises:
-            ParameterTimeout: the list did not come whole, or the component has none. What did come is in ``table``.
+            ParameterTimeout: the list is incomplete, or the component has none; ``table`` has what has arrived.
         """
         return self._loop.run(
             self.aio.download,
             refresh=refresh,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             timeout=timeout,
             on_progress=on_progress,
         )
 
-    def get(self, name: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> SettingValue:
-        """Ask the component for one value; the rest is as for :meth:`read`."""
-        return self._loop.run(self.aio.get, name, patience_s=patience_s, timeout=timeout)
+    def get(
+        self,
+        name: str,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> SettingValue:
+        """Request one value; for arguments and errors see :meth:`read`."""
+        return self._loop.run(self.aio.get, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
-    def read(self, name: str, *, patience_s: float = PATIENCE_S, timeout: float | None = None) -> Setting:
-        """Ask the component for one setting; ``table[name]`` is what is known without asking.
+    def read(
+        self,
+        name: str,
+        *,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
+        timeout: float | None = None,
+    ) -> Setting:
+        """Request one setting from the component; ``table[name]`` has the local copy.
 
         Raises:
-            InvalidArgument: the name is none, or longer than 16 characters.
-            ParameterRejected: the component answers for other settings, and not for this one.
-            ParameterTimeout: no answer.
+            InvalidArgument: the name is empty, or longer than 16 characters.
+            ParameterRejected: the component answers for other settings, but not for this one.
+            ParameterTimeout: there was no answer.
         """
-        return self._loop.run(self.aio.read, name, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.read, name, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def set(
         self,
         name: str,
         value: float | str | bytes,
         *,
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
     ) -> Setting:
-        """Set one setting, and return what the component says it is then; it may have taken another value.
+        """Set one setting; return it as confirmed by the component, which may have set another value.
 
-        With a definition ``value`` may be the name of an option, and settings that may change with this one are read
-        again before it returns. What decides on this setting and is not known yet is read before.
+        With a definition, ``value`` may be the name of an option; settings that this one may change are read again
+        afterwards, and unknown settings that restrict it are read before.
 
         Raises:
-            InvalidArgument: a name or value that cannot be; with a definition: an option or a value that is not
-                allowed, a setting that can only be read or is excluded now. It was not set.
+            InvalidArgument: an invalid name or value; with a definition: an option or value that is not allowed, or a
+                setting that is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
-            ParameterTimeout: not confirmed. It may have been set all the same.
+            ParameterTimeout: not confirmed, but it may have been set.
         """
-        return self._loop.run(self.aio.set, name, value, patience_s=patience_s, timeout=timeout)
+        return self._loop.run(self.aio.set, name, value, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
 
 class Component(TwinOf["AsyncComponent"]):
     """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
 
-    Made by :meth:`aerokit.Vehicle.component`. Commands, messages with rates, parameters and files are those of this
-    component, by the code that the autopilot's go through. https://mavlink.io/en/services/component_information.html
+    Returned by :meth:`aerokit.Vehicle.component`. It has its own commands, messages with rates, parameters and files,
+    which work like those of the autopilot. https://mavlink.io/en/services/component_information.html
     """
 
     @property
     def system_id(self) -> int:
-        """The vehicle's system id."""
+        """System id of the vehicle."""
         return self.aio.system_id
 
     @property
     def component_id(self) -> int:
-        """Its MAV_COMPONENT id, 1 to 255."""
+        """MAV_COMPONENT id, 1 to 255."""
         return self.aio.component_id
 
     @property
     def kind(self) -> str:
-        """What its HEARTBEAT says it is: ``"camera"``, ``"gimbal"``, ``"onboard_controller"`` … or ``"unknown"``."""
+        """Kind according to HEARTBEAT: ``"camera"``, ``"gimbal"``, ``"onboard_controller"`` … or ``"unknown"``."""
         return self.aio.kind
 
     @property
@@ -2654,47 +2695,47 @@ class Component(TwinOf["AsyncComponent"]):
 
     @property
     def is_silent(self) -> bool:
-        """Whether it has not been heard for more than 3.5 seconds, or never."""
+        """True if its last HEARTBEAT is older than 3.5 seconds, or none was received."""
         return self.aio.is_silent
 
     def information(self, *, timeout: float = 3.0) -> ComponentInformation:
-        """Ask what it is and what it can do (COMPONENT_INFORMATION_BASIC).
+        """Request its identity and capabilities (COMPONENT_INFORMATION_BASIC).
 
         Raises:
-            CommandRejected: it does not know the question.
+            CommandRejected: it does not support the message.
             OperationTimeout: it did not answer within ``timeout`` seconds.
         """
         return self._loop.run(self.aio.information, timeout=timeout)
 
     def metadata(self, kind: MetadataKind = "general", *, timeout: float = 3.0) -> dict[str, Any]:
-        """What it tells of itself in a file (COMPONENT_METADATA, read by MAVFTP), as its JSON has it.
+        """Read one of its metadata files (COMPONENT_METADATA) by MAVFTP and return the JSON object.
 
         Args:
             kind: ``"general"`` lists the others: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
                 ``"actuators"``. PX4 has general, parameter, events and actuators.
-            timeout: seconds until it must have said where the files are.
+            timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: it has no such file, or not on the vehicle.
+            NotSupported: it has no such file, or the file is not on the vehicle.
             FileFormatError: the file is damaged.
             FileError, FileTimeout: it cannot be read.
         """
         return self._loop.run(self.aio.metadata, kind, timeout=timeout)
 
-    def fetch(self, uri: str, *, patience_s: float = 10.0) -> bytes:
-        """The content of a file that a component names by its address, at most 16 MB.
+    def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
+        """Return the content of a file by the address that a component has reported, at most 16 MB.
 
         Args:
-            uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another one of the vehicle;
+            uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
                 ``http://`` and ``https://`` are fetched from the web.
-            patience_s: give up when nothing has come for so many seconds.
+            idle_timeout_s: fail after this many seconds without progress.
 
         Raises:
-            InvalidArgument: the address is another one.
+            InvalidArgument: the address has another scheme.
             FileFormatError: the file has more than 16 MB.
-            FileError, FileTimeout, OperationRejected: it was not given.
+            FileError, FileTimeout, OperationRejected: the file could not be read.
         """
-        return self._loop.run(self.aio.fetch, uri, patience_s=patience_s)
+        return self._loop.run(self.aio.fetch, uri, idle_timeout_s=idle_timeout_s)
 
     def command(
         self,
@@ -2705,7 +2746,7 @@ class Component(TwinOf["AsyncComponent"]):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send it any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
         return self._loop.run(
             self.aio.command,
             command,
@@ -2723,17 +2764,17 @@ class Component(TwinOf["AsyncComponent"]):
         timeout: float = 3.0,
         where: Callable[[MessageT], bool] | None = None,
     ) -> MessageT:
-        """Ask for one message (MAV_CMD_REQUEST_MESSAGE with these params behind the id) and return it.
+        """Request one message (MAV_CMD_REQUEST_MESSAGE) and return it.
 
         Args:
-            message_type: its class.
-            params: param2 to param6, where the message has several: which camera, stream, card …
-            timeout: seconds until it must have come; it is asked for up to three times.
-            where: which of several is meant; called with each that comes.
+            message_type: class of the message.
+            params: param2 to param6, e.g. the number of a camera, stream or storage.
+            timeout: seconds to wait; it is requested up to three times.
+            where: predicate to select one of several messages.
 
         Raises:
             CommandRejected: it refused.
-            OperationTimeout: no such message came.
+            OperationTimeout: the message did not arrive.
         """
         return self._loop.run(self.aio.request, message_type, *params, timeout=timeout, where=where)
 
@@ -2744,7 +2785,7 @@ class Component(TwinOf["AsyncComponent"]):
         overflow: Overflow = "drop_oldest",
         rate_hz: float | None = None,
     ) -> Subscription[ItemT]:
-        """What this component says, and events that name it; it is asked for ``rate_hz``.
+        """Subscribe to messages of this component and events about it, requested at ``rate_hz``.
 
         As :meth:`aerokit.Vehicle.subscribe`.
         """
@@ -2760,50 +2801,51 @@ class Component(TwinOf["AsyncComponent"]):
         )
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Its latest message of a kind, in a cell; as :meth:`aerokit.Vehicle.message`."""
+        """Return a cell with its latest message of a type; as :meth:`aerokit.Vehicle.message`."""
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
-        """Have it send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
+        """Request ``message_type`` at ``rate_hz`` or faster for the duration of the ``with`` block."""
         return self._block(self.aio.rate(message_type, rate_hz))
 
     @cached_property
     def files(self) -> Files:
-        """The files on it, by MAVFTP."""
+        """Its files, by MAVFTP."""
         return Files(self._loop, self._loop.call(lambda: self.aio.files))
 
     @cached_property
     def parameters(self) -> Parameters:
-        """Its parameters (PARAM_VALUE), as those of the autopilot."""
+        """Its parameters (PARAM_VALUE)."""
         return Parameters(self._loop, self._loop.call(lambda: self.aio.parameters))
 
     @cached_property
     def settings(self) -> Settings:
-        """Its settings (PARAM_EXT), texts among them; those of a camera with what its definition file says of them."""
+        """Its settings (PARAM_EXT), which may be texts; for cameras explained by the camera definition file."""
         return Settings(self._loop, self._loop.call(lambda: self.aio.settings))
 
 
 class Vehicle(VehicleTwin):
-    """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
+    """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
-    Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,
-    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name. Other threads may read the
-    cells; the parts (``mission``, ``parameters`` …) are made when they are first used, on the loop's thread.
+    Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
+    ``.fresh(within=1)``, ``await vehicle.mode.wait_until(...)``) in SI units and degrees, with the unit in the name.
+    Other threads may read the cells. Sub-objects (``mission``, ``parameters`` …) are created on first use, in the
+    event loop's thread.
     """
 
     @cached_property
     def mode(self) -> StateCell[Mode]:
-        """Flight mode by HEARTBEAT; ``vehicle.mode.value.name`` is its name."""
+        """Flight mode (HEARTBEAT); ``vehicle.mode.value.name`` is its name."""
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
     def system_status(self) -> StateCell[int]:
-        """MAV_STATE by HEARTBEAT: 3 standby, 4 active, 5 critical, 6 emergency."""
+        """MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency (HEARTBEAT)."""
         return StateCell(self._loop, self.aio.system_status)
 
     @cached_property
     def armed(self) -> StateCell[bool]:
-        """Whether the motors are armed, by HEARTBEAT."""
+        """True if the motors are armed (HEARTBEAT)."""
         return StateCell(self._loop, self.aio.armed)
 
     @cached_property
@@ -2823,12 +2865,12 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def heading_deg(self) -> StateCell[float]:
-        """Where the nose points, 0 to 360 degrees clockwise from north (GLOBAL_POSITION_INT, VFR_HUD)."""
+        """Heading, 0 to 360 degrees clockwise from north (GLOBAL_POSITION_INT, VFR_HUD)."""
         return StateCell(self._loop, self.aio.heading_deg)
 
     @cached_property
     def position(self) -> StateCell[Position]:
-        """Latitude, longitude in degrees, altitude above sea and above home in metres (GLOBAL_POSITION_INT)."""
+        """Latitude and longitude in degrees, altitude above sea and above home in metres (GLOBAL_POSITION_INT)."""
         return StateCell(self._loop, self.aio.position)
 
     @cached_property
@@ -2863,12 +2905,12 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def gps(self) -> StateCell[tuple[GpsReceiver, ...]]:
-        """Every satellite receiver, the first one first (GPS_RAW_INT, GPS2_RAW)."""
+        """All satellite receivers, the first one first (GPS_RAW_INT, GPS2_RAW)."""
         return StateCell(self._loop, self.aio.gps)
 
     @cached_property
     def batteries(self) -> StateCell[tuple[Battery, ...]]:
-        """Every battery (BATTERY_STATUS, else SYS_STATUS)."""
+        """All batteries (BATTERY_STATUS, else SYS_STATUS)."""
         return StateCell(self._loop, self.aio.batteries)
 
     @cached_property
@@ -2888,7 +2930,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def home(self) -> StateCell[Home]:
-        """Where it returns to (HOME_POSITION)."""
+        """Home position: the place to return to (HOME_POSITION)."""
         return StateCell(self._loop, self.aio.home)
 
     @cached_property
@@ -2908,12 +2950,12 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def wind(self) -> StateCell[Wind]:
-        """Wind speed in m/s and where it comes from in degrees (WIND, WIND_COV)."""
+        """Wind speed in m/s and the direction it comes from in degrees (WIND, WIND_COV)."""
         return StateCell(self._loop, self.aio.wind)
 
     @cached_property
     def range_finders(self) -> StateCell[tuple[RangeFinder, ...]]:
-        """Every distance sensor (DISTANCE_SENSOR, RANGEFINDER)."""
+        """All distance sensors (DISTANCE_SENSOR, RANGEFINDER)."""
         return StateCell(self._loop, self.aio.range_finders)
 
     @cached_property
@@ -2943,17 +2985,17 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def mission_reached(self) -> StateCell[int]:
-        """The mission item that was reached last (MISSION_ITEM_REACHED)."""
+        """The last mission item reached (MISSION_ITEM_REACHED)."""
         return StateCell(self._loop, self.aio.mission_reached)
 
     @cached_property
     def status_text(self) -> StateCell[StatusText]:
-        """The last thing it said (STATUSTEXT, chunks joined)."""
+        """The last status text (STATUSTEXT, chunks joined)."""
         return StateCell(self._loop, self.aio.status_text)
 
     @cached_property
     def connection(self) -> Connection:
-        """The connection it is reached by."""
+        """The connection of the vehicle."""
         return Connection(self._loop, self.aio.connection)
 
     @property
@@ -2973,12 +3015,12 @@ class Vehicle(VehicleTwin):
 
     @property
     def autopilot(self) -> Autopilot:
-        """What differs between ArduPilot, PX4 and others."""
+        """Behaviour that differs between ArduPilot, PX4 and others."""
         return self.aio.autopilot
 
     @cached_property
     def link_quality(self) -> StateCell[LinkReport]:
-        """Loss, delay and rates of the last second."""
+        """Packet loss, delay and data rates of the last second."""
         return StateCell(self._loop, self.aio.link_quality)
 
     def command(
@@ -2993,25 +3035,26 @@ class Vehicle(VehicleTwin):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
-        Args:
-            command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, NaN where the command says so.
-            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
-            retries: how often it is sent again while it is not answered, from 0; ``confirmation`` rises with each. An
-                order is sent again only right after a HEARTBEAT that tells of no other mode, no failsafe, and no newer
-                order (docs/reliability.md). None: 3 for a request that changes nothing but streams, 0 for all others,
-                because what they do would be done twice if only the answer was lost.
-            attempt_timeout: seconds to wait for an ack after each, above 0, and at least two measured round trips;
-                None: 1, or 4 if it is sent once.
-            progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
-            on_progress: called with 0–100, or None, for each IN_PROGRESS.
-
         See https://mavlink.io/en/services/command.html.
 
+        Args:
+            command: the number, or a member of ``enums.MavCmd``.
+            params: param1 to param7; missing ones are 0, NaN where the command allows it.
+            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
+                counts.
+            retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
+                command that changes something is sent again only right after a HEARTBEAT that shows no other mode, no
+                failsafe, and no newer order (docs/reliability.md). None: 3 for a request that changes nothing but
+                streams, 0 for all others, because they would be executed twice if only the ack was lost.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0, and at least two measured
+                round trips; None: 1, or 4 if it is sent once.
+            progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
+            on_progress: called with 0–100, or None, for each IN_PROGRESS.
+
         Raises:
-            InvalidArgument: a parameter is no number or does not fit. Nothing was sent.
-            CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
-            CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
+            InvalidArgument: a parameter is not a number or does not fit. Nothing was sent.
+            CommandRejected: any other result; ``reasons`` has the status texts received meanwhile.
+            CommandTimeout: no ack; the text has attempts, seconds, the age of the last heartbeat and the packet loss.
         """
         return self._loop.run(
             self.aio.command,
@@ -3041,9 +3084,9 @@ class Vehicle(VehicleTwin):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. With
-        ``or_long``, firmware that does not know it so is sent a COMMAND_LONG with degrees, in frame 0 only. The
-        rest is as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
+        With ``or_long``, firmware that does not support it as COMMAND_INT gets a COMMAND_LONG with degrees, in frame
+        0 only. All else as for :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -3062,10 +3105,10 @@ class Vehicle(VehicleTwin):
         )
 
     def send(self, message: Message) -> None:
-        """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
+        """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end. A
-        set-point is newer than what was :meth:`posted` about motion. Neither is, to another system than this vehicle.
+        A steering command (as by :meth:`command`) and SET_MODE are newer orders and end those of actions. A set-point
+        supersedes what was :meth:`posted` about motion. Messages to another system do neither.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -3074,7 +3117,9 @@ class Vehicle(VehicleTwin):
         self._loop.call(self.aio.send, message)
 
     def note_sent(self, message: Message) -> None:
-        """The program has sent this to the vehicle past it (``connection.send``): it counts as by :meth:`send`."""
+        """Register a message that the program sent to the vehicle by ``connection.send``; it counts as sent by
+        :meth:`send`.
+        """
         self._loop.call(self.aio.note_sent, message)
 
     def posted(
@@ -3083,22 +3128,21 @@ class Vehicle(VehicleTwin):
         modes: tuple[Mode, ...] = (),
         armed: bool | None = None,
     ) -> AbstractContextManager[PostedOrder]:
-        """An order that the next one need not wait for: mode, arming and take-off go out one after another.
+        """Open an order that need not be waited for: mode, arming and take-off can be sent one after another.
 
-        Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
-        is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
-        this order nor one of the ten seconds before it brings about, or, if it is about motion first of all, that the
-        vehicle has disarmed. Nothing is held when it is given up, and nobody watches for an order to arm that comes
-        late: the actions do that.
+        Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
+        effect is reported. They are not sent again after a newer order about the same subject, after a mode that
+        neither this order nor one of the last ten seconds explains, or, for orders about motion, after disarming. An
+        abandoned order does not make the vehicle hold, and late arming is not monitored; use the actions for that.
 
         Args:
-            subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
-                ended by it, too. One about mode or motion ends the action under way.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
+                ends orders about the others. An order about mode or motion ends the action in progress.
             modes: the modes that it brings about.
-            armed: whether it arms or disarms; one about ``"arm"`` has to say.
+            armed: True if it arms, False if it disarms; required for ``"arm"``.
 
         Raises:
-            InvalidArgument: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
+            InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
         """
         return self._twin_block(PostedOrder, self.aio.posted(*subjects, modes=modes, armed=armed))
 
@@ -3111,15 +3155,14 @@ class Vehicle(VehicleTwin):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` gives the latest only, ``missed`` counts the others.
-
-        Subscribing is the rate request: while the block lasts, the autopilot is asked to send these messages at
-        ``rate_hz`` (above 0, at most 1000), or faster if others want it. None means the default rate of a message that
-        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for. What a
-        camera or another component is to be asked for: ``vehicle.component(100).subscribe(...)``.
+        ``capacity=1`` keeps the latest only; ``missed`` counts the others. Subscribing also requests the rate: while
+        the block lasts, the autopilot is asked to send these messages at ``rate_hz`` (above 0, at most 1000), or
+        faster if another subscriber needs it. None requests the default rate of streamed messages; messages sent on
+        demand (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            InvalidArgument: no type, a rate out of range, or a message that the dialect does not hold.
+            InvalidArgument: no type, a rate out of range, or a message that the dialect does not contain.
         """
         return Subscription(
             self._loop,
@@ -3133,16 +3176,16 @@ class Vehicle(VehicleTwin):
         )
 
     def rate(self, message_type: type[Message], rate_hz: float) -> AbstractContextManager[None]:
-        """Have the vehicle send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
+        """Request ``message_type`` at ``rate_hz`` or faster for the duration of the ``with`` block."""
         return self._block(self.aio.rate(message_type, rate_hz))
 
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
-        """Have the vehicle send all that it streams at ``rate_hz`` for the time of the ``with`` block: for recordings,
-        ground stations and firmware that knows no rates of single messages.
+        """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        ArduPilot is asked by REQUEST_DATA_STREAM (whole Hz, 1 at least), again after a reboot or a silence and while
-        nothing comes; it goes on streaming afterwards. Others stream by themselves: of them, what is missing of the
-        common states is asked for as by :meth:`rate`.
+        For recordings, ground stations, and firmware without rates of single messages. ArduPilot is asked by
+        REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
+        continues to stream afterwards. Other autopilots stream by themselves; missing common states are requested as
+        by :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -3150,15 +3193,14 @@ class Vehicle(VehicleTwin):
         return self._block(self.aio.streams(rate_hz))
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """The latest message of a kind as it came, in a cell: ``vehicle.message(messages.RawImu).value.xacc``.
+        """Return the cell with the latest message of a type: ``vehicle.message(messages.RawImu).value.xacc``.
 
-        The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
-        that comes in a stream) for as long as the vehicle object lives; later calls give the same cell, and may change
-        the rate. Only messages of the autopilot count; those of a camera or another component are in
-        ``vehicle.component(100).message(...)``.
+        The first call requests it at ``rate_hz`` (None: the default rate of a streamed message) for the lifetime of
+        the vehicle object; later calls return the same cell and may change the rate. Only messages of the autopilot
+        count; use ``vehicle.component(100).message(...)`` for a camera or another component.
 
         Raises:
-            InvalidArgument: the rate is out of range, or the dialect does not hold the message.
+            InvalidArgument: the rate is out of range, or the dialect does not contain the message.
         """
         return StateCell(self._loop, self._loop.call(self.aio.message, message_type, rate_hz=rate_hz))
 
@@ -3169,17 +3211,19 @@ class Vehicle(VehicleTwin):
 
     @property
     def is_armed(self) -> bool:
-        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
+        one.
+        """
         return self.aio.is_armed
 
     @property
-    def is_surely_disarmed(self) -> bool:
-        """Whether the last heartbeat says disarmed; False while it is not known."""
-        return self.aio.is_surely_disarmed
+    def is_confirmed_disarmed(self) -> bool:
+        """True if the last heartbeat reports disarmed; False while the state is unknown."""
+        return self.aio.is_confirmed_disarmed
 
     @property
     def is_vtol(self) -> bool:
-        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        """True for a VTOL vehicle, which can hover and cruise on wings (EXTENDED_SYS_STATE reports a VTOL state)."""
         return self.aio.is_vtol
 
     @property
@@ -3189,104 +3233,106 @@ class Vehicle(VehicleTwin):
 
     @property
     def is_silent(self) -> bool:
-        """Whether no heartbeat comes: none for more than 3.5 seconds, or the link has gone."""
+        """True if no heartbeat was received for more than 3.5 seconds, or the link is lost."""
         return self.aio.is_silent
 
     @cached_property
     def link_state(self) -> StateCell[LinkState]:
-        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link has gone)."""
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link is lost)."""
         return StateCell(self._loop, self.aio.link_state)
 
     def describe_link(self) -> str:
-        """One line on how well the vehicle is heard, for error texts."""
+        """Return one line about the link's quality, for error texts."""
         return self._loop.call(self.aio.describe_link)
 
     def describe_now(self) -> str:
-        """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9 m above home, heard 0.3 s ago``."""
+        """Return a clause about the reported state: ``holding in BRAKE, still armed, 9 m above home, last heartbeat
+        0.3 s ago``.
+        """
         return self.aio.describe_now()
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
         return self._loop.call(self.aio.texts_since, at)
 
     def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
-        """Change the flight mode and wait until HEARTBEAT tells it.
+        """Change the flight mode and wait until HEARTBEAT reports it.
 
-        Args:
-            mode: a name as the autopilot's own documentation spells it (``"GUIDED"``, ``"POSCTL"``; case does not
-                matter), or the number in HEARTBEAT.custom_mode.
-            timeout: seconds for the whole of it.
-
-        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
 
+        Args:
+            mode: a name as spelled in the autopilot's documentation (``"GUIDED"``, ``"POSCTL"``; case is ignored), or
+                the number in HEARTBEAT.custom_mode.
+            timeout: seconds for the whole call.
+
         Raises:
-            InvalidArgument: this vehicle has no such mode; the text lists those it has. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not answer.
+            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
+        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
 
         Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
 
         Raises:
             NotSupported: this vehicle has no mode for it. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not answer.
+            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
         """
         self._loop.run(self.aio.hold)
 
     @property
-    def is_told_to_hold(self) -> bool:
-        """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
-        return self.aio.is_told_to_hold
+    def is_hold_pending(self) -> bool:
+        """True while the hold that followed an abandoned flight is not confirmed."""
+        return self.aio.is_hold_pending
 
     @property
     def is_flown_by_program(self) -> bool:
-        """Whether the vehicle is armed and does what this program has ordered.
+        """True while the vehicle is armed and executes orders of this program.
 
-        The program has armed it, or has given an order that steers since somebody else did; and no pilot, failsafe or
-        other program has taken it from that. False for a vehicle that others fly and that this program only watches.
+        This program armed it, or has given a steering order since another party armed it, and no pilot, failsafe or
+        other program took over since. False for a vehicle that this program only observes.
         """
         return self.aio.is_flown_by_program
 
     @property
     def taken_over(self) -> str:
-        """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
+        """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart; or
-        "a failsafe became active (MAV_STATE_CRITICAL)", which may come some seconds before the mode changes.
-        A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
+        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not distinguish;
+        or "a failsafe became active (MAV_STATE_CRITICAL)", which may be reported seconds before the mode changes.
+        Disarming alone, as after a landing, is no takeover. The program's next action resets it.
         """
         return self.aio.taken_over
 
     def missing_for_flight(self) -> list[str]:
-        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
+        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
         return self._loop.call(self.aio.missing_for_flight)
 
     def why_not_armable(self) -> list[str]:
         """Return the reasons why arming would be refused now; an empty list means that none is known.
 
-        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it can do so on request and listens to
-        what it says; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
-        Takes about a second. The vehicle is not armed by it.
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it supports that, and collects its status
+        texts; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS). Takes
+        about a second and does not arm the vehicle.
         """
         return self._loop.run(self.aio.why_not_armable)
 
     def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
-        The mode does not count: :meth:`arm` leaves one in which the vehicle does not arm. :meth:`why_not_armable`
-        names it.
+        The mode is not considered, because :meth:`arm` leaves a mode in which the vehicle cannot arm;
+        :meth:`why_not_armable` reports it.
 
         Raises:
-            OperationTimeout: not within ``timeout`` seconds; the text says what is still missing, and what the vehicle
-                said of it lately.
+            OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
+                texts.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -3296,32 +3342,33 @@ class Vehicle(VehicleTwin):
         mode: str | int | None = None,
         force: bool = False,
         timeout: float = 10.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
+        """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
-        A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
-        another one first. The order is sent once: a HEARTBEAT that says disarmed does not tell whether a pilot has
-        disarmed it since. Cancelled, or ended by any error but a refusal, it may still be carried out: for 15 seconds
-        the vehicle is watched, and disarmed if this order arms it (the vehicle accepts it, or is armed at the next
-        HEARTBEAT and nobody else has taken it), as long as the connection is there. Logger "aerokit" warns of what
-        came of it, also of an arming that nothing shows to be this order's: that one is left alone.
+        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
+        The command is sent once, because a HEARTBEAT that reports disarmed may mean that a pilot has disarmed since.
+        After a cancellation, or an error other than a refusal, the command may still be executed. The vehicle is
+        therefore monitored for 15 seconds and disarmed if this command arms it (it accepts the command, or is armed
+        at the next HEARTBEAT and there was no takeover), as long as the connection is open. Logger "aerokit" warns
+        about the outcome, and about an arming that cannot be attributed to this command, which is left alone.
 
         Args:
-            mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
+            mode: the mode to arm in; None: the present mode, or one that ``take_off`` starts in if that does not
+                allow it.
             force: skip the vehicle's own arming checks. Dangerous.
-            timeout: seconds for HEARTBEAT to say so after the command was accepted.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
+            timeout: seconds for HEARTBEAT to report armed after the command was accepted.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
-                estimator lacks. They are asked for again where the vehicle can run its checks on request.
-            CommandTimeout: there was no answer, and it did not arm; the text says whether the order may still arrive.
-            OperationRejected: it is armed already, in another mode than ``mode``, and nothing was sent; or somebody
-                else has disarmed it, or changed its mode, meanwhile.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted and did not arm.
+            InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
+                estimates. Where the vehicle can run its checks on request, they are run again for this.
+            CommandTimeout: there was no acknowledgement, and it did not arm; the text says whether it may still arm.
+            OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
+                disarmed it or changed its mode meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it accepted the command and did not arm.
         """
         self._loop.run(self.aio.arm, mode=mode, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3330,50 +3377,50 @@ class Vehicle(VehicleTwin):
         *,
         force: bool = False,
         timeout: float = 10.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Stop the motors and wait until HEARTBEAT says disarmed.
+        """Stop the motors and wait until HEARTBEAT reports disarmed.
 
         Args:
-            force: also in the air: **the vehicle falls**.
-            timeout: seconds for HEARTBEAT to say so after the command was accepted.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
+            force: disarm in flight as well: **the vehicle falls**.
+            timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            CommandRejected: the vehicle refused, usually because it flies.
-            CommandTimeout: there was no answer.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted and did not disarm.
+            CommandRejected: the vehicle refused, usually because it is flying.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it accepted the command and did not disarm.
         """
         self._loop.run(self.aio.disarm, force=force, timeout=timeout, max_silence_s=max_silence_s)
 
     def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
-        """Reboot the autopilot and wait until it is back: its time since boot has started anew.
+        """Reboot the autopilot and wait until it is back: its time since boot has restarted.
 
         Args:
-            force: also while armed: **a flying vehicle falls**.
+            force: reboot while armed as well: **a flying vehicle falls**.
             timeout: seconds until it is back.
 
         Raises:
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
-            CommandTimeout: there was no answer, and it did not reboot.
-            LinkLost: the link goes down with the vehicle (USB, TCP); connect again.
+            CommandTimeout: there was no acknowledgement, and it did not reboot.
+            LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: it did not come back.
         """
         self._loop.run(self.aio.reboot, force=force, timeout=timeout)
 
     def look_at(self, target: Position) -> None:
-        """Make nose or gimbal point at a place, until :meth:`stop_looking`; without an altitude, at its own.
+        """Point nose or gimbal at a place, until :meth:`stop_looking`; without an altitude, at the vehicle's own.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), and
-        MAV_CMD_DO_SET_ROI to old firmware, which knows no other.
+        Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
+        MAV_CMD_DO_SET_ROI to old firmware.
 
         Raises:
-            ValueUnknownError: home is not known and is needed here.
+            ValueUnknownError: home is needed here and not known.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no answer.
-            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         self._loop.run(self.aio.look_at, target)
 
@@ -3382,8 +3429,8 @@ class Vehicle(VehicleTwin):
 
         Raises:
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no answer.
-            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         self._loop.run(self.aio.stop_looking)
 
@@ -3396,35 +3443,34 @@ class Vehicle(VehicleTwin):
         tolerance_m: float | None = None,
         max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
         """Fly to a place and return on arrival.
 
-        Cancelled half-way, or when it does not arrive in time or falls silent, the vehicle is told to hold where it
-        is; unless another order was given meanwhile or somebody else has changed the mode. A silent vehicle is told so
-        when it is heard again, if it still goes there then.
+        After a cancellation, a time-out or a silence the vehicle is told to hold where it is, unless another order
+        was given meanwhile or another party changed the mode. A silent vehicle is told to hold when it is received
+        again, if it is still on its way then. Sends MAV_CMD_DO_REPOSITION
+        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
+        vehicle that does not support it.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
                 the present one is kept.
-            speed_m_s: ground speed from now on, above 0; None leaves it.
-            heading_deg: where to look on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
-            tolerance_m: how near is there, in metres; None: what suits the type of vehicle.
-            max_distance_m: metres from where it is; a place farther away is refused.
-            timeout: seconds; None: as long as it takes, provided that heartbeats come, the mode stays and it moves.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
-
-        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), and
-        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
+            speed_m_s: ground speed from now on, above 0; None keeps the present one.
+            heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
+            tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
+            max_distance_m: a place farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            InvalidArgument: the target is no place on earth or too far away, or another argument is out of range.
-                Nothing was sent.
-            ValueUnknownError: position or home is not known and is needed here.
+            InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
+                was sent.
+            ValueUnknownError: position or home is needed here and not known.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
-            OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
-            CommandTimeout: there was no answer.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
+            OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: it did not arrive in time, or does not move.
         """
         self._loop.run(
@@ -3439,9 +3485,9 @@ class Vehicle(VehicleTwin):
         )
 
     def set_speed(self, speed_m_s: float) -> None:
-        """Change the ground speed for flying somewhere, in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
+        """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot takes it only while it is under way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` sees to that.
+        ArduPilot applies it only on the way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for that.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
@@ -3457,27 +3503,28 @@ class Vehicle(VehicleTwin):
         rate_deg_s: float = 0.0,
         tolerance_deg: float = 5.0,
         timeout: float = 60.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Turn on the spot and return when the nose points there.
+        """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: MAV_CMD_CONDITION_YAW, in GUIDED, which it is put into. PX4 has no such command and stops where it
-        is to turn: MAV_CMD_DO_REPOSITION.
+        ArduPilot: MAV_CMD_CONDITION_YAW in GUIDED, which is set first. PX4 has no such command and stops to turn:
+        MAV_CMD_DO_REPOSITION.
 
         Args:
-            heading_deg: −360 to 360, clockwise from north; ``relative``: by so many degrees, left is negative.
+            heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
+                left.
             relative: count from the present heading.
-            rate_deg_s: how fast, degrees per second; 0 leaves it to the autopilot. PX4 does not look at it.
-            tolerance_deg: how near is there.
-            timeout: seconds until it is there.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
+            tolerance_deg: accepted deviation in degrees.
+            timeout: seconds until it has the heading.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or it disarmed on the way.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not get there in time.
+            OperationRejected: the mode changed or it disarmed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it did not reach the heading in time.
         """
         self._loop.run(
             self.aio.set_heading,
@@ -3490,25 +3537,26 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
-        """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
+        """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
+        reports it.
+
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG
+        with a resolution of about a metre to old firmware, which does not support it as COMMAND_INT.
 
         Args:
-            place: latitude, longitude and an altitude above mean sea level; None: where it is now.
-            timeout: seconds until HOME_POSITION tells it.
-
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG to
-        old firmware, which does not know it as COMMAND_INT: to within a metre then.
+            place: latitude, longitude and an altitude above mean sea level; None: the present position.
+            timeout: seconds until HOME_POSITION reports it.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
-            CommandRejected: the vehicle refused: it knows no position, or the place is none.
-            CommandTimeout: there was no answer.
-            OperationTimeout: it accepted, and HOME_POSITION did not tell it.
+            CommandRejected: the vehicle refused: it has no position, or the place is invalid.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: it accepted, and HOME_POSITION did not report it.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
     def distance_to(self, target: Position) -> float:
-        """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.
+        """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.
         """
@@ -3519,46 +3567,46 @@ class Vehicle(VehicleTwin):
         altitude_m: float,
         *,
         timeout: float = 60.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Where the autopilot needs its guided mode for this, it is put into it. Cancelled
-        half-way, or when it does not get there in time, the vehicle is told to hold where it is.
+        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out
+        the vehicle is told to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
             timeout: seconds until it is there.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
-                way.
-            CommandTimeout: there was no answer.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not get there in time, or does not move.
+            OperationRejected: it is not armed or is flying already, or its mode changed or it disarmed meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it did not reach the altitude in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         self._loop.run(self.aio.take_off, altitude_m, timeout=timeout, max_silence_s=max_silence_s)
 
-    def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = LONGEST_SILENCE_S) -> None:
-        """Land where the vehicle is; returns on the ground, where the motors may still be turning.
+    def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
+        """Land at the present position; returns on the ground, where the motors may still be turning.
 
-        Follow ``vehicle.armed`` for the motors. Cancelled, the vehicle goes on landing.
+        Watch ``vehicle.armed`` for the motors. After a cancellation the vehicle continues to land.
 
         Args:
-            timeout: seconds until it is on the ground; None: as long as it takes.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            timeout: seconds until it is on the ground; None: no limit.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            NotSupported: this type of vehicle has no mode for it. Nothing was sent.
+            NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
-            CommandTimeout: there was no answer.
-            OperationRejected: the mode changed on the way.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: not on the ground in time.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: the mode changed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it was not on the ground in time.
         """
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
@@ -3566,24 +3614,26 @@ class Vehicle(VehicleTwin):
         self,
         *,
         timeout: float | None = 600.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Return to the launch place; returns on the ground, or above it where the vehicle does not land by itself.
+        """Return to launch; returns on the ground, or above it if the autopilot does not land by itself.
 
-        Raises as :meth:`land`.
+        Raises the same errors as :meth:`land`.
         """
         self._loop.run(self.aio.return_to_launch, timeout=timeout, max_silence_s=max_silence_s)
 
     @property
     def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
-        """What is on board, as far as it was heard: autopilot, cameras, gimbals, companions, receivers, others.
+        """The components seen on board: autopilot, cameras, gimbals, companion computers, receivers and others.
 
-        Cameras and gimbals without a component id of their own are known once one of their messages has come.
+        Cameras and gimbals without a component id of their own appear after their first message.
         """
         return self._part("components", StateCell)
 
     def component(self, component_id: int) -> Component:
-        """One of them, to talk to: ``vehicle.component(100).command(…)``. It need not have been heard yet.
+        """Return the component with this id, to send commands to it: ``vehicle.component(100).command(…)``.
+
+        The component need not have been seen yet.
 
         Raises:
             InvalidArgument: the id is not from 1 to 255.
@@ -3592,28 +3642,29 @@ class Vehicle(VehicleTwin):
 
     @property
     def camera(self) -> Camera:
-        """The first camera that is heard: one with a component id of its own before those behind the autopilot.
+        """The first camera found. One with a component id of its own comes before those behind the autopilot.
 
-        Its calls wait for it a moment; ``camera_at`` gives any other one.
+        Its calls wait briefly until a camera is found; ``camera_at`` returns any other one.
         """
         return self._part("camera", Camera)
 
     @property
     def cameras(self) -> StateCell[tuple[int, ...]]:
-        """The numbers of the cameras that have been heard, for ``camera_at``.
+        """The numbers of the cameras found so far, for ``camera_at``.
 
-        Component ids (100 to 105), and 1 to 6 for those behind the autopilot once they have told of a picture.
+        A number is a component id (100 to 105), or 1 to 6 for a camera behind the autopilot that has reported a
+        picture.
         """
         return self._part("cameras", StateCell)
 
     def camera_at(self, number: int) -> Camera:
-        """One camera by its number; it need not have been heard yet.
+        """Return the camera with this number. It need not have been found yet.
 
         Args:
-            number: its component id (100 to 105, at most 255), or 1 to 6 behind the autopilot.
+            number: its component id (100 to 105, at most 255), or 1 to 6 for a camera behind the autopilot.
 
         Raises:
-            InvalidArgument: there can be no such camera.
+            InvalidArgument: no camera can have this number.
         """
         return Camera(self._loop, self._loop.call(self.aio.camera_at, number))
 
@@ -3624,61 +3675,61 @@ class Vehicle(VehicleTwin):
 
     @property
     def gimbal(self) -> Gimbal:
-        """The first gimbal: where it points, and orders to it."""
+        """The first gimbal: its attitude, and commands to it."""
         return self._part("gimbal", Gimbal)
 
     @property
     def gimbals(self) -> Gimbals:
-        """All gimbals that it carries."""
+        """All gimbals of the vehicle."""
         return self._part("gimbals", Gimbals)
 
     @property
     def files(self) -> Files:
-        """The files on it, by MAVFTP."""
+        """The vehicle's file system, accessed by MAVFTP."""
         return self._part("files", Files)
 
     @property
     def logs(self) -> Logs:
-        """Its flight logs."""
+        """The vehicle's flight logs."""
         return self._part("logs", Logs)
 
     @property
     def parameters(self) -> Parameters:
-        """The autopilot's parameters: download, get, set, transactions, what was changed."""
+        """The autopilot's parameters: download, get, set, transactions, change notifications."""
         return self._part("parameters", Parameters)
 
     @property
     def mission(self) -> MissionControl:
-        """The mission it holds: upload, download, start, pause, wait until it is finished."""
+        """The vehicle's mission: upload, download, start, pause, wait until finished."""
         return self._part("mission", MissionControl)
 
     @property
     def fence(self) -> FenceControl:
-        """The fence it holds."""
+        """The vehicle's geofence."""
         return self._part("fence", FenceControl)
 
     @property
     def rally(self) -> RallyControl:
-        """The rally points it holds."""
+        """The vehicle's rally points."""
         return self._part("rally", RallyControl)
 
     def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
-        """Give the vehicle a key (SETUP_SIGNING), and sign and check with it from then on; None takes the key away.
+        """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key travels in clear**: do this over a cable or a link that nobody listens to. Returns when the
-        vehicle's frames are signed with the key (None: when they are not signed any more); until then what was in use
-        remains in use. All on this connection need the key then, or ``signing.allow_unsigned``. Cancelled, the vehicle
-        may have taken the key all the same. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
+        are signed with the key (None: when they are no longer signed). Until then the previous setting remains
+        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. After a
+        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle uses it.
+            timeout: seconds until the vehicle must use it.
 
         Raises:
-            NotSupported: we or the vehicle speak MAVLink 1, which has no signatures. Nothing was sent.
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            OperationTimeout: it went on as before; the text has what it said.
-            BusyError: another vehicle on this connection is just being given a key. Nothing was sent.
+            NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            OperationTimeout: the vehicle did not change; the text includes its status texts.
+            BusyError: another key exchange is in progress on this connection. Nothing was sent.
         """
         self._loop.run(self.aio.setup_signing, signing, timeout=timeout)
 
@@ -3695,46 +3746,44 @@ def open_connection(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
-    peers: Peers | None = None,
+    peers: PeerFilter | None = None,
     may_move: bool = False,
     heartbeat: OwnHeartbeat | None = OwnHeartbeat(),
 ) -> Connection:
-    """Open a link and be a MAVLink node on it ; use it in a ``with`` block, or close it.
+    """Open a connection for an ``with`` block: this program becomes a MAVLink node on the link.
 
-    Runs in the asyncio loop that is already running; nothing outlives the block, and what the block raises comes out
-    of it as it is. Our HEARTBEAT goes out at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
+    Runs in the current asyncio loop. Everything ends with the block, and exceptions of the block pass unchanged. Our
+    HEARTBEAT is sent at 1 Hz from the start (https://mavlink.io/en/services/heartbeat.html).
 
     Args:
-        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or a link not yet open; or
-            several of them, none twice, that lead to the same vehicles (docs/how-to/several-links.md): each frame is
-            taken once, orders go over the best link, and over the next one when it falls silent. ``?costly=1`` behind
-            an address marks one that is used when the others fail. A link that is lost is opened again, as long as
-            another one is there.
-        source_system: our own system id, 1–255; ground stations take 255.
-        source_component: our own component id, 1–255. 0, which is nobody's, is allowed for programs that always were
-            that (DroneKit).
-        baud: of a serial link whose address names none, bits per second, above 0.
-        dialect: the messages that are understood.
-        mavlink_version: of what we send, 1 or 2; both are understood.
-        signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: what we
-            send is not signed, and signatures are not checked.
-        record: a ``.tlog`` file for everything received and sent, messages of unknown dialects too; an existing file
-            is replaced when the first frame is received. A disk that is full ends the recording, not the connection.
-        reconnect: whether a link that is lost, a device unplugged for example, is opened again until it is back,
-            instead of ending the connection: ``LinkInterrupted``, ``LinkRestored``. Not for the first opening, and not
-            at the end of a recording. Of several links: whether the connection outlives that all are away.
-        peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or
-            those of :mod:`ipaddress`. For links to which anybody can send: udpin, udpbcast, tcpin. None: all.
-        may_move: whether a vehicle that was silent may come back from another IP address without going on where it
-            stopped, by sequence numbers and time since boot: rebooted, with a new address. Else it is not listened to
-            there (``MoveRefused``), for it might be anybody.
-        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
-            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
+        address: a connection string (``"udpin:0.0.0.0:14550"``, ``"/dev/ttyACM0,57600"``, …) or an unopened link; or a
+            list of them that lead to the same vehicles (docs/how-to/several-links.md). Then each frame is processed
+            once, and commands use the best link, or the next one when it fails. ``?costly=1`` in an address marks a
+            link that is used only when the others fail. A lost link is reopened while another one works.
+        source_system: own system id, 1–255; ground stations use 255.
+        source_component: own component id, 1–255. 0 is allowed for programs that have always used it (DroneKit).
+        baud: bits per second of a serial link whose address has none, above 0.
+        dialect: the messages that are decoded.
+        mavlink_version: version of sent messages, 1 or 2; both are received.
+        signing: key that signs sent frames; received frames without its signature are refused (docs/signing.md). None:
+            frames are neither signed nor verified.
+        record: ``.tlog`` file for all sent and received frames, unknown messages included. An existing file is replaced
+            when the first frame is received. A full disk ends the recording, not the connection.
+        reconnect: True to reopen a lost link (e.g. an unplugged device) until it is back, instead of ending the
+            connection; see ``LinkInterrupted`` and ``LinkRestored``. Does not apply to the first opening, or to the end
+            of a replay. With several links: True to keep the connection while all of them are lost.
+        peers: IP addresses and networks to accept, e.g. ``"10.0.0.7"``, ``["10.0.0.0/24", "fd00::/8"]``, or objects of
+            :mod:`ipaddress`. For udpin, udpbcast and tcpin links. None: all.
+        may_move: True to accept a silent vehicle from another IP address even if its sequence numbers and time since
+            boot do not continue, e.g. after a reboot with a new address. Otherwise it is refused (see
+            ``RouteChangeRefused``), because it may be a different sender.
+        heartbeat: content of our HEARTBEAT and when it pauses. None sends none: PX4 then sends no STATUSTEXT, and a
+            ``udpout:`` link stays silent.
 
     Raises:
         InvalidArgument: an argument is wrong; nothing was opened.
-        LinkOpenError: the link or the file for the recording could not be opened.
-        ConnectionClosed, BusyError: the link given was used before.
+        LinkOpenError: the link or the recording could not be opened.
+        ConnectionClosed, BusyError: the given link was used before.
     """
     return opened(
         Connection,
@@ -3769,49 +3818,51 @@ def connect(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
-    peers: Peers | None = None,
+    peers: PeerFilter | None = None,
     may_move: bool = False,
     heartbeat: OwnHeartbeat | None = OwnHeartbeat(),
     share: Iterable[str | Endpoint | Link] = (),
 ) -> Vehicle:
-    """Connect to a vehicle ; use it in a ``with`` block, or close it.
+    """Connect to a vehicle for the duration of the ``with`` block.
 
-    Returns at its first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the asyncio
-    loop that is already running: nothing outlives the block, and what the block raises comes out of it as it is.
+    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the
+    running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
-        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; several of these that lead to the vehicle (docs/how-to/several-links.md); or a connection that is
-            open already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
-        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
+        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
+            link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
+            connection, to use several vehicles on one link: the arguments after ``rates`` then belong to the call
+            that opened it.
+        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
         timeout: seconds to wait for its first heartbeat, above 0.
-        rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for
+        rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
-        source_component: our own component id, 0–255; 0, which is nobody's, for programs that always were that.
-        baud: of a serial link whose address names none.
-        dialect: the messages that are understood.
-        mavlink_version: of what we send, 1 or 2.
-        signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: neither.
-        record: a ``.tlog`` file for everything received and sent; an existing file is replaced.
-        reconnect: whether a link that is lost is opened again until it is back, instead of ending the connection.
-        peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24"]``. For links to
-            which anybody can send: udpin, udpbcast, tcpin. None: all.
-        may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
-            stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
-            there (``MoveRefused``), for it might be anybody.
-        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
-            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
-        share: where ground stations and other programs are, or come, that use the same link:
-            ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). They should have other ids than this program. For an open
-            connection: ``async with aerokit.hub.shared(connection, […])``.
+        source_component: our own component id, 0–255. 0 is not a valid component id; some old programs send it.
+        baud: baud rate of a serial link whose address has none.
+        dialect: the message definitions to use.
+        mavlink_version: version of the frames we send, 1 or 2.
+        signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
+            None: no signatures.
+        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
+        reconnect: reopen a lost link until it is back, instead of ending the connection.
+        peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
+            ``["10.0.0.0/24"]``. For links that anybody can send to: udpin, udpbcast, tcpin. None: accept all.
+        may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
+            not continue (it rebooted and has a new address). Otherwise that address is refused
+            (``RouteChangeRefused``), because it may belong to another sender.
+        heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
+            ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.
+        share: addresses at which ground stations and other programs use the same link: ``["tcpin:127.0.0.1:5760"]``
+            (docs/hub.md). They should use other ids than this program. For an open connection use ``async with
+            aerokit.hub.shared(connection, […])``.
 
     Raises:
-        InvalidArgument: an argument is wrong. Nothing was opened.
-        BusyError: this system has a vehicle object on this connection already.
-        LinkOpenError: the link, one to share it on, or the file to record to, could not be opened.
-        LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle came in time; the text says what was heard instead.
+        InvalidArgument: an argument is invalid. Nothing was opened.
+        BusyError: this connection already has a vehicle object for this system.
+        LinkOpenError: the link, a shared link or the recording could not be opened.
+        LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
+        ConnectFailed: no heartbeat of such a vehicle arrived in time; the text says what was received instead.
     """
     return opened(
         Vehicle,

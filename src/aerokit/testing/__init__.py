@@ -1,7 +1,8 @@
-"""For tests of programs that use aerokit. Nothing in aerokit imports this.
+"""Tools to test programs that use aerokit; only `aerokit.apps.cli` imports this package.
 
 An event loop on virtual time (`run_virtual`), simulated vehicles with faults and true tracks (`open_flight`,
-`open_fleet`, `serve_flight`), and a pytest plugin with the same as fixtures: docs/testing.md.
+`open_fleet`, `serve_flight`), recordings as vehicles (`RecordedVehicle`), faulty links, and a pytest plugin with
+fixtures: docs/testing.md.
 """
 
 from __future__ import annotations
@@ -13,9 +14,6 @@ from aerokit._internal.imports import lazy_exports
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.sim.journal import Journal as Journal
-    from aerokit.sim.track import Track as Track
-    from aerokit.sim.track_points import TrackPoint as TrackPoint
     from aerokit.testing.clock import VIRTUAL_BACKEND as VIRTUAL_BACKEND
     from aerokit.testing.clock import DeadlockError as DeadlockError
     from aerokit.testing.clock import VirtualClockLoop as VirtualClockLoop
@@ -23,12 +21,16 @@ if TYPE_CHECKING:
     from aerokit.testing.fault_model import FaultModel as FaultModel
     from aerokit.testing.faults import FaultInjector as FaultInjector
     from aerokit.testing.faulty_link import FaultyLink as FaultyLink
-    from aerokit.testing.flights import Fleet as Fleet
     from aerokit.testing.flights import Flight as Flight
+    from aerokit.testing.flights import SimulatedFleet as SimulatedFleet
     from aerokit.testing.flights import open_fleet as open_fleet
     from aerokit.testing.flights import open_flight as open_flight
+    from aerokit.testing.journal import Journal as Journal
+    from aerokit.testing.recorded import RecordedVehicle as RecordedVehicle
     from aerokit.testing.served import ServedFlight as ServedFlight
     from aerokit.testing.served import serve_flight as serve_flight
+    from aerokit.testing.track import Track as Track
+    from aerokit.testing.track_points import TrackPoint as TrackPoint
 
 
 __getattr__: Callable[[str], Any]
@@ -36,14 +38,15 @@ __dir__: Callable[[], list[str]]
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "aerokit.sim.journal": ("Journal",),
-        "aerokit.sim.track": ("Track",),
-        "aerokit.sim.track_points": ("TrackPoint",),
+        "aerokit.testing.journal": ("Journal",),
+        "aerokit.testing.track": ("Track",),
+        "aerokit.testing.track_points": ("TrackPoint",),
         "aerokit.testing.clock": ("DeadlockError", "VIRTUAL_BACKEND", "VirtualClockLoop", "run_virtual"),
         "aerokit.testing.fault_model": ("FaultModel",),
         "aerokit.testing.faults": ("FaultInjector",),
         "aerokit.testing.faulty_link": ("FaultyLink",),
-        "aerokit.testing.flights": ("Fleet", "Flight", "open_fleet", "open_flight"),
+        "aerokit.testing.flights": ("SimulatedFleet", "Flight", "open_fleet", "open_flight"),
+        "aerokit.testing.recorded": ("RecordedVehicle",),
         "aerokit.testing.served": ("ServedFlight", "serve_flight"),
     },
 )

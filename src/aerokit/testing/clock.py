@@ -1,14 +1,13 @@
-"""Tests without waiting: an asyncio loop whose clock jumps to the next timer instead of sleeping.
+"""An asyncio event loop on virtual time: its clock jumps to the next timer instead of sleeping.
 
 ```python
 async def fly() -> None:
-    await asyncio.sleep(3600)          # returns at once; loop.time() has moved by an hour
+    await asyncio.sleep(3600)          # returns at once; loop.time() has advanced by an hour
 
 run_virtual(fly())
 ```
 
-With anyio's pytest plugin, a test module runs on virtual time when it (or its ``conftest.py``) has the
-fixture
+With anyio's pytest plugin, a test module runs on virtual time if it or its ``conftest.py`` has this fixture:
 
 ```python
 @pytest.fixture
@@ -20,15 +19,15 @@ async def test_an_hour_of_silence() -> None:
     await anyio.sleep(3600)
 ```
 
-The rules:
+Rules:
 
-* ``time()`` starts at 0.0 and moves only when no callback is ready and no socket has anything to say.
-* Real sockets are polled before every jump, but a jump does not wait for them: let tests on virtual time talk
-  over `aerokit.transport.memory_link_pair`.
-* While a call of ``run_in_executor`` (``asyncio.to_thread``, name resolution) is under way the clock stands
-  still. Other threads may wake the loop by ``call_soon_threadsafe``, but do not stop the clock.
-* When nothing can ever happen again, `DeadlockError` names the waiting tasks instead of hanging. If real
-  sockets or other threads could still wake the loop, they get `PATIENCE_S` seconds of real time first.
+- ``time()`` starts at 0.0 and advances only when no callback is ready and no socket has data.
+- Real sockets are polled before every jump, but a jump does not wait for them. Use
+  `aerokit.transport.memory_link_pair` in tests on virtual time.
+- The clock stands still during ``run_in_executor`` (``asyncio.to_thread``, name resolution). Other threads may wake
+  the loop by ``call_soon_threadsafe``, but do not stop the clock.
+- If nothing can happen any more, `DeadlockError` names the waiting tasks. If real sockets or other threads could
+  still wake the loop, it waits `DEADLOCK_TIMEOUT_S` of real time first.
 """
 
 from __future__ import annotations
@@ -45,60 +44,60 @@ import anyio
 
 T = TypeVar("T")
 
-PATIENCE_S = 10.0
-"""Real seconds that sockets, executor calls and other threads get before the loop is called deadlocked."""
+DEADLOCK_TIMEOUT_S = 10.0
+"""Real seconds to wait for sockets, executor calls and other threads before the loop is considered deadlocked."""
 
 
 class DeadlockError(RuntimeError):
-    """Nothing left to wait for: no ready callback, no timer, and nobody outside who would wake the loop."""
+    """Nothing can happen any more: no ready callback, no timer, no socket or thread that could wake the loop."""
 
 
 class VirtualClockLoop(asyncio.SelectorEventLoop):
-    """An asyncio loop on virtual time; see the module's text for its rules.
+    """An asyncio event loop on virtual time; the module documents its rules.
 
-    ``patience_s`` is in real seconds, see `PATIENCE_S`.
+    ``deadlock_timeout_s`` is in real seconds, see `DEADLOCK_TIMEOUT_S`.
     """
 
-    def __init__(self, *, patience_s: float = PATIENCE_S) -> None:
+    def __init__(self, *, deadlock_timeout_s: float = DEADLOCK_TIMEOUT_S) -> None:
         self._now = 0.0
         self._outside_calls = 0
-        self._patience_s = patience_s
-        self._own_sources: int | None = None  # the loop's own self-pipe, known once it is set up
+        self._deadlock_timeout_s = deadlock_timeout_s
+        self._own_sources: int | None = None  # Size of the selector map with the loop's self-pipe only.
         super().__init__(_JumpingSelector(self))
         self._own_sources = len(self._selector_map())
-        self._clock_resolution = 1e-9  # now + (when - now) may miss a timer by a rounding error
+        self._clock_resolution = 1e-9  # A rounding error in now + (when - now) must not miss a timer.
 
     def time(self) -> float:
-        """Virtual seconds since this loop was made."""
+        """Return the virtual seconds since the loop was created."""
         return self._now
 
     def jump(self, when: float) -> bool:
-        """Inside a callback: move the clock on to ``when``, unless something else happens until then; whether it did.
+        """Advance the clock to ``when``, unless something else happens before; return True if it did.
 
-        Saves a turn of the loop to whoever would have nothing done but set a timer for ``when``.
+        To be called in a callback. It saves a turn of the loop to a caller that would only set a timer for ``when``.
         """
         if self._ready or self._stopping or self._outside_calls or self._debug:  # type: ignore[attr-defined]
             return False
         timers: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
-        while timers and timers[0].cancelled():  # as the loop itself does at its next turn
+        while timers and timers[0].cancelled():  # As the loop itself does in its next turn.
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
             heappop(timers)._scheduled = False  # type: ignore[attr-defined]
         if timers and timers[0].when() <= when + self._clock_resolution:
             return False
-        if len(self._selector_map()) != self._own_sources:  # sockets are asked before every jump
+        if len(self._selector_map()) != self._own_sources:  # Sockets must be polled before every jump.
             return False
         self._now = max(self._now, when)
         return True
 
     def run_in_executor(self, executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]
-        """Runs ``func`` on a thread; the clock stands still until it has returned."""
+        """Run ``func`` on a thread; the clock stands still until it returns."""
         future = super().run_in_executor(executor, func, *args)
         self._outside_calls += 1
         future.add_done_callback(self._outside_call_done)
         return future
 
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:
-        """Joins the executor's threads, in real time."""
+        """Join the threads of the executor, in real time."""
         self._outside_calls += 1
         try:
             await super().shutdown_default_executor()
@@ -106,7 +105,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             self._outside_calls -= 1
 
     def wait_for_events(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
-        """What the selector does instead of waiting ``timeout`` virtual seconds (None: for ever)."""
+        """Replace the selector's wait for ``timeout`` virtual seconds; None waits without a limit."""
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events
@@ -121,10 +120,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         self._outside_calls -= 1
 
     def _wait_in_real_time(self, poll: Callable[[float], list[Any]]) -> list[Any]:
-        events = poll(self._patience_s)
+        events = poll(self._deadlock_timeout_s)
         if not events:
             raise DeadlockError(
-                self._deadlock(f"nothing came from outside in {self._patience_s} real seconds")
+                self._deadlock(f"no socket or thread woke the loop in {self._deadlock_timeout_s} real seconds")
             )
         return events
 
@@ -141,9 +140,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Runs a coroutine to its end on a `VirtualClockLoop`; cancels what it left, as asyncio.run does.
+    """Run a coroutine on a `VirtualClockLoop`, and cancel its remaining tasks, as asyncio.run does.
 
-    TypeError for what is no coroutine, such as the function that makes it.
+    Raises TypeError for anything but a coroutine, such as a coroutine function.
     """
     if not asyncio.iscoroutine(coroutine):
         raise TypeError(f"run_virtual takes a coroutine, as main() gives one, not {coroutine!r}")
@@ -158,11 +157,11 @@ def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
 
 
 VIRTUAL_BACKEND: tuple[str, dict[str, object]] = ("asyncio", {"loop_factory": VirtualClockLoop})
-"""What a fixture ``anyio_backend`` returns to run a module's tests on virtual time."""
+"""Return value of a fixture ``anyio_backend`` that runs a module's tests on virtual time."""
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Asks the loop what to do instead of waiting."""
+    """Calls the loop instead of waiting."""
 
     def __init__(self, loop: VirtualClockLoop) -> None:
         super().__init__()
@@ -178,7 +177,7 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 def _where(task: asyncio.Task[Any]) -> str:
-    """A waiting task with the innermost line it stands at."""
+    """Return the name of a waiting task and its innermost line."""
     place = ""
     step: object = task.get_coro()
     while isinstance(step, CoroutineType):

@@ -1,4 +1,4 @@
-"""What a report says of a test that failed: what was flown, said and ordered, and where its picture is."""
+"""Report of a failed test: flights, texts and the paths of pictures and recordings."""
 
 from __future__ import annotations
 
@@ -7,45 +7,46 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aerokit.sim.picture import save_picture
-from aerokit.testing.flights import Fleet
+from aerokit.testing.flights import SimulatedFleet
+from aerokit.testing.picture import save_picture
 
 if TYPE_CHECKING:
-    from aerokit.sim.journal import SaidText
     from aerokit.testing.flights import Flight
+    from aerokit.testing.journal import SentText
     from aerokit.testing.served import ServedFlight
 
-_TEXTS = 6
+_MAX_TEXTS = 6
 
 
-def what_was_flown(flown: Iterable[Fleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
-    """Some lines for each vehicle; with a directory, a picture of them all is drawn there, named after the test.
+def failure_report(flown: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
+    """Return lines about each vehicle.
 
-    What was recorded is put there, too, with its report.
+    With ``directory``, also save a picture of all tracks there, named after the test, and recordings with their
+    reports.
     """
-    flights = _each(flown)
-    lines = [line for flight in flights for line in _told(flight)]
+    flights = _flatten(flown)
+    lines = [line for flight in flights for line in _describe(flight)]
     if directory is not None:
         lines.append(_picture(flights, test, Path(directory)))
         lines += _recordings(flights, test, Path(directory))
     return "\n".join(lines)
 
 
-def _each(flown: Iterable[Fleet | Flight | ServedFlight]) -> list[Flight | ServedFlight]:
+def _flatten(flown: Iterable[SimulatedFleet | Flight | ServedFlight]) -> list[Flight | ServedFlight]:
     flights: list[Flight | ServedFlight] = []
-    for each in flown:
-        flights += each if isinstance(each, Fleet) else [each]
+    for flight in flown:
+        flights += flight if isinstance(flight, SimulatedFleet) else [flight]
     return flights
 
 
-def _told(flight: Flight | ServedFlight) -> list[str]:
+def _describe(flight: Flight | ServedFlight) -> list[str]:
     try:
-        return _story(flight)
-    except Exception as error:  # the vehicle makes a mistake just now; the failure is to be told all the same
+        return _describe_flight(flight)
+    except Exception as error:  # The vehicle itself raises, but the failed test must be reported.
         return [f"{flight.simulated!r} fails: {error!r}"]
 
 
-def _story(flight: Flight | ServedFlight) -> list[str]:
+def _describe_flight(flight: Flight | ServedFlight) -> list[str]:
     track, texts = flight.track, flight.journal.texts
     if not track:
         return [f"{track.name}: not switched on"]
@@ -54,11 +55,11 @@ def _story(flight: Flight | ServedFlight) -> list[str]:
         f" up to {track.max_altitude_m:.1f} m high and {track.max_distance_m:.1f} m away",
         f"  ended {track.end}",
     ]
-    return [*lines, *_last(texts)]
+    return [*lines, *_text_lines(texts)]
 
 
-def _last(texts: Sequence[SaidText]) -> list[str]:
-    return [f"  said at {text}" for text in texts[-_TEXTS:]]
+def _text_lines(texts: Sequence[SentText]) -> list[str]:
+    return [f"  text at {text}" for text in texts[-_MAX_TEXTS:]]
 
 
 def _path(test: str, directory: Path, ending: str) -> Path:
@@ -70,13 +71,13 @@ def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Pat
     try:
         directory.mkdir(parents=True, exist_ok=True)
         save_picture([flight.track for flight in flights], path)
-    except OSError as error:  # the failure is to be told all the same
+    except OSError as error:  # The failed test must be reported without a picture, too.
         return f"no picture: {error}"
     return f"track in {path}"
 
 
 def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
-    """A file for each link, and a report for each vehicle."""
+    """Save a file for each link, and a report for each vehicle."""
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
     for flight in flights:
         by_recording.setdefault(id(flight.recording), []).append(flight)
@@ -90,9 +91,7 @@ def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: 
             path.write_bytes(recording.to_bytes())
             lines.append(f"recording in {path}")
             lines += [_report(path, flight, len(group)) for flight in group]
-        except (
-            Exception
-        ) as error:  # nothing was said on the link, or the disk is full: the failure is to be told
+        except Exception as error:  # Nothing was sent on the link, or the disk is full.
             lines.append(f"no report: {error}")
     return lines
 
@@ -105,5 +104,5 @@ def _report(path: Path, flight: Flight | ServedFlight, count: int) -> str:
     try:
         write_report(path, target, system_id=system_id, force=True)
     except ModuleNotFoundError:
-        return "no report of it: pip install 'aerokit-mavlink[report]'"
+        return "no report: pip install 'aerokit-mavlink[report]'"
     return f"report in {target}"

@@ -1,4 +1,4 @@
-"""``FaultModel``: what a bad radio does to frames; ``FaultyPath``: does it, one direction, without IO and clock."""
+"""``FaultModel``: effects of a bad radio on frames; ``FaultyPath``: applies them to one direction, without I/O."""
 
 from __future__ import annotations
 
@@ -15,34 +15,35 @@ _SECONDS = ("delay_s", "jitter_s", "overtaken_s")
 
 
 class FaultModel(Snapshot):
-    """One direction of a radio link. Without arguments it changes nothing.
+    """Faults of one direction of a radio link; none by default.
 
-    Shares are probabilities from 0 to 1 for each frame, independent of each other and of what came before.
-    Raises InvalidArgument for a field that makes no sense.
+    Shares are probabilities from 0 to 1 for each frame, independent of each other and of previous frames.
+
+    Raises InvalidArgument for a value out of range.
     """
 
     loss: float = 0.0
-    """Share of the frames that are gone."""
+    """Share of lost frames."""
     duplication: float = 0.0
-    """Share of the frames that arrive twice, the copy right behind the first one."""
+    """Share of frames that arrive twice; the copy follows at once."""
     reordering: float = 0.0
-    """Share of the frames that are held back, so that later ones overtake them."""
+    """Share of frames that are delayed, so that later ones overtake them."""
     corruption: float = 0.0
-    """Share of the frames in which one to eight bits are flipped."""
+    """Share of frames in which one to eight bits are flipped."""
     delay_s: float = 0.0
-    """Seconds from one end to the other."""
+    """Latency in seconds."""
     jitter_s: float = 0.0
-    """Up to so many seconds are added at random; frames keep their order all the same, as in any queue."""
+    """Maximum random delay in seconds that is added; frames keep their order, as in a queue."""
     overtaken_s: float = 0.05
-    """Seconds that a frame is held back by ``reordering``."""
+    """Delay in seconds of frames that are reordered."""
     bandwidth: float = math.inf
-    """Bytes per second; a serial line or radio of 57,600 baud moves about 5,760. What is too much waits in a queue."""
+    """Bytes per second; a serial line or radio of 57,600 baud transfers about 5,760. Excess frames are queued."""
     queue_bytes: float = math.inf
-    """What does not fit into the queue any more is dropped; a telemetry radio has room for some 4,000 bytes."""
+    """Size of the queue; frames beyond it are dropped. Telemetry radios have about 4,000 bytes."""
     outages: tuple[tuple[float, float], ...] = ()
-    """Times (begin, end), in seconds since the link was opened, in which everything that is sent is lost."""
+    """Intervals (begin, end), in seconds since the link was opened, in which all frames are lost."""
     per_frame: bool = True
-    """Every MAVLink frame suffers its own fate, as on a radio; False: whole writes and datagrams do."""
+    """True applies faults to each MAVLink frame, as a radio does; False to whole writes and datagrams."""
 
     def _check(self) -> None:
         for name in _SHARES:
@@ -58,17 +59,17 @@ class FaultModel(Snapshot):
 
 
 class Air:
-    """What is transmitted on: busy until its last frame has left. Two directions that share one are half duplex."""
+    """A transmission medium, busy until its last frame was sent. Two directions that share one are half duplex."""
 
     def __init__(self) -> None:
         self.busy_until: float = -math.inf
 
 
 class FaultyPath:
-    """One direction. The same model, seed, frames and times always give the same result.
+    """One direction. Equal model, seed, frames and times produce equal results.
 
-    Counters: ``frames`` and ``bytes`` that were put in, and the frames that were ``lost`` (outages included),
-    ``overflowed`` (no room in the queue), ``duplicated``, ``reordered`` and ``corrupted``.
+    Counters: ``frames`` and ``bytes`` that were passed in, and frames that were ``lost`` (including outages),
+    ``overflowed`` (queue full), ``duplicated``, ``reordered`` and ``corrupted``.
     """
 
     frames: int
@@ -91,11 +92,11 @@ class FaultyPath:
         self._latest_due = -math.inf
 
     def start(self, now: float) -> None:
-        """The times of outages count from here; otherwise from the first frame."""
+        """Start the time of the outages; by default the first frame does."""
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        """What becomes of a write or datagram: (when it arrives, bytes), in the order of sending."""
+        """Return the arrivals (time, bytes) of a write or datagram, in the order of sending."""
         if self._started_at is None:
             self.start(now)
         arrivals: list[tuple[float, bytes]] = []
@@ -104,7 +105,7 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        # Always as many draws, so that the other faults stay where they were when one share is changed.
+        # Always draw as many numbers, so that changing one share does not move the other faults.
         model, draws = self.model, [self._chance() for _ in range(5)]
         lost, doubled = draws[0] < model.loss, draws[1] < model.duplication
         held, bad, jitter = (
@@ -133,7 +134,7 @@ class FaultyPath:
         return [(due, frame)] * (1 + doubled)
 
     def _transmit(self, size: int, now: float) -> float | None:
-        """When the last byte has left; None when there is no room to wait."""
+        """Return the time at which the last byte was sent; None if the queue is full."""
         model, air = self.model, self._air
         begin = max(now, air.busy_until)
         if math.isinf(model.bandwidth):
@@ -158,9 +159,9 @@ class FaultyPath:
 
 
 def split_frames(data: bytes) -> Sequence[bytes]:
-    """The MAVLink frames of a write or datagram; what is no frame, or only the beginning of one, is one piece.
+    """Split a write or datagram into MAVLink frames; other bytes and partial frames are one piece.
 
-    Only lengths are looked at, no checksums.
+    Only lengths are checked, no checksums.
     """
     pieces: list[bytes] = []
     begin, size = 0, len(data)

@@ -1,4 +1,4 @@
-"""`FaultInjector`: what goes wrong with a simulated vehicle, in readable verbs, at once or at a simulated second."""
+"""`FaultInjector`: injects faults into a simulated vehicle, at once or at a simulated time."""
 
 from __future__ import annotations
 
@@ -9,99 +9,100 @@ from typing import Any
 
 from aerokit.errors import InvalidArgument
 from aerokit.sim.faults import Faults
-from aerokit.sim.motion import Wind
-from aerokit.sim.track import true_point
-from aerokit.sim.track_points import TrackPoint
-from aerokit.testing.stage import Stagehand
+from aerokit.sim.motion import SimulatedWind
+from aerokit.testing.stage import FlightScheduler
+from aerokit.testing.track import true_point
+from aerokit.testing.track_points import TrackPoint
 
-OnStage = Callable[[Callable[[Stagehand], None]], None]
-"""Lets a stagehand plan something, as of now."""
+# Calls a function with the scheduler of the flight.
+ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
 class FaultInjector:
-    """Every verb acts at once, or ``after_s`` simulated seconds from now, and, where it says so, for ``for_s``.
+    """Methods inject a fault at once, or ``after_s`` simulated seconds from now, and some for a duration ``for_s``.
 
-    Before the flight is opened, seconds count from its opening. Raises InvalidArgument for times and shares
-    that make no sense. What is planned happens even if the vehicle reboots meanwhile.
+    Before the flight is opened, times count from its opening. Scheduled faults survive a reboot of the vehicle.
+    Raises InvalidArgument for times and shares out of range.
     """
 
-    def __init__(self, vehicle: Any, on_stage: OnStage) -> None:
+    def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
         self._vehicle = vehicle
-        self._on_stage = on_stage
+        self._schedule_with = schedule_with
 
     def when(self, condition: Callable[[TrackPoint], bool]) -> FaultInjector:
-        """The same verbs, acting once this is true of where the vehicle is; seconds count from there.
+        """Return an injector whose faults start once this condition on the true state is met; times count from there.
 
-        It is asked ten times a simulated second: ``faults.when(lambda here: here.altitude_m > 15).lose_gps()``.
+        The condition is checked ten times per simulated second: ``faults.when(lambda point: point.altitude_m >
+        15).lose_gps()``.
         """
 
         def is_true() -> bool:
             return condition(true_point(self._vehicle))
 
-        def wait(use: Callable[[Stagehand], None]) -> None:
-            self._on_stage(lambda hand: hand.do_when(is_true, partial(use, hand)))
+        def wait(use: Callable[[FlightScheduler], None]) -> None:
+            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(use, scheduler)))
 
         return FaultInjector(self._vehicle, wait)
 
     @property
     def all(self) -> Faults:
-        """Everything that can go wrong, such as refused commands; see `aerokit.sim.Faults`."""
+        """All faults of the vehicle, such as refused commands; see `aerokit.sim.Faults`."""
         faults: Faults = self._vehicle.faults
         return faults
 
     def lose_gps(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """No GPS fix any more; the estimator gives its position up seconds later."""
+        """Lose the GPS fix; the estimator drops its position some seconds later."""
         self._set("gps_lost", True, False, after_s, for_s)
 
     def lose_rc(self, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """The pilot's transmitter is off."""
+        """Switch the pilot's transmitter off."""
         self._set("rc_lost", True, False, after_s, for_s)
 
     def fail_motor(self, *, after_s: float = 0.0) -> None:
-        """A motor stands still: it comes down."""
+        """Stop a motor, so that the vehicle falls."""
         self._set("motor_failed", True, False, after_s, None)
 
     def drop_packets(self, share: float, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Lose this share of the packets, 0 to 1, in both directions; the same ones for the same seed."""
+        """Lose this share of packets, 0 to 1, in both directions; determined by the seed."""
         if not 0.0 <= share <= 1.0:
             raise InvalidArgument(f"share = {share!r} is not allowed: 0 to 1")
         self._set("loss", share, 0.0, after_s, for_s)
         self._set("loss_incoming", share, 0.0, after_s, for_s)
 
     def go_silent(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """The radio is out: nothing gets through in either direction, the vehicle flies on. None is for ever."""
+        """Interrupt the radio in both directions; the vehicle continues to fly. None is without an end."""
         self._set("silent", True, False, after_s, for_s)
 
     def hang(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """The autopilot neither hears, moves nor sends. None is for ever."""
+        """Freeze the autopilot: it does not receive, move or send. None is without an end."""
         self._set("frozen", True, False, after_s, for_s)
 
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:
-        """Its arming checks give this reason besides the real ones."""
+        """Add a reason to the failed arming checks."""
         reasons = self.all.prearm_failures
         self._plan(partial(reasons.append, reason), after_s)
         if for_s is not None:
             self._plan(partial(reasons.remove, reason), after_s + _duration(for_s))
 
     def reboot(self, *, after_s: float = 0.0) -> None:
-        """It reboots, in the air as on the ground."""
+        """Reboot the vehicle, also in flight."""
         self._plan(self._vehicle.restart, after_s)
 
     def set_wind(
         self, *, north_m_s: float = 0.0, east_m_s: float = 0.0, gusts_m_s: float = 0.0, after_s: float = 0.0
     ) -> None:
-        """Where the air goes from now on, in m/s; gusts as their standard deviation."""
-        wind = Wind(north_m_s, east_m_s, gusts_m_s)
+        """Set the wind in m/s, as the direction in which the air moves; gusts are a standard deviation."""
+        wind = SimulatedWind(north_m_s, east_m_s, gusts_m_s)
         self._plan(partial(setattr, self._vehicle.motion, "wind", wind), after_s)
 
     def set_battery(self, percent: float, *, after_s: float = 0.0) -> None:
-        """So much charge is left, 0 to 100; it is drained from there."""
+        """Set the remaining battery charge, 0 to 100; it drains from there."""
         if not 0.0 <= percent <= 100.0:
             raise InvalidArgument(f"percent = {percent!r} is not allowed: 0 to 100")
         self._plan(partial(setattr, self._vehicle.battery, "percent", percent), after_s)
 
     def end(self, *, after_s: float = 0.0) -> None:
-        """Everything that a vehicle can recover from is well again: GPS, radios, motor, processor."""
+        """End all faults that a vehicle can recover from: GPS, radios, motor, processor."""
         for name in ("gps_lost", "rc_lost", "motor_failed", "silent", "frozen"):
             self._set(name, False, False, after_s, None)
         self.drop_packets(0.0, after_s=after_s)
@@ -115,7 +116,7 @@ class FaultInjector:
     def _plan(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):
             raise InvalidArgument(f"after_s = {after_s!r} must be 0 or more seconds")
-        self._on_stage(lambda hand: hand.do(action, after_s=after_s))
+        self._schedule_with(lambda scheduler: scheduler.do(action, after_s=after_s))
 
 
 def _duration(for_s: float) -> float:

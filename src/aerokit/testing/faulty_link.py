@@ -1,4 +1,4 @@
-"""``FaultyLink``: a bad radio around any link, for tests, benchmarks and trying out what a program does then.
+"""``FaultyLink``: a bad radio around any link, for tests and benchmarks.
 
 ```python
 radio = FaultyLink(
@@ -25,8 +25,8 @@ from aerokit.testing.fault_model import Air, FaultModel, FaultyPath
 from aerokit.transport.link import (
     LINGER_S,
     DrainListener,
-    HelmListener,
     Link,
+    OrderRefusalListener,
     Peer,
     PeerListener,
     Receiver,
@@ -37,10 +37,10 @@ from aerokit.transport.outbox import Outbox
 LIMIT = 256 * 1024
 
 
-class StalledLine:
-    """As a TCP connection whose other side has stopped: the system takes ``system_bytes``, the rest waits.
+class StalledQueue:
+    """A stalled TCP connection: the operating system accepts ``system_bytes``, the rest is queued.
 
-    ``carry(data, peer)`` is what happens to bytes that leave; ``dropped`` and ``stalled`` are those of an `Outbox`.
+    ``carry(data, peer)`` sends bytes; ``dropped`` and ``stalled`` are callbacks of an `Outbox`.
     """
 
     def __init__(
@@ -53,29 +53,29 @@ class StalledLine:
         self._room, self._carry, self._dropped, self._stalled = system_bytes, carry, dropped, stalled
         self._system: list[tuple[bytes, Peer]] = []
         self._outboxes: dict[Peer, Outbox] = {}
-        self._stalled_ones: set[Peer] = set()
-        self._is_stuck = True
+        self._stalled_peers: set[Peer] = set()
+        self._is_stalled = True
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that wait here or in the system."""
+        """Bytes in the queues and in the operating system."""
         return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     def write(self, data: bytes, peer: Peer) -> None:
-        """As `Link.write`."""
+        """See `Link.write`."""
         outbox = self._outboxes.get(peer)
         if outbox is None:
             outbox = self._outboxes[peer] = self._new_outbox(peer)
         outbox.write(data)
 
     def discard(self) -> None:
-        """Take back what the system does not have."""
+        """Discard bytes that the operating system has not accepted."""
         for outbox in self._outboxes.values():
             outbox.discard()
 
     def drain(self) -> None:
-        """What the system has goes out, and what has not waited for too long."""
-        self._is_stuck = False
+        """Send the bytes of the operating system, and queued ones that have not expired."""
+        self._is_stalled = False
         system, self._system = self._system, []
         for data, peer in system:
             self._carry(data, peer)
@@ -83,7 +83,7 @@ class StalledLine:
             outbox.resume()
 
     def close(self) -> None:
-        """What the system has is forgotten with it."""
+        """Close the queues, without sending what the operating system has accepted."""
         for outbox in self._outboxes.values():
             outbox.discard()
             outbox.close()
@@ -94,14 +94,14 @@ class StalledLine:
             partial(self._in_system, peer),
             limit=LIMIT,
             dropped=self._dropped,
-            stalled=partial(self._tell, peer),
+            stalled=partial(self._on_peer_stalled, peer),
         )
-        if self._is_stuck and not self._room:
+        if self._is_stalled and not self._room:
             outbox.pause()
         return outbox
 
     def _take(self, data: bytes, peer: Peer) -> None:
-        if not self._is_stuck:
+        if not self._is_stalled:
             self._carry(data, peer)
             return
         self._system.append((data, peer))
@@ -110,22 +110,22 @@ class StalledLine:
                 outbox.pause()
 
     def _in_system(self, peer: Peer) -> int:
-        return sum(len(data) for data, each in self._system if each == peer)
+        return sum(len(data) for data, receiver in self._system if receiver == peer)
 
-    def _tell(self, peer: Peer, is_stalled: bool) -> None:
-        (self._stalled_ones.add if is_stalled else self._stalled_ones.discard)(peer)
-        self._stalled(bool(self._stalled_ones))
+    def _on_peer_stalled(self, peer: Peer, is_stalled: bool) -> None:
+        (self._stalled_peers.add if is_stalled else self._stalled_peers.discard)(peer)
+        self._stalled(bool(self._stalled_peers))
 
 
 class FaultyLink(Link):
-    """Loses, repeats, delays and damages what another link brings and takes, as `FaultModel` says.
+    """Loses, duplicates, delays and corrupts the traffic of another link, as `FaultModel` specifies.
 
-    ``outgoing`` is what this program writes, ``incoming`` what it receives; ``model`` is for the one of them that is
-    not given. Each direction has its own random numbers, made from ``seed``; on virtual time the same program has the
-    same bad luck each time. ``half_duplex`` lets both directions take turns on one frequency, each with its own
+    ``outgoing`` applies to what this program writes, ``incoming`` to what it receives; ``model`` is the default of
+    both. Each direction has random numbers of its own, derived from ``seed``, so that a program on virtual time gets
+    the same faults in every run. ``half_duplex`` makes both directions share the medium, each with its own
     ``bandwidth``.
 
-    The wrapped link must not be open yet, and belongs to this one from now on.
+    The wrapped link must not be open, and belongs to this one from now on.
     """
 
     def __init__(
@@ -143,87 +143,87 @@ class FaultyLink(Link):
         model = FaultModel() if model is None else model
         air = Air() if half_duplex else None
         self.outgoing: FaultyPath = FaultyPath(outgoing or model, (seed, "outgoing"), air)
-        """What happens to what is written, with its counters; its ``model`` may be replaced at any time."""
+        """Outgoing direction with its counters; its ``model`` may be replaced at any time."""
         self.incoming: FaultyPath = FaultyPath(incoming or model, (seed, "incoming"), air)
-        """What happens to what is received."""
-        self._ears: _Ears | None = None
-        self._on_the_way: _Timetable | None = None
+        """Incoming direction with its counters."""
+        self._incoming_path: _IncomingPath | None = None
+        self._in_flight: _DeliveryQueue | None = None
         self._is_closed = False
-        self._line: StalledLine | None = None  # None: it has never stalled
+        self._stalled_queue: StalledQueue | None = None  # None before the first stall.
         self._stalled_at: float | None = None
-        self._too_late = 0
+        self._expired = 0
         self._drained = asyncio.Event()
         self._drained.set()
 
     @property
     def address(self) -> str:  # type: ignore[override]
-        """``faulty(udpin:0.0.0.0:14550)``."""
+        """Such as ``faulty(udpin:0.0.0.0:14550)``."""
         return f"faulty({self.link.address})"
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """What the wrapped link dropped, what had no room in the queue, and what a stall kept for too long.
+        """Writes that the wrapped link dropped, that overflowed a queue, or that expired during a stall.
 
-        What was lost on its way is none.
+        Frames lost in transit do not count.
         """
-        return self.link.dropped_writes + self.outgoing.overflowed + self._too_late
+        return self.link.dropped_writes + self.outgoing.overflowed + self._expired
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; what is on its way through the air has left."""
-        return self.link.unsent_bytes + (0 if self._line is None else self._line.unsent_bytes)
+        """See `Link.unsent_bytes`; bytes in transit do not count."""
+        return self.link.unsent_bytes + (0 if self._stalled_queue is None else self._stalled_queue.unsent_bytes)
 
     def discard_unsent(self) -> None:
         """See `Link.discard_unsent`."""
-        if self._line is not None:
-            self._line.discard()
+        if self._stalled_queue is not None:
+            self._stalled_queue.discard()
         self.link.discard_unsent()
 
     def stall(self, system_bytes: int = 0) -> None:
-        """From now on what is written does not leave, until :meth:`drain`: as over TCP when the network is away.
+        """Stop sending until :meth:`drain`, like TCP over an interrupted network.
 
-        The system takes ``system_bytes`` of it, which arrive after :meth:`drain`, whenever that is; the rest waits for
-        at most a second, can be taken back by :meth:`discard_unsent`, and is dropped then. The link must be open.
+        The operating system accepts ``system_bytes``, which arrive after :meth:`drain`. The rest is dropped after a
+        second unless it is sent before; :meth:`discard_unsent` discards it. The link must be open.
         """
-        if self._line is not None:
-            self._line.close()
-        self._line = StalledLine(system_bytes, self._carry, self._count_too_late, self._tell_stalled)
+        if self._stalled_queue is not None:
+            self._stalled_queue.close()
+        self._stalled_queue = StalledQueue(system_bytes, self._carry, self._count_expired, self._on_stalled)
 
     def drain(self) -> None:
-        """What was written leaves again."""
-        if self._line is not None:
-            self._line.drain()
+        """Resume sending after :meth:`stall`."""
+        if self._stalled_queue is not None:
+            self._stalled_queue.drain()
 
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""
         if self._is_closed:
             raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
-        if self._ears is not None:
-            raise BusyError(f"{self.address} is open; a link is opened once")
+        if self._incoming_path is not None:
+            raise BusyError(f"{self.address} is open; a link can be opened only once")
         loop = asyncio.get_running_loop()
-        self._on_the_way = _Timetable(loop)
-        self._ears = _Ears(self.incoming, receiver, self._lost)
+        self._in_flight = _DeliveryQueue(loop)
+        self._incoming_path = _IncomingPath(self.incoming, receiver, self._lost)
         self.outgoing.start(loop.time())
         self.incoming.start(loop.time())
         try:
-            await self.link.open(self._ears)
+            await self.link.open(self._incoming_path)
         except BaseException:
-            self._ears.close()
-            self._on_the_way.clear()
-            self._ears = self._on_the_way = None
+            self._incoming_path.close()
+            self._in_flight.clear()
+            self._incoming_path = self._in_flight = None
             raise
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; what is lost on its way is no dropped write."""
-        if self._on_the_way is None or self._is_closed:
+        """See `Link.write`; a frame lost in transit is not a dropped write."""
+        if self._in_flight is None or self._is_closed:
             return
-        if self._line is not None:
-            self._line.write(bytes(data), peer)
+        if self._stalled_queue is not None:
+            self._stalled_queue.write(bytes(data), peer)
         else:
             self._carry(data, peer)
 
     def _carry(self, data: bytes, peer: Peer) -> None:
-        on_the_way = self._on_the_way
+        on_the_way = self._in_flight
         if on_the_way is None:
             return
         for due, piece in self.outgoing.carry(bytes(data), on_the_way.loop.time()):
@@ -246,15 +246,15 @@ class FaultyLink(Link):
         return self.link.has_peer(peer)
 
     def close(self) -> None:
-        """See `Link.close`; what is on its way still goes out, unless that takes longer than `LINGER_S`."""
+        """See `Link.close`; frames in transit are still delivered, for up to `LINGER_S`."""
         if self._is_closed:
             return
         self._is_closed = True
-        if self._line is not None:
-            self._line.close()
-        if self._ears is not None:
-            self._ears.close()
-        on_the_way = self._on_the_way
+        if self._stalled_queue is not None:
+            self._stalled_queue.close()
+        if self._incoming_path is not None:
+            self._incoming_path.close()
+        on_the_way = self._in_flight
         if on_the_way is None or on_the_way.loop.is_closed() or not on_the_way:
             self.link.close()
             return
@@ -266,11 +266,11 @@ class FaultyLink(Link):
         await self._drained.wait()
         await self.link.wait_closed()
 
-    def _count_too_late(self, writes: int) -> None:
-        self._too_late += writes
+    def _count_expired(self, writes: int) -> None:
+        self._expired += writes
 
-    def _tell_stalled(self, is_stalled: bool) -> None:
-        ears, now, since = self._ears, asyncio.get_running_loop().time(), self._stalled_at
+    def _on_stalled(self, is_stalled: bool) -> None:
+        ears, now, since = self._incoming_path, asyncio.get_running_loop().time(), self._stalled_at
         if ears is None or is_stalled == (since is not None):
             return
         self._stalled_at = now if is_stalled else None
@@ -280,11 +280,11 @@ class FaultyLink(Link):
             ears.link_drained(now - since)
 
     def _lost(self) -> None:
-        """What is on its way out meets nobody any more."""
-        if self._line is not None:
-            self._line.close()
-        if self._on_the_way is not None:
-            self._on_the_way.clear()
+        """Discard the outgoing frames in transit."""
+        if self._stalled_queue is not None:
+            self._stalled_queue.close()
+        if self._in_flight is not None:
+            self._in_flight.clear()
         self._drained.set()
 
     def _close_link(self) -> None:
@@ -292,27 +292,27 @@ class FaultyLink(Link):
         self.link.close()
 
 
-class _Ears:
-    """What the wrapped link calls."""
+class _IncomingPath:
+    """Receiver of the wrapped link."""
 
     def __init__(self, path: FaultyPath, receiver: Receiver, when_lost: Callable[[], None]) -> None:
         self._path, self._receiver, self._when_lost = path, receiver, when_lost
         self.keeps_peers = keeps_peers(receiver)
-        self._on_the_way = _Timetable(asyncio.get_running_loop())
+        self._in_flight = _DeliveryQueue(asyncio.get_running_loop())
         self._is_closed = False
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""
-        for due, piece in self._path.carry(data, self._on_the_way.loop.time()):
-            if self._is_closed:  # by the receiver
+        for due, piece in self._path.carry(data, self._in_flight.loop.time()):
+            if self._is_closed:  # Closed by the receiver.
                 return
-            self._on_the_way.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
+            self._in_flight.put(due, lambda piece=piece: self._receiver.bytes_received(piece, peer))  # type: ignore[misc]
 
     def link_lost(self, error: LinkLost) -> None:
-        """See `Receiver`; what is on its way is heard before."""
+        """See `Receiver`; frames in transit are delivered before."""
         self._when_lost()
         if not self._is_closed:
-            self._on_the_way.put(self._on_the_way.latest_due, lambda: self._receiver.link_lost(error))
+            self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
 
     def link_stalled(self, unsent_bytes: int) -> None:
         """See `DrainListener`."""
@@ -324,10 +324,10 @@ class _Ears:
         if not self._is_closed and isinstance(self._receiver, DrainListener):
             self._receiver.link_drained(stalled_s)
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
-        """See `HelmListener`."""
-        if not self._is_closed and isinstance(self._receiver, HelmListener):
-            self._receiver.order_refused(message, reason, helm, answers)
+    def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
+        """See `OrderRefusalListener`."""
+        if not self._is_closed and isinstance(self._receiver, OrderRefusalListener):
+            self._receiver.order_refused(message, reason, lease_holder, answers)
 
     def peer_joined(self, peer: Peer) -> None:
         """See `PeerListener`."""
@@ -341,11 +341,11 @@ class _Ears:
 
     def close(self) -> None:
         self._is_closed = True
-        self._on_the_way.clear()
+        self._in_flight.clear()
 
 
-class _Timetable:
-    """Does things when they are due, in order, those of one instant in the order they were put in; one timer."""
+class _DeliveryQueue:
+    """Runs actions when they are due, in order, with a single timer."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
@@ -353,13 +353,13 @@ class _Timetable:
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0  # uvloop's handle of a time that is past does not tell it
+        self._timer_at = 0.0  # uvloop's TimerHandle.when() fails for a time that has passed.
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """At once when it is due and nothing waits, so that a radio without faults is no radio at all."""
+        """Run the action at once if it is due and the queue is empty, so that a radio without faults adds no delay."""
         if due <= self.loop.time() and not self._waiting:
             action()
             return
@@ -384,10 +384,10 @@ class _Timetable:
 
     def _run(self) -> None:
         self._timer = None
-        now = max(self.loop.time(), self._waiting[0][0])  # a timer may fire a hair early
+        now = max(self.loop.time(), self._waiting[0][0])  # A timer may fire slightly early.
         try:
             while self._waiting and self._waiting[0][0] <= now:
                 heappop(self._waiting)[2]()
-        finally:  # what an action raised is for the loop to report; the others are done all the same
+        finally:  # The loop reports an exception of an action; the other actions still run.
             if self._waiting:
                 self._schedule()

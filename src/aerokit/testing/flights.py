@@ -1,4 +1,4 @@
-"""`Flight`: a simulated vehicle, the program's vehicle on it, what may go wrong, and what was flown.
+"""`Flight`: a simulated vehicle in a test, with the program's vehicle, faults and track.
 
 ```python
 async with open_flight("copter", seed=3) as flight:
@@ -21,20 +21,20 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 import aerokit
 from aerokit.errors import InvalidArgument
 from aerokit.sim.kinds import simulated
-from aerokit.sim.picture import save_picture
 from aerokit.sim.server import SimulatorServer
-from aerokit.sim.track import least_distance_m
 from aerokit.testing.clock import run_virtual
 from aerokit.testing.faults import FaultInjector
-from aerokit.testing.stage import FlightRecording, Stagehand
+from aerokit.testing.picture import save_picture
+from aerokit.testing.stage import FlightRecording, FlightScheduler
+from aerokit.testing.track import min_distance_m
 from aerokit.transport import memory_link_pair
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from aerokit.sim.journal import Journal
-    from aerokit.sim.track import Track
     from aerokit.sim.vehicle import SimulatedVehicle
+    from aerokit.testing.journal import Journal
+    from aerokit.testing.track import Track
     from aerokit.transport import Link
 
 T = TypeVar("T")
@@ -42,40 +42,40 @@ _BOOT_TIME_S = 1.0
 
 
 class Flight:
-    """One simulated vehicle in a test. Faults can be planned before it is opened; the track stays afterwards."""
+    """A simulated vehicle in a test. Faults can be scheduled before it is opened; the track remains afterwards."""
 
-    def __init__(self, fleet: Fleet, number: int) -> None:
+    def __init__(self, fleet: SimulatedFleet, number: int) -> None:
         self._fleet = fleet
         self.simulated: Any = fleet._vehicles[number]
-        """The simulated vehicle, such as `aerokit.sim.SimulatedCopter`: its battery, parameters, motion …"""
-        self.track: Track = fleet._stagehand.tracks[number]
-        """Where it truly was."""
-        self.journal: Journal = fleet._stagehand.journals[number]
-        """What it said, and the orders that it heard."""
-        self.faults: FaultInjector = FaultInjector(self.simulated, fleet._on_stage)
-        """What goes wrong with it."""
+        """The simulated vehicle, such as `aerokit.sim.SimulatedCopter`: battery, parameters, motion …"""
+        self.track: Track = fleet._scheduler.tracks[number]
+        """True track of the vehicle."""
+        self.journal: Journal = fleet._scheduler.journals[number]
+        """Texts that it sent and messages that it received."""
+        self.faults: FaultInjector = FaultInjector(self.simulated, fleet._schedule_with)
+        """Injects faults."""
         self._vehicle: aerokit.Vehicle | None = None
 
     @property
     def vehicle(self) -> aerokit.Vehicle:
-        """The program's vehicle, connected; RuntimeError when the flight is not open."""
+        """The program's vehicle, connected; RuntimeError if the flight is not open."""
         if self._vehicle is None:
             self._fleet._check_open()
-            raise RuntimeError("nobody connected: this flight was opened with connect=False; use flight.link")
+            raise RuntimeError("no vehicle: this flight was opened with connect=False; connect to flight.link")
         return self._vehicle
 
     @property
     def recording(self) -> FlightRecording | None:
-        """All that goes over its link, with ``record=True`` only; of a fleet all of them together."""
+        """Recording of the link, shared by a fleet; None without ``record=True``."""
         return self._fleet.recording
 
     @property
     def link(self) -> Link:
-        """For programs that connect by themselves, in the place of an address; needs ``connect=False``."""
+        """The program's end of the link, for programs that connect themselves; needs ``connect=False``."""
         return self._fleet.link
 
     def run(self, main: Callable[[Flight], Awaitable[T]]) -> T:
-        """Open the flight, await ``main(flight)`` on virtual time, close it: for a test without ``async``."""
+        """Open the flight, run ``main(flight)`` on virtual time and close it; for tests without ``async``."""
 
         async def fly() -> T:
             async with self._fleet.open():
@@ -84,10 +84,10 @@ class Flight:
         return run_virtual(fly())
 
 
-class Fleet(Sequence[Flight]):
-    """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It is opened once.
+class SimulatedFleet(Sequence[Flight]):
+    """Simulated vehicles on one link, with system ids 1, 2, 3 …; a sequence of `Flight`. It can be opened once.
 
-    They stand side by side, ``spacing_m`` metres apart, eastwards from the ``home`` of the first.
+    They stand in a row, ``spacing_m`` metres apart, to the east of the ``home`` of the first.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ class Fleet(Sequence[Flight]):
     ) -> None:
         options.setdefault("boot_time_s", _BOOT_TIME_S)
         self._vehicles = _side_by_side(kinds, spacing_m, **options)
-        self._stagehand = Stagehand(self._vehicles)
+        self._scheduler = FlightScheduler(self._vehicles)
         self._connect, self._latency_s = connect, latency_s
         self.recording: FlightRecording | None = FlightRecording() if record else None
-        """All that goes over their link, with ``record=True`` only."""
+        """Recording of the link; None without ``record=True``."""
         self._server: SimulatorServer | None = None
         self._link: Link | None = None
         self._was_opened = False
@@ -126,25 +126,23 @@ class Fleet(Sequence[Flight]):
         return [flight.vehicle for flight in self._flights]
 
     @property
-    def least_distance_m(self) -> float:
-        """The nearest that any two of them came to each other, in space; infinity for less than two."""
+    def min_distance_m(self) -> float:
+        """Minimum distance of any two vehicles in space; infinity for fewer than two."""
         return self._nearest()[0]
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """No two of them came nearer to each other than this, in space; they begin 5 m apart."""
+        """Assert that no two vehicles came nearer to each other than this, in space; they start 5 m apart."""
         __tracebackhide__ = True
         nearest, time_s, names = self._nearest()
-        assert nearest >= distance_m, (
-            f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
-        )
+        assert nearest >= distance_m, f"{names} came nearer than {distance_m:g} m: {nearest:.1f} m at {time_s:.1f} s"
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Draw the tracks of all of them in one picture; see `aerokit.sim.picture.save_picture`."""
+        """Draw all tracks in one picture; see `aerokit.testing.picture.save_picture`."""
         save_picture([flight.track for flight in self], path)
 
     def _nearest(self) -> tuple[float, float, str]:
         pairs = [
-            (*least_distance_m(one.track, other.track), f"{one.track.name} and {other.track.name}")
+            (*min_distance_m(one.track, other.track), f"{one.track.name} and {other.track.name}")
             for one, other in combinations(self, 2)
         ]
         return min(pairs, default=(math.inf, 0.0, ""))
@@ -154,14 +152,12 @@ class Fleet(Sequence[Flight]):
         """The program's end of the link, to be opened by it; needs ``connect=False``."""
         self._check_open()
         if self._connect:
-            raise RuntimeError(
-                "this link is in use: open the flight with connect=False to connect by yourself"
-            )
+            raise RuntimeError("this link is in use: open the flight with connect=False to connect by yourself")
         assert self._link is not None
         return self._link
 
-    def run(self, main: Callable[[Fleet], Awaitable[T]]) -> T:
-        """Open the fleet, await ``main(fleet)`` on virtual time, close it: for a test without ``async``."""
+    def run(self, main: Callable[[SimulatedFleet], Awaitable[T]]) -> T:
+        """Open the fleet, run ``main(fleet)`` on virtual time and close it; for tests without ``async``."""
 
         async def fly() -> T:
             async with self.open():
@@ -170,24 +166,22 @@ class Fleet(Sequence[Flight]):
         return run_virtual(fly())
 
     @asynccontextmanager
-    async def open(self) -> AsyncIterator[Fleet]:
-        """Switch everybody on, and connect; when the block is left, nothing but the tracks is left.
+    async def open(self) -> AsyncIterator[SimulatedFleet]:
+        """Switch the vehicles on and connect; tracks and journals remain after the block.
 
-        Raises RuntimeError the second time.
+        Raises RuntimeError if it was opened before.
         """
         if self._was_opened:
-            raise RuntimeError("this flight was opened before: each test has its own")
+            raise RuntimeError("this flight was opened before; create a new one")
         self._was_opened = True
         near, far = memory_link_pair(latency_s=self._latency_s)
         async with AsyncExitStack() as stack:
             self._link = near
-            self._server = await stack.enter_async_context(
-                SimulatorServer([self._stagehand, *self._vehicles], far)
-            )
+            self._server = await stack.enter_async_context(SimulatorServer([self._scheduler, *self._vehicles], far))
             if self.recording is not None:
-                self.recording.follow(self._server)
+                self.recording.attach(self._server)
             stack.callback(self._close)
-            self._stagehand.follow(self._catch_up)
+            self._scheduler.refresh_with(self._refresh)
             if self._connect:
                 await self._connect_all(near, stack)
             yield self
@@ -201,17 +195,17 @@ class Fleet(Sequence[Flight]):
 
     def _close(self) -> None:
         try:
-            self._catch_up()
+            self._refresh()
         finally:
-            self._stagehand.follow(None)
+            self._scheduler.refresh_with(None)
             self._server = self._link = None
             for flight in self._flights:
                 flight._vehicle = None
 
-    def _catch_up(self) -> None:
+    def _refresh(self) -> None:
         if self._server is not None:
             self._server.wake()
-            self._stagehand.record()
+            self._scheduler.record()
 
     def _check_open(self) -> None:
         if self._server is None:
@@ -220,9 +214,9 @@ class Fleet(Sequence[Flight]):
                 " flight.run(main), in a fixture `async with open_flight()`"
             )
 
-    def _on_stage(self, plan: Callable[[Stagehand], None]) -> None:
-        self._catch_up()
-        plan(self._stagehand)
+    def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
+        self._refresh()
+        plan(self._scheduler)
         if self._server is not None:
             self._server.wake()
 
@@ -242,31 +236,35 @@ def _side_by_side(
 
 @asynccontextmanager
 async def open_flight(kind: str = "copter", **options: Any) -> AsyncIterator[Flight]:
-    """A vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane"), connected.
+    """Open a connected vehicle of a kind ("copter", "plane", "rover", "sub", "px4", "px4_plane").
 
-    ``connect=False`` leaves connecting to the program, by ``flight.link``; ``latency_s`` passes on the way in
-    both directions; ``record=True`` keeps all that goes over the link, for the report of a test that fails. Other
-    options are those of the simulated vehicle: ``seed``, ``home``, ``parameters``, ``battery_percent`` …
-    Raises InvalidArgument for a kind that does not exist.
+    ``connect=False`` lets the program connect to ``flight.link``; ``latency_s`` delays both directions;
+    ``record=True`` records the link for the report of a failed test. Other options are those of the simulated
+    vehicle: ``seed``, ``home``, ``parameters``, ``battery_percent`` …
+
+    Raises InvalidArgument for an unknown kind.
     """
-    fleet = Fleet(kind, **options)
+    fleet = SimulatedFleet(kind, **options)
     async with fleet.open():
         yield fleet._flights[0]
 
 
-def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> AbstractAsyncContextManager[Fleet]:
-    """Vehicles of these kinds, or ``count`` of one kind, on one link, as `open_flight` opens one.
+def open_fleet(*kinds: str, count: int | None = None, **options: Any) -> AbstractAsyncContextManager[SimulatedFleet]:
+    """Open vehicles of these kinds, or ``count`` of one kind, on one link; options as of `open_flight`.
 
-    They stand ``spacing_m`` metres apart (5), eastwards from the ``home`` of the first.
+    They stand ``spacing_m`` metres (5) apart, to the east of the ``home`` of the first.
     """
-    return Fleet(*repeated(kinds, count), **options).open()
+    return SimulatedFleet(*expand_kinds(kinds, count), **options).open()
 
 
-def repeated(kinds: Sequence[str], count: int | None) -> Sequence[str]:
-    """The kinds, or one kind so many times; InvalidArgument for what makes no sense."""
+def expand_kinds(kinds: Sequence[str], count: int | None) -> Sequence[str]:
+    """Return the kinds, or one kind ``count`` times.
+
+    Raises InvalidArgument for ``count`` with several kinds or below 1.
+    """
     kinds = kinds or ("copter",)
     if count is None:
         return kinds
     if len(kinds) != 1 or count < 1:
-        raise InvalidArgument(f"count = {count!r} goes with one kind, and is 1 or more")
+        raise InvalidArgument(f"count = {count!r} needs a single kind, and must be 1 or more")
     return list(kinds) * count

@@ -6,55 +6,60 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.sim.kinds import simulated, wait_longer
+from aerokit.sim.kinds import scale_timeouts, simulated
 from aerokit.sim.server import SimulatorServer, open_simulator
 from aerokit.testing.faults import FaultInjector
 from aerokit.testing.interruption import Interruption
-from aerokit.testing.stage import FlightRecording, Stagehand
+from aerokit.testing.stage import FlightRecording, FlightScheduler
 
 if TYPE_CHECKING:
     from anyio.from_thread import BlockingPortal
 
-    from aerokit.sim.journal import Journal
-    from aerokit.sim.track import Track
+    from aerokit.testing.journal import Journal
+    from aerokit.testing.track import Track
 
 SPEEDUP = 10.0
-"""Simulated seconds in a real one, unless a test says otherwise."""
+"""Default number of simulated seconds per second."""
 
 
 class ServedFlight:
-    """One simulated vehicle that a thread of its own serves, faster than real time. Seconds are simulated ones."""
+    """A simulated vehicle that a thread serves faster than real time. Seconds are simulated."""
 
     def __init__(
         self,
         portal: BlockingPortal,
         server: SimulatorServer,
-        hand: Stagehand,
+        scheduler: FlightScheduler,
         vehicle: Any,
         interruption: Interruption,
         recording: FlightRecording | None = None,
     ) -> None:
         self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
-        """Where programs connect to, such as "tcp:127.0.0.1:5760"."""
+        """Address to connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
-        """The simulated vehicle; it lives on another thread: read it, change it by the verbs of ``faults``."""
-        self.track: Track = hand.tracks[0]
-        """Where it truly was."""
-        self.journal: Journal = hand.journals[0]
-        """What it said, and the orders that it heard."""
-        self.faults: FaultInjector = FaultInjector(vehicle, lambda plan: portal.call(self._on_stage, plan))
-        """What goes wrong with it."""
+        """The simulated vehicle. It runs on another thread: read it, and change it by the methods of ``faults``."""
+        self.track: Track = scheduler.tracks[0]
+        """True track of the vehicle."""
+        self.journal: Journal = scheduler.journals[0]
+        """Texts that it sent and messages that it received."""
+        self.faults: FaultInjector = FaultInjector(vehicle, lambda plan: portal.call(self._schedule_with, plan))
+        """Injects faults."""
         self.recording: FlightRecording | None = recording
-        """All that goes over its link, with ``record=True`` only."""
-        self._portal, self._server, self._hand, self._interruption = portal, server, hand, interruption
-        self._is_told = False
-        hand.follow(lambda: portal.call(self._catch_up))
+        """Recording of its link; None without ``record=True``."""
+        self._portal, self._server, self._scheduler, self._interruption = (
+            portal,
+            server,
+            scheduler,
+            interruption,
+        )
+        self._is_raised = False
+        scheduler.refresh_with(lambda: portal.call(self._refresh))
 
     @contextmanager
-    def failing_at_once(self) -> Iterator[None]:
-        """Raise what the simulated vehicle raises, as soon as it does, in the place of what it causes.
+    def raising_vehicle_errors(self) -> Iterator[None]:
+        """Raise an exception of the simulated vehicle as soon as it occurs, in place of its consequences.
 
-        Its link is closed, which ends calls that wait for the vehicle; and the main thread is interrupted, as by
+        Its link is closed, which ends calls that wait for the vehicle, and the main thread is interrupted as by
         Ctrl-C, which ends programs that poll.
         """
         try:
@@ -68,35 +73,35 @@ class ServedFlight:
     def _raise_failure(self) -> None:
         failure = self._server.failure
         if failure is not None:
-            self._is_told = True
+            self._is_raised = True
             raise failure from failure.__cause__
 
     @contextmanager
-    def _telling_once(self) -> Iterator[None]:
+    def _raising_once(self) -> Iterator[None]:
         try:
             yield
         except Exception as error:
-            if not self._is_told or error is not self._server.failure:
+            if not self._is_raised or error is not self._server.failure:
                 raise
 
-    def _catch_up(self) -> None:
+    def _refresh(self) -> None:
         if self._server.failure is None:
             self._server.wake()
-        self._hand.record()
+        self._scheduler.record()
 
-    def _on_stage(self, plan: Callable[[Stagehand], None]) -> None:
-        self._catch_up()
-        plan(self._hand)
+    def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
+        self._refresh()
+        plan(self._scheduler)
         self._server.wake()
 
 
 @contextmanager
 def serve_flight(kind: str = "copter", **options: Any) -> Iterator[ServedFlight]:
-    """Serve a vehicle of a kind while the block runs; ``options`` are those of the vehicle, and of `hosted_flight`.
+    """Serve a vehicle while the block runs; ``options`` are those of the vehicle and of `hosted_flight`.
 
-    A mistake inside the simulated vehicle ends the block at once, as `ServedFlight.failing_at_once` does.
+    An exception in the simulated vehicle ends the block at once, see `ServedFlight.raising_vehicle_errors`.
     """
-    with hosted_flight(kind, **options) as flight, flight.failing_at_once():
+    with hosted_flight(kind, **options) as flight, flight.raising_vehicle_errors():
         yield flight
 
 
@@ -109,36 +114,35 @@ def hosted_flight(
     record: bool = False,
     **options: Any,
 ) -> Iterator[ServedFlight]:
-    """Serve a vehicle of a kind on an address while the block runs; ``options`` are those of the vehicle.
+    """Serve a vehicle on an address while the block runs; ``options`` are those of the vehicle.
 
-    It waits ``speedup`` times as long for what the program sends by its own clock, unless ``parameters`` says
-    otherwise: see `aerokit.sim.patience.wait_longer`.
-    Raises InvalidArgument for a wrong kind or address, LinkOpenError for one that cannot be opened, and at the
-    end what the vehicle raised, if nobody was told of it.
+    Timeouts of the vehicle for the client are multiplied by ``speedup``, except those in ``parameters``; see
+    `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, LinkOpenError if the
+    address cannot be opened, and on exit an exception of the vehicle that was not raised before.
     """
     from anyio.from_thread import start_blocking_portal
 
     options.setdefault("boot_time_s", 1.0)
     vehicle: Any = simulated(kind, **options)
-    wait_longer([vehicle], speedup, leave=options.get("parameters") or ())
-    hand, interruption = Stagehand([vehicle]), Interruption()
+    scale_timeouts([vehicle], speedup, leave=options.get("parameters") or ())
+    scheduler, interruption = FlightScheduler([vehicle]), Interruption()
     recording = FlightRecording() if record else None
 
     @asynccontextmanager
     async def serve() -> AsyncIterator[SimulatorServer]:
         with interruption.at_an_error():
-            async with open_simulator([hand, vehicle], address, speedup=speedup) as server:
+            async with open_simulator([scheduler, vehicle], address, speedup=speedup) as server:
                 if recording is not None:
-                    recording.follow(server)
+                    recording.attach(server)
                 yield server
 
     with start_blocking_portal() as portal:
         serving = portal.wrap_async_context_manager(serve())
-        flight = ServedFlight(portal, serving.__enter__(), hand, vehicle, interruption, recording)
+        flight = ServedFlight(portal, serving.__enter__(), scheduler, vehicle, interruption, recording)
         try:
             yield flight
         finally:
-            portal.call(hand.record)
-            hand.follow(None)
-            with flight._telling_once():
+            portal.call(scheduler.record)
+            scheduler.refresh_with(None)
+            with flight._raising_once():
                 serving.__exit__(None, None, None)

@@ -1,4 +1,4 @@
-"""What stands beside simulated vehicles in a test: an agenda in simulated time, their tracks and journals."""
+"""Runs beside the simulated vehicles of a test: scheduled actions, tracks, journals and the recording of the link."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.tlog import TlogWriter
-from aerokit.sim.journal import Journal
-from aerokit.sim.track import record_track, true_point
 from aerokit.sim.vehicle import SimulatedVehicle
+from aerokit.testing.journal import Journal
+from aerokit.testing.track import record_track, true_point
 
 if TYPE_CHECKING:
     from aerokit.sim.channel import Channel
     from aerokit.sim.server import SimulatorServer
-    from aerokit.sim.track import Track
+    from aerokit.testing.track import Track
 
-_LOOK_S = 0.1
-"""How often conditions are looked at, in simulated seconds."""
+# Interval in simulated seconds at which conditions are checked.
+_POLL_INTERVAL_S = 0.1
 
 
-class Stagehand(SimulatedVehicle):
-    """On the links with the vehicles, but dumb: it does what is planned at its simulated second.
+class FlightScheduler(SimulatedVehicle):
+    """A silent vehicle on the links that runs scheduled actions.
 
-    A timer of a vehicle is forgotten when the vehicle reboots and late when it hangs; one of these is not. Give it
-    to the server before the vehicles: it steps them to the instant of what it does.
+    Its timers survive a reboot of a vehicle, and are not delayed while a vehicle is frozen. Pass it to the server
+    before the vehicles: it advances them to the time of each action.
     """
 
     def __init__(self, vehicles: Sequence[Any]) -> None:
         super().__init__(system_id=0, component_id=0, seed=0, components=())
         self._vehicles = vehicles
         self.tracks: list[Track] = [record_track(vehicle) for vehicle in vehicles]
-        """Of each vehicle, in their order."""
+        """Tracks in the order of the vehicles."""
         self.journals: list[Journal] = [Journal() for _ in vehicles]
-        """The same."""
+        """Journals in the order of the vehicles."""
         for vehicle, journal in zip(vehicles, self.journals, strict=True):
             vehicle.journal = journal
 
     def step(self, now: float) -> None:
-        """See `SimulatedVehicle`."""
+        """Advance all vehicles to each action, and run it."""
         while (due := self.next_due) <= now:
             for vehicle in self._vehicles:
                 vehicle.step(max(due, vehicle.now))
@@ -47,46 +47,46 @@ class Stagehand(SimulatedVehicle):
         super().step(now)
 
     def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
-        """It has no ears."""
+        """Ignore the data."""
         self.step(now)
 
     def boot(self) -> None:
-        """It is there at once."""
+        """Do nothing."""
 
     def start_channel(self, channel: Channel) -> None:
-        """It sends nothing."""
+        """Send nothing."""
 
     def do(self, action: Callable[[], None], *, after_s: float) -> None:
-        """Do it now, or so many simulated seconds later."""
+        """Run an action after ``after_s`` simulated seconds; 0 runs it at once."""
         if after_s:
             self.call_later(after_s, action)
         else:
             action()
 
     def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
-        """Do it as soon as the condition holds, looked at ten times a simulated second; once."""
+        """Run an action once, when a condition is true; it is checked ten times per simulated second."""
         if condition():
             action()
         else:
-            self.call_later(_LOOK_S, lambda: self.do_when(condition, action))
+            self.call_later(_POLL_INTERVAL_S, lambda: self.do_when(condition, action))
 
     def record(self) -> None:
-        """Write down where everybody is now, besides what the tracks note by themselves."""
+        """Append the current points to the tracks."""
         for vehicle, track in zip(self._vehicles, self.tracks, strict=True):
             track.append(true_point(vehicle))
 
-    def follow(self, catch_up: Callable[[], None] | None) -> None:
-        """See `Track.follow`."""
+    def refresh_with(self, refresh: Callable[[], None] | None) -> None:
+        """See `Track.refresh_with`."""
         for track in self.tracks:
-            track.follow(catch_up)
+            track.refresh_with(refresh)
 
 
-_BEGAN_AT = 1_790_000_000.0
-"""UTC of the simulated second 0: the same in every run."""
+# UTC at simulated second 0, the same in every run.
+_UTC_AT_START = 1_790_000_000.0
 
 
 class FlightRecording:
-    """Kept in memory, some kilobytes a simulated second, because most tests succeed."""
+    """A .tlog in memory, of some kilobytes per simulated second."""
 
     def __init__(self) -> None:
         self._file = BytesIO()
@@ -95,14 +95,14 @@ class FlightRecording:
         for framer in self._framers:
             framer.keep_unknown = True
 
-    def follow(self, server: SimulatorServer) -> None:
-        """Record what this server sends and hears from now on."""
-        server.on_datagram = self._take
+    def attach(self, server: SimulatorServer) -> None:
+        """Record the traffic of this server from now on."""
+        server.on_datagram = self._write
 
     def to_bytes(self) -> bytes:
-        """The file."""
+        """Return the content of the file."""
         return self._file.getvalue()
 
-    def _take(self, time_s: float, data: bytes, is_sent: bool) -> None:
+    def _write(self, time_s: float, data: bytes, is_sent: bool) -> None:
         for frame in self._framers[is_sent].receive(data, time_s):
-            self._writer.write(frame.raw, _BEGAN_AT + time_s)
+            self._writer.write(frame.raw, _UTC_AT_START + time_s)

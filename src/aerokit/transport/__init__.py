@@ -1,6 +1,6 @@
-"""Bytes in, bytes out: UDP, TCP, serial, zenoh, memory, recordings, and a bad radio around any of them.
+"""Links that carry bytes: UDP, TCP, serial ports, zenoh, memory and recordings.
 
-Only this package touches sockets and ports.
+Only this package uses sockets and serial ports.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     from aerokit.transport.create import create_link as create_link
     from aerokit.transport.link import BurstListener as BurstListener
     from aerokit.transport.link import DrainListener as DrainListener
-    from aerokit.transport.link import HelmListener as HelmListener
     from aerokit.transport.link import Link as Link
+    from aerokit.transport.link import MemoryLink as MemoryLink
+    from aerokit.transport.link import OrderRefusalListener as OrderRefusalListener
     from aerokit.transport.link import Peer as Peer
     from aerokit.transport.link import PeerKeeper as PeerKeeper
     from aerokit.transport.link import PeerListener as PeerListener
     from aerokit.transport.link import Receiver as Receiver
-    from aerokit.transport.memory import MemoryLink as MemoryLink
-    from aerokit.transport.memory import memory_link_pair as memory_link_pair
-    from aerokit.transport.reconnecting import Interruptible as Interruptible
+    from aerokit.transport.link import memory_link_pair as memory_link_pair
+    from aerokit.transport.multilink import LinkPeer as LinkPeer
+    from aerokit.transport.multilink import MemberLinkListener as MemberLinkListener
+    from aerokit.transport.multilink import MultiLink as MultiLink
+    from aerokit.transport.reconnecting import InterruptionListener as InterruptionListener
     from aerokit.transport.reconnecting import ReconnectingLink as ReconnectingLink
     from aerokit.transport.replay import Replay as Replay
     from aerokit.transport.serial import PtyLink as PtyLink
     from aerokit.transport.serial import SerialLink as SerialLink
-    from aerokit.transport.several import LinkPeer as LinkPeer
-    from aerokit.transport.several import OneOfSeveralListener as OneOfSeveralListener
-    from aerokit.transport.several import SeveralLinks as SeveralLinks
     from aerokit.transport.tcp import TcpConnect as TcpConnect
     from aerokit.transport.tcp import TcpListen as TcpListen
     from aerokit.transport.udp import UdpBroadcast as UdpBroadcast
@@ -54,18 +54,19 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "aerokit.transport.link": (
             "BurstListener",
             "DrainListener",
-            "HelmListener",
             "Link",
+            "MemoryLink",
+            "OrderRefusalListener",
             "Peer",
             "PeerKeeper",
             "PeerListener",
             "Receiver",
+            "memory_link_pair",
         ),
-        "aerokit.transport.memory": ("MemoryLink", "memory_link_pair"),
-        "aerokit.transport.reconnecting": ("Interruptible", "ReconnectingLink"),
+        "aerokit.transport.reconnecting": ("InterruptionListener", "ReconnectingLink"),
         "aerokit.transport.replay": ("Replay",),
         "aerokit.transport.serial": ("PtyLink", "SerialLink"),
-        "aerokit.transport.several": ("LinkPeer", "OneOfSeveralListener", "SeveralLinks"),
+        "aerokit.transport.multilink": ("LinkPeer", "MemberLinkListener", "MultiLink"),
         "aerokit.transport.tcp": ("TcpConnect", "TcpListen"),
         "aerokit.transport.udp": ("UdpBroadcast", "UdpConnect", "UdpListen"),
         "aerokit.transport.zenoh.connect": ("ZenohConnect",),

@@ -1,4 +1,4 @@
-"""Connection strings: DroneKit's and pymavlink's spellings and URLs, read into one form."""
+"""``parse_address``: connection strings of DroneKit and pymavlink, and URLs."""
 
 from __future__ import annotations
 
@@ -6,61 +6,53 @@ import math
 import re
 from typing import Literal, NoReturn
 
+from aerokit._internal.formatting import did_you_mean
 from aerokit._internal.values import Snapshot
-from aerokit._internal.wording import did_you_mean
 from aerokit.errors import InvalidArgument
 
-LinkKind = Literal[
-    "udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"
-]
+LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial", "replay", "pty", "zenoh", "zenohin"]
 
 ACCEPTED_FORMS = """\
   127.0.0.1:14550  udp:0.0.0.0:14550  udpin:0.0.0.0:14550  udp://:14550   listen for UDP
   udpout:192.168.1.12:14550  udpout://192.168.1.12:14550                  send UDP to one host
-  udpbcast:192.168.1.255:14550                                            broadcast, then talk to who answers
+  udpbcast:192.168.1.255:14550                                            broadcast, then use the peer that answers
   tcp:127.0.0.1:5760  tcp://127.0.0.1:5760  tcpout:127.0.0.1:5760         connect by TCP
   tcpin:0.0.0.0:5760                                                      wait for TCP clients
   /dev/ttyACM0  /dev/ttyUSB0,57600  COM14  COM14,115200                   serial port, with its baud rate
   serial:///dev/ttyUSB0:57600  serial://COM3:57600?rtscts=1               the same, with flow control
   flight.tlog  replay:flight.tlog?speed=2  file:///logs/flight.tlog       replay a recording
   pty  pty:/tmp/ttyV0                                                     a pseudo-terminal, and a name for it
-  zenoh://fleet/alpha  zenoh://fleet/alpha?connect=tcp/10.0.0.5:7447      what a zenoh network has of this name
-  zenohin://fleet/alpha?listen=tcp/0.0.0.0:7447                           put it there, for clients of zenoh:
-  an IPv6 address stands in brackets: udpin:[::1]:14550"""
-"""What an address may look like, for error messages and help texts."""
+  zenoh://fleet/alpha  zenoh://fleet/alpha?connect=tcp/10.0.0.5:7447      a vehicle on a zenoh network, by name
+  zenohin://fleet/alpha?listen=tcp/0.0.0.0:7447                           serve that name, for clients of zenoh:
+  IPv6 addresses need brackets: udpin:[::1]:14550"""
+"""Forms of a connection string, for error messages and help texts."""
 
 
 class LinkAddress(Snapshot):
-    """A connection string, taken apart; ``str()`` gives the canonical one, which parses back to the same."""
+    """A parsed connection string. ``str()`` returns its canonical form, which parses to the same value."""
 
     kind: LinkKind
     host: str = ""
-    """Name or IP address without brackets; "0.0.0.0" where none was given to listen on."""
+    """Name or IP address without brackets; "0.0.0.0" for listening without a host."""
     port: int = 0
-    """0 to 65535; 0 only for listening: the system chooses."""
+    """1 to 65535, or 0 for listening: the system chooses."""
     device: str = ""
     """Serial port, e.g. "/dev/ttyACM0" or "COM14"."""
     baud: int | None = None
-    """Bits per second; None when the string does not say."""
+    """Bits per second; None if not given."""
     path: str = ""
-    """File of a recording; of a pseudo-terminal the symbolic link to its other end, "" for none.
-
-    On a zenoh network fleet and name: "fleet/alpha".
-    """
+    """File of a recording; symbolic link of a pseudo-terminal, "" for none; "fleet/name" on a zenoh network."""
     options: tuple[tuple[str, str], ...] = ()
-    """The rest, sorted.
-
-    ``rtscts`` is "1"; ``speed`` a factor, "inf" as fast as it goes; ``timeout`` is in seconds. ``costly`` is "1" for
-    one of several links that is used only when the others fail.
-    """
+    """Options, sorted: ``rtscts`` ("1"), ``speed`` (a factor, or "inf"), ``timeout`` (seconds), ``costly`` ("1") and
+    those of zenoh."""
 
     def __str__(self) -> str:
-        as_written = _quote_option if self.kind in _ON_NETWORKS else str
+        as_written = _quote_option if self.kind in _ZENOH_KINDS else str
         query = "&".join(f"{key}={as_written(value)}" for key, value in self.options)
         return self._without_options() + (f"?{query}" if query else "")
 
     def option(self, name: str) -> str | None:
-        """The value of one option, None when it was not given."""
+        """Return the value of an option, or None if it is not given."""
         return dict(self.options).get(name)
 
     def _without_options(self) -> str:
@@ -71,23 +63,25 @@ class LinkAddress(Snapshot):
             return f"replay:{'//' if self.path.startswith('//') else ''}{_quote(self.path)}"
         if self.kind == "pty":
             return f"pty:{self.path}" if self.path else "pty"
-        if self.kind in _ON_NETWORKS:
+        if self.kind in _ZENOH_KINDS:
             return f"{self.kind}://{self.path}"
         return f"{self.kind}:{host_and_port(self.host, self.port)}"
 
 
 def parse_address(text: str) -> LinkAddress:
-    """Reads a connection string.
+    """Parse a connection string.
 
-    A bare ``host:port`` and ``udp:`` listen, as with DroneKit and pymavlink. In the forms with a scheme,
-    ``%20`` and its like in devices and paths are decoded, as in any URL. Raises InvalidArgument that says
-    what is wrong and lists the accepted forms.
+    A bare ``host:port`` and ``udp:`` listen, as in DroneKit and pymavlink. In forms with a scheme, percent-encoded
+    characters of devices and paths are decoded.
+
+    Raises:
+        InvalidArgument: the string is wrong; the text has the reason and the accepted forms.
     """
     return _Parser(text).parse()
 
 
 def host_and_port(host: str, port: int) -> str:
-    """``host:port`` with brackets where the host is an IPv6 address."""
+    """Return ``host:port``, with brackets around an IPv6 address."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -110,7 +104,7 @@ _OPTIONS: dict[LinkKind, tuple[str, ...]] = {
     "tcp": ("timeout",),
     "serial": ("baud", "rtscts"),
     "replay": ("speed",),
-    "zenoh": ("connect", "listen", "mode", "config", "client", "helm", "timeout"),
+    "zenoh": ("connect", "listen", "mode", "config", "client", "control", "timeout"),
     "zenohin": ("connect", "listen", "mode", "config"),
 }
 
@@ -118,13 +112,13 @@ _LISTENING = ("udpin", "tcpin")
 
 _NEVER_COSTLY = ("replay", "pty")
 
-_ON_NETWORKS = ("zenoh", "zenohin")
+_ZENOH_KINDS = ("zenoh", "zenohin")
 
-_CHOICES = {"mode": ("peer", "client"), "helm": ("free", "take", "never")}
+_CHOICES = {"mode": ("peer", "client"), "control": ("free", "take", "never")}
 
-_AS_IT_IS = ("connect", "listen", "config", "client")  # names and paths: in upper and lower case
+_CASE_SENSITIVE = ("connect", "listen", "config", "client")
 
-_NOT_HERE = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")  # pymavlink knows these
+_PYMAVLINK_ONLY = ("uds", "unix", "mcast", "ws", "wss", "wsserver", "csv")
 
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^/].*", re.IGNORECASE | re.DOTALL)
 
@@ -136,8 +130,8 @@ _RECORDING = re.compile(r".*\.tlog(\?[^/\\]*)?", re.IGNORECASE | re.DOTALL)
 
 _DATAFLASH = re.compile(r".*\.(bin|log|px4log|ulg)", re.IGNORECASE | re.DOTALL)
 
+# A missing colon: ``udp//:14550``, ``tcp/127.0.0.1:5760``, ``127.0.0.1/14550``.
 _WITHOUT_COLON = re.compile(r"([^/\\:.~,][^/\\:]*)(//+|/(?=([^/\\]*:)?\d+$))")
-"""A path of no device: ``udp//:14550``, ``tcp/127.0.0.1:5760``, ``127.0.0.1/14550``."""
 
 _COM_PORT = re.compile(r"com\d+([,:].*)?", re.IGNORECASE)
 
@@ -160,8 +154,6 @@ _YES_AND_NO = {
 
 
 class _Parser:
-    """One run over one string; keeps it for the error messages."""
-
     def __init__(self, text: str) -> None:
         self.text = text
 
@@ -170,7 +162,7 @@ class _Parser:
         if not text:
             self.fail("it is empty")
         if "\0" in text:
-            self.fail("it has a NUL character in it")
+            self.fail("it contains a NUL character")
         if text.lower() == "pty" or text.lower().startswith("pty:"):
             return LinkAddress("pty", path=text[len("pty:") :])
         scheme, rest = self.split_scheme(text)
@@ -181,11 +173,11 @@ class _Parser:
         return self.bare(text)
 
     def split_scheme(self, text: str) -> tuple[str, str]:
-        """The scheme in lower case and what follows it; "" when the string has none."""
+        """Return the scheme in lower case ("" if there is none), and the rest."""
         if match := _URL.fullmatch(text):
             return match[1].lower(), match[2]
         match = _SCHEME.fullmatch(text)
-        if match and match[1].lower() in (*_SCHEMES, *_NOT_HERE, "http", "https", "ftp"):
+        if match and match[1].lower() in (*_SCHEMES, *_PYMAVLINK_ONLY, "http", "https", "ftp"):
             return match[1].lower(), match[2]
         return "", text
 
@@ -198,7 +190,7 @@ class _Parser:
         if kind == "replay":
             drive = scheme == "file" and re.match(r"/[a-z]:[/\\]", rest, re.IGNORECASE)
             return self.replay(_unquote(rest[1:] if drive else rest), options)
-        if kind in _ON_NETWORKS:
+        if kind in _ZENOH_KINDS:
             return self.named(kind, rest.removesuffix("/"), options)
         return self.network(kind, rest.removesuffix("/"), options)
 
@@ -207,7 +199,7 @@ class _Parser:
             end = text.lower().rindex(".tlog") + len(".tlog")
             return self.replay(text[:end], self.options("replay", text[end + 1 :]))
         if _DATAFLASH.fullmatch(text):
-            self.fail("this is a log of the autopilot's own format, not a recording of MAVLink (.tlog)")
+            self.fail("this is a log in the autopilot's own format, not a MAVLink recording (.tlog)")
         if match := _WITHOUT_COLON.match(text):
             self.fail_without_colon(match[1].lower(), match[0], text)
         if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
@@ -222,14 +214,14 @@ class _Parser:
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
-                self.fail(f"{text!r} does not begin with an IPv6 address in brackets")
+                self.fail(f"{text!r} does not start with an IPv6 address in brackets")
         else:
             host, colon, tail = text.rpartition(":")
             if not colon:
                 host, tail = tail, ""
             tail = colon + tail
             if _is_ipv6(host):
-                self.fail("an IPv6 address must stand in brackets, as in [::1]:14550")
+                self.fail("an IPv6 address needs brackets, as in [::1]:14550")
             if host.isdigit() and not tail:
                 self.fail(f"the host is missing, as in {kind}:127.0.0.1:{host}")
         if not host and kind in _LISTENING:
@@ -240,17 +232,15 @@ class _Parser:
             self.fail("broadcast exists in IPv4 only")
         if not _is_ipv6(host) and not _HOST.fullmatch(host):
             self.fail(f"{host!r} is not a host")
-        return LinkAddress(
-            kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items()))
-        )
+        return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
 
     def named(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        from aerokit.transport.zenoh.keys import check_name  # few addresses need it
+        from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):
             for endpoint in filter(None, options.get(key, "").split(",")):
                 if not _ENDPOINT.fullmatch(endpoint):
-                    self.fail(f"{key}={endpoint} is no endpoint of zenoh, as tcp/10.0.0.5:7447 is")
+                    self.fail(f"{key}={endpoint} is not a zenoh endpoint such as tcp/10.0.0.5:7447")
         fleet, slash, name = text.partition("/")
         if not slash:
             self.fail(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")
@@ -302,7 +292,7 @@ class _Parser:
                 known = ", ".join(allowed) or "none"
                 meant = did_you_mean(key, allowed)
                 self.fail(f"{key!r} is not an option of {kind} links (they have: {known}){meant}")
-            if key in _AS_IT_IS:
+            if key in _CASE_SENSITIVE:
                 found[key] = _unquote(value.strip()) or self.fail(f"{key}= is empty")
             else:
                 found[key] = self.option_value(key, value.strip().lower())
@@ -317,7 +307,7 @@ class _Parser:
             return value
         if key in _CHOICES:
             if value not in _CHOICES[key]:
-                self.fail(f"{key}={value} is none of {', '.join(_CHOICES[key])}")
+                self.fail(f"{key}={value} is not one of {', '.join(_CHOICES[key])}")
             return value
         if key in ("rtscts", "costly"):
             if value not in _YES_AND_NO:
@@ -338,26 +328,22 @@ class _Parser:
 
     def fail_without_colon(self, scheme: str, begin: str, text: str) -> NoReturn:
         if scheme not in _SCHEMES:
-            self.fail(
-                f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}"
-            )
+            self.fail(f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}")
         self.fail(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
 
     def fail_scheme(self, scheme: str) -> NoReturn:
-        known = (
-            "pymavlink has it, aerokit does not" if scheme in _NOT_HERE else "there is no such kind of link"
-        )
+        known = "supported by pymavlink, not by aerokit" if scheme in _PYMAVLINK_ONLY else "unknown kind of link"
         self.fail(f"{scheme}: {known}{did_you_mean(scheme, _SCHEMES)}")
 
     def fail(self, reason: str) -> NoReturn:
-        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # a broker's, with a password
+        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # hide the password of a broker's URL
         raise InvalidArgument(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
 
 
 def _is_ipv6(text: str) -> bool:
     if ":" not in text:
         return False
-    import ipaddress  # as urllib below: few addresses need it
+    import ipaddress  # imported here, like urllib below, because few addresses need it
 
     try:
         ipaddress.IPv6Address(text)
@@ -367,7 +353,7 @@ def _is_ipv6(text: str) -> bool:
 
 
 def _quote(text: str) -> str:
-    """Percent-encodes only what would be misread: ``%``, ``?`` and white space."""
+    """Percent-encode only ``%``, ``?`` and white space."""
     from urllib.parse import quote
 
     return re.sub(r"[%?\s]", lambda match: quote(match[0], safe=""), text)

@@ -1,4 +1,4 @@
-"""From a connection string to a link that is ready to be opened."""
+"""``create_link``: make an unopened link from a connection string."""
 
 from __future__ import annotations
 
@@ -9,24 +9,28 @@ from aerokit.transport.address import LinkAddress, parse_address
 
 if TYPE_CHECKING:
     from aerokit.transport.link import Link
-    from aerokit.transport.sockets import Peers
+    from aerokit.transport.sockets import PeerFilter
     from aerokit.transport.zenoh.session import NetworkOptions
 
 
-def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers | None = None) -> Link:
-    """The link that a connection string describes; nothing is opened yet.
+def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFilter | None = None) -> Link:
+    """Make the link that a connection string describes, without opening it.
 
-    ``baud`` is for serial ports whose string does not say one. ``peers`` are the IP addresses and networks that are
-    listened to, where anybody could send or connect: udpin, udpbcast, tcpin. Raises InvalidArgument for a wrong
-    address, with the reason and the accepted forms, and for wrong ``peers``.
+    Args:
+        address: a connection string, or the result of :func:`parse_address`.
+        baud: bits per second of a serial port whose string has none.
+        peers: IP addresses and networks to accept, for udpin, udpbcast and tcpin; None: all.
+
+    Raises:
+        InvalidArgument: the address or ``peers`` are wrong.
     """
     where = address if isinstance(address, LinkAddress) else parse_address(address)
     if peers is not None and where.kind not in ("udpin", "udpbcast", "tcpin"):
         raise InvalidArgument(
-            f"peers = … is not allowed with {where}: nobody else can send there (allowed: udpin, udpbcast, tcpin)"
+            f"peers = … is not allowed with {where}: only udpin, udpbcast and tcpin accept any sender"
         )
     if where.kind == "serial":
-        from aerokit.transport.serial import SerialLink  # each kind when it is wanted: a program has one link
+        from aerokit.transport.serial import SerialLink  # imported here because a program has few kinds
 
         return SerialLink(where.device, where.baud or baud, rtscts=where.option("rtscts") == "1")
     if where.kind == "replay":
@@ -44,7 +48,7 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: Peers |
     return _udp(where, peers)
 
 
-def _tcp(where: LinkAddress, peers: Peers | None) -> Link:
+def _tcp(where: LinkAddress, peers: PeerFilter | None) -> Link:
     from aerokit.transport.tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
 
     if where.kind == "tcpin":
@@ -54,12 +58,10 @@ def _tcp(where: LinkAddress, peers: Peers | None) -> Link:
 
 
 def network_options(where: LinkAddress) -> NetworkOptions:
-    """How an address of a network says that a program is connected to it."""
+    """Return the zenoh options of an address."""
     from aerokit.transport.zenoh.session import NetworkOptions
 
-    connect, listen = (
-        tuple(filter(None, (where.option(each) or "").split(","))) for each in ("connect", "listen")
-    )
+    connect, listen = (tuple(filter(None, (where.option(key) or "").split(","))) for key in ("connect", "listen"))
     return NetworkOptions(connect, listen, where.option("mode") or "", where.option("config") or "")
 
 
@@ -77,12 +79,12 @@ def _zenoh(where: LinkAddress) -> Link:
         name,
         options=options,
         client=where.option("client") or "",
-        wish=where.option("helm") or "free",
+        control=where.option("control") or "free",
         open_timeout_s=float(where.option("timeout") or OPEN_TIMEOUT_S),
     )
 
 
-def _udp(where: LinkAddress, peers: Peers | None) -> Link:
+def _udp(where: LinkAddress, peers: PeerFilter | None) -> Link:
     from aerokit.transport.udp import UdpBroadcast, UdpConnect, UdpListen
 
     if where.kind == "udpin":

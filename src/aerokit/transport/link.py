@@ -1,4 +1,4 @@
-"""The contract of every link: bytes in by callback, bytes out without waiting."""
+"""``Link``: the interface of all links, with receive callbacks and non-blocking writes; base class and memory link."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import enum
 import errno
 import socket
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Hashable
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
@@ -14,174 +15,170 @@ from typing import Any, Protocol, runtime_checkable
 from aerokit.errors import BusyError, ConnectionClosed, LinkError, LinkLost, LinkOpenError
 
 Peer = Hashable
-"""Who sent the bytes, to be handed back to `Link.write`; None where there is only one. Opaque."""
+"""Opaque identifier of a remote end, to be passed to `Link.write`; None for links with a single remote end."""
 
 
 class Receiver(Protocol):
-    """What a link calls, always on the loop it was opened on and never from inside `Link.write`.
+    """Callbacks of a link. They run on the loop that opened the link, and never inside `Link.write`.
 
-    Calls may come before `Link.open` has returned to its caller, and none comes after `Link.close`. They must
-    not raise: what they raise goes to the loop's exception handler, and a stream link may end by it.
+    Callbacks may run before `Link.open` returns; none runs after `Link.close`. They must not raise: an exception goes
+    to the loop's exception handler and may end a stream link.
     """
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Bytes came in: a datagram, or any piece of a stream."""
+        """Process a datagram, or any part of a stream."""
 
     def link_lost(self, error: LinkLost) -> None:
-        """The link has gone by itself; called at most once, and the last call there is."""
+        """Handle that the link was lost. Called at most once, as the last callback."""
 
 
 @runtime_checkable
 class DrainListener(Receiver, Protocol):
-    """A receiver that wants to be told when a link takes bytes and does not get rid of them."""
+    """A receiver that is notified when written data does not leave."""
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """Nothing has left for a second although something waits; orders among it may arrive late, or never."""
+        """Handle that no waiting data has left for a second. Commands in it may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
-        """It goes on, after so many seconds."""
+        """Handle that data leaves again, after ``stalled_s`` seconds."""
 
 
 @runtime_checkable
-class HelmListener(Receiver, Protocol):
-    """A receiver that wants to be told when the other side of a network refuses an order (docs/network.md)."""
+class OrderRefusalListener(Receiver, Protocol):
+    """A receiver that is notified when the other end of a zenoh network refuses a command (docs/network.md)."""
 
-    def order_refused(self, message: str, reason: str, helm: str | None, answers: tuple[bytes, ...]) -> None:
-        """A message of this name did not go to the vehicle; ``helm`` is who orders it, if that is why.
+    def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
+        """Handle that a message with this name was not forwarded to the vehicle.
 
-        ``answers`` are frames such as the vehicle would refuse it by, for whoever waits for them; not of every message.
+        ``lease_holder`` is the client that has control, if that is the reason. ``answers`` are frames by which a
+        vehicle would reject the command; some messages have none.
         """
 
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that says by `Link.keep_peer` whom to remember: who sends nothing but noise holds no place.
+    """A receiver that decides by `Link.keep_peer` which peers a link remembers, so that senders of noise are not.
 
-    A link around another one passes `Link.keep_peer`, `Link.forget_peer` and `Link.host_of` on to it.
+    A link that wraps another one forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
 
     keeps_peers: bool
-    """Whether it does: the link then writes to nobody else, and forgets nobody by itself."""
+    """If True, the link writes to kept peers only, and forgets none by itself."""
 
 
 @runtime_checkable
 class BurstListener(Receiver, Protocol):
-    """A receiver that gathers what comes in one go, and wants to be told that this is all for now.
-
-    Called by links whose `Link.tells_bursts` is True, after one or several ``bytes_received``.
-    """
+    """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Nothing more comes before the loop has turned."""
+        """Handle the end of one or more ``bytes_received``; the next one comes in a later loop iteration."""
 
 
 @runtime_checkable
 class PeerListener(Receiver, Protocol):
-    """A receiver that wants to be told of peers that come and go by themselves: the clients of a TCP server.
-
-    They are there before they have said anything, and some never do.
-    """
+    """A receiver that is notified of connecting and disconnecting peers, i.e. the clients of a TCP server."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """A peer can be written to."""
+        """Handle that a peer has connected. It may never send anything."""
 
     def peer_left(self, peer: Peer) -> None:
-        """It cannot any more."""
+        """Handle that a peer has disconnected."""
 
 
 def keeps_peers(receiver: Receiver) -> bool:
-    """Whether a receiver says whom to remember."""
+    """Return True if the receiver decides which peers a link remembers."""
     return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
 
 
 class Link(ABC):
-    """Moves bytes between this program and one or several peers; knows nothing of what they mean.
+    """Transports bytes between this program and one or more peers.
 
-    A link belongs to the event loop it was opened on and is opened once; when `open` has failed or was
-    cancelled it may be tried again.
+    A link belongs to the event loop it was opened on, and can be opened once. `open` may be repeated if it failed or
+    was cancelled.
     """
 
     address: str
-    """What to call it: mostly a form that `create_link` takes; a listening port 0 becomes the real one."""
+    """Name of the link, usually in a form that `create_link` accepts, with the actual port instead of 0."""
 
     dropped_writes: int = 0
-    """Writes (datagrams, whole calls of `write`) that were thrown away: no room in time, no route, nobody there."""
+    """Number of dropped writes: buffer full, waited too long, no route, or no peer."""
 
-    is_several: bool = False
-    """Whether it is several links to the same vehicles (`SeveralLinks`), with a way for each peer over each of them."""
+    is_multilink: bool = False
+    """True for `MultiLink`, which joins several links to the same vehicles."""
 
     @abstractmethod
     async def open(self, receiver: Receiver) -> None:
-        """Opens the link; from now on the receiver is called.
+        """Open the link and start calling the receiver. If it fails or is cancelled, all resources are released.
 
-        Raises LinkOpenError with the address, the system's reason and a hint (its ``__context__`` is the system's
-        error: ConnectionRefusedError, socket.gaierror, serial.SerialException, …), BusyError when it is open
-        already, and ConnectionClosed after `close`. A cancelled or failed `open` leaves nothing behind.
+        Raises:
+            LinkOpenError: the text has the address, the system's reason and a hint; ``__context__`` is the system's
+                error (ConnectionRefusedError, socket.gaierror, serial.SerialException, …).
+            BusyError: the link is open.
+            ConnectionClosed: the link was closed.
         """
 
     @abstractmethod
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """Sends bytes to one peer, or to every known one (None).
+        """Send bytes to one peer, or to all known peers (None).
 
-        Never blocks and never raises: what cannot be sent is dropped whole and counted in `dropped_writes`;
-        before `open` and after the end it does nothing.
+        Never blocks or raises. Data that cannot be sent is dropped as a whole and counted in `dropped_writes`. Does
+        nothing while the link is not open.
         """
 
     @property
-    def tells_bursts(self) -> bool:
-        """Whether a `BurstListener` is told, now that the link is open."""
+    def reports_bursts(self) -> bool:
+        """True if the open link calls `BurstListener.burst_ended`."""
         return False
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that `write` took and that have not left: an order among them may still arrive.
+        """Written bytes that have not left this machine: in the link, in its transport and, on Linux, in the kernel.
 
-        What waits in the link, in its transport, and, where it can be asked (Linux), in the system. 0 does not say
-        that the other side has read them.
+        Commands in them may still arrive. 0 does not mean that the other end has received everything.
         """
         return 0
 
     def unsent_bytes_to(self, peer: Peer) -> int:
-        """The same of one peer; all of them together where the link does not tell them apart."""
+        """Return the same for one peer; for all peers if the link does not count them separately."""
         return self.unsent_bytes
 
     def discard_unsent(self) -> None:
-        """Take back what has not left, as far as that is possible, and count it in `dropped_writes`.
+        """Discard data that has not left, and count it in `dropped_writes`.
 
-        What the system has of a TCP connection is beyond recall, and stays in `unsent_bytes`.
+        Data in the kernel's TCP buffer cannot be discarded; it stays in `unsent_bytes`.
         """
         return
 
     def keep_peer(self, peer: Peer) -> None:
-        """A peer has shown that it is one: remember it, and write to it, until `forget_peer` (see `PeerKeeper`)."""
+        """Remember a peer, and write to it, until `forget_peer`; see `PeerKeeper`."""
         return
 
     def forget_peer(self, peer: Peer) -> None:
-        """A peer is not written to any more."""
+        """Stop writing to a peer."""
         return
 
     def host_of(self, peer: Peer) -> object:
-        """What stays the same when a peer changes its port: its IP address. Of other links the peer itself."""
+        """Return what identifies the peer's host: its IP address, or the peer itself if it has none."""
         return peer[0] if isinstance(peer, tuple) else peer
 
     def has_peer(self, peer: Peer) -> bool:
-        """Whether a peer that was heard could still be written to: not a client that has gone."""
+        """Return False if the peer has disconnected."""
         return True
 
     @abstractmethod
     def close(self) -> None:
-        """Closes the link: at once to the eye, no callback comes any more. Never blocks, idempotent.
+        """Close the link. No callback runs afterwards. Never blocks; idempotent.
 
-        What was written is still handed to the system, for up to `LINGER_S` seconds.
+        Data already written is still sent in the background, for up to `LINGER_S` seconds.
         """
 
     @abstractmethod
     async def wait_closed(self) -> None:
-        """Returns when nothing of a closed or lost link is left; at most about `LINGER_S` seconds later."""
+        """Wait until a closed or lost link has released all resources, at most about `LINGER_S` seconds."""
 
 
 LINGER_S = 1.0
-"""Seconds that a closed link may spend on sending what was written before."""
+"""Seconds for which a closed link may continue to send data written before."""
 
 
 class _State(enum.Enum):
@@ -193,29 +190,26 @@ class _State(enum.Enum):
 
 
 class BaseLink(Link):
-    """The life of a link; a transport adds `_connect`, `_release` and `write`."""
-
-    dropped_writes: int
+    """State machine of a link. Subclasses implement `_connect`, `_release` and `write`."""
 
     def __init__(self, address: str) -> None:
         self.address = address
-        self.dropped_writes = 0
+        self.dropped_writes: int = 0
         self._state = _State.NEW
-        self._receiver: Receiver | None = None  # None: no callback is made
-        self._keeps_peers = False  # whether the receiver says whom to remember
+        self._receiver: Receiver | None = None  # None: no callbacks
+        self._keeps_peers = False
         self._stalled_at: float | None = None
         self._released = asyncio.Event()
         self._released.set()
 
     async def open(self, receiver: Receiver) -> None:
-        """See `Link.open`."""
         self._check_may_open()
         self._state, self._receiver = _State.OPENING, receiver
         self._keeps_peers = keeps_peers(receiver)
         try:
             await self._connect()
         except BaseException as error:
-            self._give_up_opening()
+            self._abort_opening()
             if isinstance(error, OSError) and not isinstance(error, LinkError):
                 raise link_open_error(self.address, error) from None
             raise
@@ -226,13 +220,11 @@ class BaseLink(Link):
             self._state = _State.OPEN
 
     def close(self) -> None:
-        """See `Link.close`."""
         if self._state is not _State.CLOSED:
             self._state, self._receiver = _State.CLOSED, None
             self._release()
 
     async def wait_closed(self) -> None:
-        """See `Link.wait_closed`."""
         await self._released.wait()
 
     @property
@@ -241,11 +233,11 @@ class BaseLink(Link):
 
     @abstractmethod
     async def _connect(self) -> None:
-        """Gets the sockets; an OSError becomes a LinkOpenError; `_release` is called after any failure."""
+        """Open sockets. An OSError becomes a LinkOpenError; `_release` is called after any failure."""
 
     @abstractmethod
     def _release(self) -> None:
-        """Gives the sockets up without blocking; may be called again. Sets `_released` when they are gone."""
+        """Close sockets without blocking, and set `_released` when they are closed. May be called repeatedly."""
 
     def _deliver(self, data: bytes, peer: Peer = None) -> None:
         if self._receiver is not None:
@@ -254,8 +246,8 @@ class BaseLink(Link):
     def _drop(self, writes: int) -> None:
         self.dropped_writes += writes
 
-    def _tell_stalled(self, is_stalled: bool) -> None:
-        """Some transport of this link does not drain, or all of them do again."""
+    def _report_stalled(self, is_stalled: bool) -> None:
+        """Notify the receiver when the first transport of this link stalls, and when none is stalled again."""
         if is_stalled == (self._stalled_at is not None):
             return
         now, since = asyncio.get_running_loop().time(), self._stalled_at
@@ -269,7 +261,7 @@ class BaseLink(Link):
             receiver.link_drained(now - since)
 
     def _lose(self, reason: str, cause: BaseException | None = None, kind: type[LinkLost] = LinkLost) -> None:
-        """The link has gone by itself: says so once and releases what is left of it."""
+        """Release the link and report its loss to the receiver, once."""
         receiver, self._receiver = self._receiver, None
         if receiver is None:
             return
@@ -283,9 +275,9 @@ class BaseLink(Link):
         if self._state is _State.CLOSED:
             raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
         if self._state is not _State.NEW:
-            raise BusyError(f"{self.address} is {self._state.value}; a link is opened once")
+            raise BusyError(f"{self.address} is {self._state.value}; a link can be opened only once")
 
-    def _give_up_opening(self) -> None:
+    def _abort_opening(self) -> None:
         self._receiver = None
         self._release()
         if self._state is not _State.CLOSED:
@@ -293,7 +285,7 @@ class BaseLink(Link):
 
 
 def link_open_error(address: str, cause: OSError, hint: str = "") -> LinkOpenError:
-    """A LinkOpenError with the address, the system's reason and a hint what to do about it."""
+    """Return a LinkOpenError with the address, the system's reason and a hint."""
     hint = hint or _hint(address, cause)
     reason = cause.strerror or str(cause) or type(cause).__name__
     error = LinkOpenError(f"cannot open {address}: {reason}" + (f" ({hint})" if hint else ""))
@@ -303,29 +295,27 @@ def link_open_error(address: str, cause: OSError, hint: str = "") -> LinkOpenErr
 
 def _hint(address: str, cause: OSError) -> str:
     if isinstance(cause, socket.gaierror):
-        return "the host name is not known here; check its spelling or give the IP address"
+        return "unknown host name; check the spelling or use the IP address"
     if cause.errno == errno.EADDRNOTAVAIL and address.startswith(("udpin", "tcpin")):
-        return (
-            "this machine has no such address; listen on 0.0.0.0, or reach another machine by udpout: or tcp:"
-        )
+        return "this machine does not have this address; listen on 0.0.0.0, or reach another machine by udpout: or tcp:"
     if cause.errno == errno.EACCES and address.startswith("udpout"):
-        return "to reach a broadcast address write udpbcast:"
+        return "for a broadcast address use udpbcast:"
     return _HINTS.get(cause.errno or 0, "")
 
 
 _HINTS = {
-    errno.EADDRINUSE: "another program has this port: a ground station, a simulator, an earlier run of yours",
+    errno.EADDRINUSE: "another program uses this port: a ground station, a simulator, an earlier run",
     errno.ECONNREFUSED: "nothing listens there; is the vehicle or simulator running, and is this its port?",
     errno.EHOSTUNREACH: "no route to this host; is the network or radio up?",
     errno.ENETUNREACH: "no route to this network; is the network or radio up?",
     errno.ETIMEDOUT: "the host does not answer; is it on, and does a firewall drop the port?",
-    errno.EACCES: "ports below 1024 need the rights of an administrator",
-    errno.EAFNOSUPPORT: "this machine has no such address family, for instance no IPv6",
+    errno.EACCES: "ports below 1024 need administrator rights",
+    errno.EAFNOSUPPORT: "this machine does not support this address family, e.g. IPv6",
 }
 
 
-def needed(address: str, module: str, package: str, extra: str) -> Any:
-    """Import it; LinkOpenError with what to install when it is not there."""
+def import_optional(address: str, module: str, package: str, extra: str) -> Any:
+    """Import a module; raise LinkOpenError with the package to install if it is missing."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -333,3 +323,74 @@ def needed(address: str, module: str, package: str, extra: str) -> Any:
             f"cannot open {address}: this needs {package}, which is not installed:"
             f" pip install 'aerokit-mavlink[{extra}]'"
         ) from error
+
+
+def memory_link_pair(*, latency_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]:
+    """Return two links, each the other's only peer. Open both on the same event loop.
+
+    Each write arrives unsplit and in order, ``latency_s`` seconds later, but never before `Link.write` returns. Data
+    for an end that is not open is dropped, as with UDP. When one end closes, the other receives the data written
+    before, and is then lost.
+    """
+    near, far = MemoryLink("memory:near", latency_s), MemoryLink("memory:far", latency_s)
+    near._far, far._far = far, near
+    return near, far
+
+
+class MemoryLink(BaseLink):
+    """One end of `memory_link_pair`."""
+
+    def __init__(self, address: str, latency_s: float = 0.0) -> None:
+        super().__init__(address)
+        self._latency_s = latency_s
+        self._far: MemoryLink | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due, data or None: the far end has closed)
+        self._wake_up: asyncio.Handle | None = None
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; the far end receives it in a later loop iteration."""
+        if self._receiver is not None and self._far is not None:
+            self._far._post(bytes(data), self)
+
+    async def _connect(self) -> None:
+        self._loop = asyncio.get_running_loop()
+
+    def _release(self) -> None:
+        if self._wake_up is not None:
+            self._wake_up.cancel()
+        self._wake_up = None
+        self._inbox.clear()
+        opened, self._loop = self._loop is not None, None
+        if opened and self._far is not None:
+            self._far._post(None, self)
+
+    def _post(self, data: bytes | None, sender: MemoryLink) -> None:
+        if self._loop is None or self._receiver is None:
+            sender.dropped_writes += data is not None
+            return
+        self._inbox.append((self._loop.time() + self._latency_s, data))
+        if self._wake_up is None:
+            self._schedule(self._loop)
+
+    def _schedule(self, loop: asyncio.AbstractEventLoop) -> None:
+        if not loop.is_closed():
+            due = self._inbox[0][0]
+            self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
+
+    def _arrive(self) -> None:
+        self._wake_up = None
+        if self._loop is None or not self._inbox:
+            return
+        now = max(self._loop.time(), self._inbox[0][0])  # a timer may fire early by the clock's resolution
+        due = 1 if len(self._inbox) == 1 else sum(when <= now for when, _ in self._inbox)
+        for _ in range(due):
+            if not self._inbox:  # closed by the receiver
+                return
+            _, data = self._inbox.popleft()
+            if data is None:
+                self._lose("the other end was closed")
+            else:
+                self._deliver(data)
+        if self._inbox and self._wake_up is None:
+            self._schedule(self._loop)

@@ -1,4 +1,4 @@
-"""``Outbox``: what a transport cannot take waits here, bounded in bytes and seconds, and can be taken back."""
+"""``Outbox``: write buffer in front of a transport, limited in bytes and seconds, which can be discarded."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ import sys
 from collections import deque
 from collections.abc import Callable
 
-WRITE_DEADLINE_S = 1.0
-"""What has waited for so long is not written any more: an order that arrives late is worse than none."""
+WRITE_TIMEOUT_S = 1.0
+"""Data that has waited for this long is dropped: a late command is worse than none."""
 
 STALLED_AFTER_S = 1.0
-"""Bytes wait and none of them has left for so long: the link does not drain."""
+"""Time without progress after which a link counts as stalled."""
 
-_LOOK_EVERY_S = 0.25
-_JOINED = 1024  # small frames that waited go out in pieces of up to so many bytes
+_POLL_INTERVAL_S = 0.25
+_MAX_JOINED_BYTES = 1024  # small frames that waited are joined up to this size
 
 
 class Outbox:
-    """In front of one transport: passes writes on while it takes them, keeps them while it does not.
+    """Write buffer of one transport: forwards writes while the transport accepts them, and keeps them otherwise.
 
-    ``send(data)`` hands bytes to the transport, ``pending()`` counts those that it, or the system, still has.
-    At most ``limit`` bytes wait here, a single larger write excepted, none of them longer than `WRITE_DEADLINE_S`;
-    ``dropped(n)`` is told of n writes that were thrown away. ``stalled(True)`` is called when nothing has left for
-    `STALLED_AFTER_S` although something waits, ``stalled(False)`` when it goes on. Meanwhile nothing more is handed
-    to the transport, so that no more than it has already is beyond recall.
+    At most ``limit`` bytes (or one larger write) are kept, for at most `WRITE_TIMEOUT_S`. While the transport is
+    stalled, nothing is forwarded, because the transport's own data cannot be discarded.
+
+    Args:
+        send: writes bytes to the transport.
+        pending: returns the number of unsent bytes in the transport and the kernel.
+        limit: bytes.
+        dropped: called with the number of dropped writes.
+        stalled: called with True when no waiting data has left for `STALLED_AFTER_S`, with False when it leaves again.
     """
 
     def __init__(
@@ -39,94 +43,90 @@ class Outbox:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._send, self._pending, self._limit = send, pending, limit
-        self._dropped, self._tell_stalled = dropped, stalled
-        self._waiting: deque[tuple[float, bytes]] = deque()  # (until when, frame)
+        self._dropped, self._on_stalled = dropped, stalled
+        self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
         self._waiting_bytes = 0
-        self._handed_over = 0  # bytes that were given to the transport
-        self._left = 0  # bytes that had left it when somebody looked last
-        self._moved_at = 0.0  # when some had, or when the first began to wait
-        self._is_full = False  # the transport has said so
+        self._forwarded = 0  # bytes written to the transport
+        self._left = 0  # of them, bytes that had left it at the last poll
+        self._progress_at = 0.0  # last progress, or start of waiting
+        self._is_full = False  # between pause() and resume()
         self._is_stalled = self._is_closed = False
         self._timer: asyncio.TimerHandle | None = None
 
     @property
     def is_stalled(self) -> bool:
-        """Whether something waits and nothing leaves."""
         return self._is_stalled
 
     @property
     def unsent_bytes(self) -> int:
-        """Bytes that were accepted and have not left this machine."""
         return self._waiting_bytes + self._pending()
 
     def write(self, data: bytes) -> None:
-        """Hand over, keep, or drop and count; never blocks."""
+        """Forward, keep or drop data. Never blocks."""
         if self._is_closed:
             self._dropped(1)
             return
         if self._is_full or self._is_stalled or self._waiting:
             self._keep(bytes(data))
         else:
-            self._hand_over(data)
+            self._forward(data)
         if self._timer is None:
-            self._moved_at = self._loop.time()
-            self._look_later()
+            self._progress_at = self._loop.time()
+            self._schedule_poll()
 
     def pause(self) -> None:
-        """The transport takes no more."""
         self._is_full = True
 
     def resume(self) -> None:
-        """The transport takes some again: something has left it, whatever waits here."""
         self._is_full = False
         if self._is_closed:
             return
-        self._moved_at = self._loop.time()
+        self._progress_at = self._loop.time()
         self._set_stalled(False)
         self._flush()
 
     def discard(self) -> None:
-        """Take back everything that waits here; the transport keeps what it has."""
+        """Drop the data that waits here. The transport keeps its own."""
         self._dropped(len(self._waiting))
         self._waiting.clear()
         self._waiting_bytes = 0
 
-    def taken_back(self, count: int) -> None:
-        """So many bytes were taken out of the transport, or out of the system: they have not left."""
-        self._handed_over -= count
+    def reclaimed(self, count: int) -> None:
+        """Record that bytes were removed from the transport or kernel without being sent."""
+        self._forwarded -= count
 
     def close(self) -> None:
-        """Give the transport all that may still be written; no callback comes any more but ``dropped``."""
+        """Forward the data that may still be sent. Only ``dropped`` is called afterwards."""
         if self._is_closed:
             return
         self._is_closed = True
-        self._stop_looking()
+        self._stop_polling()
         if self._is_stalled:
             self.discard()
         self._expire()
         while self._waiting:
-            self._hand_over(self._joined())
+            self._forward(self._joined())
 
     def _keep(self, data: bytes) -> None:
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
             self._dropped(1)
             return
-        self._waiting.append((self._loop.time() + WRITE_DEADLINE_S, data))
+        self._waiting.append((self._loop.time() + WRITE_TIMEOUT_S, data))
         self._waiting_bytes += len(data)
 
-    def _hand_over(self, data: bytes) -> None:
-        self._handed_over += len(data)
+    def _forward(self, data: bytes) -> None:
+        self._forwarded += len(data)
         self._send(data)
 
     def _flush(self) -> None:
         self._expire()
         while self._waiting and not self._is_full and not self._is_stalled and not self._is_closed:
-            self._hand_over(self._joined())
+            self._forward(self._joined())
 
     def _joined(self) -> bytes:
-        """The next of what waits: whole writes, as few bytes as one has or up to `_JOINED`."""
+        """Return the next write, joined with following ones up to `_MAX_JOINED_BYTES`."""
         data = self._next()
-        while self._waiting and len(data) + len(self._waiting[0][1]) <= _JOINED:
+        while self._waiting and len(data) + len(self._waiting[0][1]) <= _MAX_JOINED_BYTES:
             data += self._next()
         return data
 
@@ -143,30 +143,29 @@ class Outbox:
         if count:
             self._dropped(count)
 
-    # ----------------------------------------------------------------------- does it drain?
+    # ------------------------------------------------------------------- stall detection
 
-    def _look_later(self) -> None:
-        self._timer = self._loop.call_later(_LOOK_EVERY_S, self._look)
+    def _schedule_poll(self) -> None:
+        self._timer = self._loop.call_later(_POLL_INTERVAL_S, self._poll)
 
-    def _stop_looking(self) -> None:
+    def _stop_polling(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
-    def _look(self) -> None:
-        """Four times a second while something waits, here or in the transport."""
+    def _poll(self) -> None:
         self._timer = None
         self._expire()
         pending, now = self._pending(), self._loop.time()
-        left = self._handed_over - pending
+        left = self._forwarded - pending
         is_idle = not (pending or self._waiting or self._is_full)
         if left != self._left or is_idle:
-            self._left, self._moved_at = left, now
+            self._left, self._progress_at = left, now
             self._set_stalled(False)
-        elif now - self._moved_at >= STALLED_AFTER_S:
+        elif now - self._progress_at >= STALLED_AFTER_S:
             self._set_stalled(True)
         if self._timer is None and not self._is_closed and not is_idle:
-            self._look_later()
+            self._schedule_poll()
 
     def _set_stalled(self, is_stalled: bool) -> None:
         if is_stalled == self._is_stalled:
@@ -174,11 +173,11 @@ class Outbox:
         self._is_stalled = is_stalled
         if not is_stalled:
             self._flush()
-        self._tell_stalled(is_stalled)
+        self._on_stalled(is_stalled)
 
 
-def unsent_in_kernel(fd: int) -> int:
-    """Bytes of a socket or terminal that the system still has, unsent or not acknowledged; 0 where it does not say."""
+def kernel_unsent_bytes(fd: int) -> int:
+    """Return the bytes in the kernel that are unsent or unacknowledged; 0 on systems other than Linux."""
     if sys.platform != "linux":
         return 0
     import fcntl

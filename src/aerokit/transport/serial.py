@@ -1,11 +1,11 @@
-"""Serial ports, by pyserial-asyncio.
+"""Serial ports, by pyserial-asyncio, and pseudo-terminals.
 
-It is used for its transport alone, with the port's own calls replaced, because of what was seen:
+Only pyserial-asyncio's transport is used, and the calls of its port are replaced, because of these observed problems:
 
-* It waits in ``tcdrain`` on the loop itself when it closes: a port that is held up blocks everything.
-* pyserial's ``write`` spins while the device takes nothing; its ``read`` fails above file descriptor 1023.
-* A write to an unplugged device goes to the loop's exception handler too; a read from one is told only when
-  what is left to write has gone.
+* Closing calls ``tcdrain`` on the event loop: a port with flow control asserted blocks the program.
+* pyserial's ``write`` spins while the device accepts nothing; its ``read`` fails above file descriptor 1023.
+* A failed write to an unplugged device is also reported to the loop's exception handler. A failed read is reported only
+  after the remaining data has been written.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from serial import SerialException
+
+from aerokit.errors import InvalidArgument
 from aerokit.transport.address import LinkAddress
 from aerokit.transport.link import LINGER_S, BaseLink, Peer, link_open_error
 from aerokit.transport.outbox import Outbox
@@ -29,21 +32,24 @@ if sys.platform == "win32":
 else:
     from termios import error as _TermiosError  # noqa: N812
 
-_Failed = Callable[[OSError], None]
+_OnFailure = Callable[[OSError], None]
 
 _READ_SIZE = 4096
 
 _LINGER_STEP_S = 0.005
 
-_SECONDS_HELD_BACK = 2.0  # more would only be stale when it arrives
+_MAX_BUFFER_S = 2.0  # data that waits for longer would be outdated when it arrives
+
+
+class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
+    """An invalid connection string, for programs that expect pyserial's error as pymavlink raises it."""
 
 
 class SerialLink(BaseLink):
-    """A serial port, 8N1, not shared with other programs; unplugging it is a lost link.
+    """A serial port, 8N1, opened exclusively. Unplugging it is a lost link.
 
-    ``baud`` is in bits per second and matters to real UARTs, not to USB ports such as /dev/ttyACM0;
-    ``rtscts`` turns hardware flow control on. About two seconds' worth of bytes may wait to be sent, at least
-    4096; none waits here for longer than a second.
+    ``baud`` is in bits per second. It matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts`` enables
+    hardware flow control. The write buffer holds about two seconds of data, at least 4096 bytes, for at most a second.
     """
 
     def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:
@@ -57,16 +63,16 @@ class SerialLink(BaseLink):
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; with what waits in the port's driver."""
+        """See `Link.unsent_bytes`; includes the driver's buffer."""
         return 0 if self._outbox is None else self._outbox.unsent_bytes
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops what is more than the line carries in two seconds, or has waited for one."""
+        """See `Link.write`. Drops data beyond the write buffer, and data that has waited for a second."""
         if self._outbox is not None and data:
             self._outbox.write(data)
 
     def discard_unsent(self) -> None:
-        """See `Link.discard_unsent`; the driver's share too, which may cut a frame in two."""
+        """See `Link.discard_unsent`. Also clears the driver's buffer, which may truncate a frame."""
         if self._outbox is None or not self._loop or self._loop.is_closed():
             return
         self._outbox.discard()
@@ -75,11 +81,11 @@ class SerialLink(BaseLink):
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
         taken = before - self._waiting_to_be_sent(self._transport)
-        self._outbox.taken_back(taken)
+        self._outbox.reclaimed(taken)
         self._drop(taken > 0)
 
     async def _connect(self) -> None:
-        """Without an await in it: there is no half-way at which it could be cancelled."""
+        """Open the port. It contains no await, so it cannot be cancelled halfway."""
         self._loop = asyncio.get_running_loop()
         self._port = port = self._open_port()
         self._released.clear()
@@ -87,14 +93,14 @@ class SerialLink(BaseLink):
             self._loop, _SerialProtocol(self), port
         )
         _replace_calls(port, self._device_failed)
-        limit = max(4096, int(self._baud / 10 * _SECONDS_HELD_BACK))
-        self._transport.set_write_buffer_limits(high=0)  # what the driver does not take waits in the outbox
+        limit = max(4096, int(self._baud / 10 * _MAX_BUFFER_S))
+        self._transport.set_write_buffer_limits(high=0)  # data that the driver does not accept waits in the outbox
         self._outbox = Outbox(
             self._transport.write,
             partial(self._waiting_to_be_sent, self._transport),
             limit=limit,
             dropped=self._drop,
-            stalled=self._tell_stalled,
+            stalled=self._report_stalled,
         )
 
     def _open_port(self) -> Any:
@@ -110,14 +116,14 @@ class SerialLink(BaseLink):
                 self._device, self._baud, rtscts=self._rtscts, exclusive=True, timeout=0, write_timeout=0
             )
         except _TermiosError as error:
-            # it vanished while it was being opened: pyserial lets this one through
+            # pyserial does not convert this one, which occurs when the device vanishes during opening.
             raise serial.SerialException(*error.args) from error
 
     def _device_failed(self, error: OSError) -> None:
-        """Reading or writing failed; said on a later turn, for it may be inside `write`."""
+        # Reported in a later loop iteration, because this may run inside write().
         if self._loop is not None and self._transport is not None:
             self._transport.pause_reading()
-            self._loop.call_soon(self._lose, f"the device is gone: {error.strerror or error}", error)
+            self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
 
     def _release(self) -> None:
         transport, self._transport = self._transport, None
@@ -135,7 +141,6 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _finish(self, transport: Any, until: float) -> None:
-        """Closes the port when what was written has left the machine, or has had its time."""
         assert self._loop is not None
         if self._waiting_to_be_sent(transport) and self._loop.time() < until:
             self._loop.call_later(_LINGER_STEP_S, self._finish, transport, until)
@@ -150,11 +155,11 @@ class SerialLink(BaseLink):
     def _close_port(self, transport: Any) -> None:
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            transport.pause_reading()  # again: before its first turn there was nothing to pause
+            transport.pause_reading()  # again: before its first loop iteration it had no effect
             transport.flush()
         if unsent:
             with contextlib.suppress(Exception):
-                self._port.reset_output_buffer()  # else the system's close waits for it, up to 30 s
+                self._port.reset_output_buffer()  # otherwise close() waits for it, up to 30 s
         self._port.close()
         self._released.set()
 
@@ -171,45 +176,45 @@ class _SerialProtocol(asyncio.Protocol):
             self._link._outbox.pause()
 
     def resume_writing(self) -> None:
-        """On a later turn: the transport is in the middle of a write."""
+        # In a later loop iteration, because the transport is in the middle of a write.
         if self._link._outbox is not None and self._link._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    def connection_lost(self, exc: Exception | None) -> None:  # only where the port's own calls are in use
-        self._link._lose(f"the device is gone: {exc}", exc)
+    def connection_lost(self, exc: Exception | None) -> None:  # only called where the port's calls are not replaced
+        self._link._lose(f"the device failed: {exc}", exc)
 
 
-def _replace_calls(port: Any, failed: _Failed) -> None:
-    """Gives a port calls that never wait and report a lost device to ``failed``."""
+def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
+    """Replace the calls of a port by ones that never block and report a lost device to ``on_failure``."""
     port.flush = lambda: None
     if os.name == "posix":
-        port.read = partial(_read, port.fileno(), failed)
-        port.write = partial(_write, partial(os.write, port.fileno()), failed)
+        port.read = partial(_read, port.fileno(), on_failure)
+        port.write = partial(_write, partial(os.write, port.fileno()), on_failure)
     else:
-        port.write = partial(_write, port.write, failed)
+        port.write = partial(_write, port.write, on_failure)
 
 
-def _read(fd: int, failed: _Failed, _size: int) -> bytes:
+def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
     try:
         data = os.read(fd, _READ_SIZE)
     except (BlockingIOError, InterruptedError):
         return b""
     except OSError as error:
-        failed(error)
+        on_failure(error)
         return b""
-    if not data:  # ready to be read, and nothing there
-        failed(OSError(errno.ENODEV, "unplugged"))
+    if not data:  # end of file
+        on_failure(OSError(errno.ENODEV, "unplugged"))
     return data
 
 
-def _write(write: Callable[[bytes], int], failed: _Failed, data: bytes) -> int:
+def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -> int:
     try:
         return write(data)
     except (BlockingIOError, InterruptedError):
-        raise  # the transport keeps it for later
+        raise  # the transport retries later
     except OSError as error:
-        failed(error)
+        on_failure(error)
         return len(data)
 
 
@@ -219,13 +224,13 @@ def _open_error(address: str, error: Exception) -> OSError:
         number = errno.ENOTTY
     cause = OSError(number, os.strerror(number)) if number else OSError(str(error))
     missing = number in (errno.ENOENT, errno.ENXIO, errno.ENODEV)
-    return link_open_error(address, cause, _ports_here() if missing else _HINTS.get(number or 0, ""))
+    return link_open_error(address, cause, _available_ports() if missing else _HINTS.get(number or 0, ""))
 
 
-def _ports_here() -> str:
+def _available_ports() -> str:
     comports = importlib.import_module("serial.tools.list_ports").comports
     names = ", ".join(sorted(port.device for port in comports()))
-    return f"serial ports here: {names}" if names else "there is no serial port here; is it plugged in?"
+    return f"available serial ports: {names}" if names else "no serial port was found; is the device plugged in?"
 
 
 _HINTS = {
@@ -233,17 +238,17 @@ _HINTS = {
     errno.EPERM: "on Linux: sudo usermod -a -G dialout $USER, then log in again",
     errno.EAGAIN: "another program uses this port",
     errno.EBUSY: "another program uses this port",
-    errno.ENOTTY: "this is no serial port; to replay a recording write replay:PATH",
+    errno.ENOTTY: "this is not a serial port; use replay:PATH to replay a recording",
     errno.EISDIR: "this is a directory",
 }
 
 
 class PtyLink(BaseLink):
-    """This end of a pseudo-terminal; another program opens the other end, whose name `address` says once it is open.
+    """One end of a pseudo-terminal. Another program opens the other end; `address` has its name once the link is open.
 
-    ``path`` is a symbolic link that is made to the other end, and removed when the link is closed; a dead link of
-    that name is replaced, anything else there is a LinkOpenError. Baud rates mean nothing. Programs may open and
-    close the other end as often as they like; what nobody reads is dropped. Not on Windows.
+    ``path`` is the name of a symbolic link to the other end. It is removed when the link is closed. A dangling symbolic
+    link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect. Programs may
+    open and close the other end repeatedly; unread data is dropped. Not available on Windows.
     """
 
     def __init__(self, path: str = "") -> None:
@@ -254,7 +259,7 @@ class PtyLink(BaseLink):
         self._linked = False
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; what does not fit into the system's buffer is dropped."""
+        """See `Link.write`. Data that does not fit into the kernel's buffer is dropped."""
         if not self._ends or not data:
             return
         try:
@@ -269,9 +274,8 @@ class PtyLink(BaseLink):
         import tty
 
         self._loop = asyncio.get_running_loop()
-        ours, theirs = self._ends = (
-            os.openpty()
-        )  # theirs stays open: else ours fails while nobody has it open
+        # The other end stays open here: otherwise ours fails while no program has it open.
+        ours, theirs = self._ends = os.openpty()
         tty.setraw(theirs)
         os.set_blocking(ours, False)
         name = os.ttyname(theirs)
@@ -293,7 +297,7 @@ class PtyLink(BaseLink):
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
-            self._lose(f"the pseudo-terminal is gone: {error.strerror or error}", error)
+            self._lose(f"the pseudo-terminal failed: {error.strerror or error}", error)
             return
         self._deliver(data)
 

@@ -1,4 +1,4 @@
-"""Host names and bound sockets, the same for UDP and TCP."""
+"""Sockets for UDP and TCP: name resolution, binding and filters by address."""
 
 from __future__ import annotations
 
@@ -15,45 +15,44 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument
 
 
-class Endpoint(NamedTuple):
-    """Where to bind, or whom to reach."""
+class SocketAddress(NamedTuple):
+    """Address family, and an address for ``socket.bind`` or ``connect``."""
 
     family: int
-    address: Any  # what socket.connect and socket.bind take: a tuple, its length depends on the family
+    address: Any  # a tuple, whose length depends on the family
 
 
-async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[Endpoint]:
-    """The endpoints behind a host name, IPv4 first: that is where vehicles and simulators listen.
+async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketAddress]:
+    """Resolve a host name to socket addresses, IPv4 first, because vehicles and simulators usually listen there.
 
-    An IP address is resolved at once, a name on a thread of the loop's executor.
+    A name is resolved on a thread of the loop's executor.
     """
     try:
         found = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_NUMERICHOST)
     except socket.gaierror:
         found = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
-    endpoints = [Endpoint(family, address) for family, _, _, _, address in found]
-    return sorted(endpoints, key=lambda endpoint: endpoint.family != socket.AF_INET)
+    addresses = [SocketAddress(family, address) for family, _, _, _, address in found]
+    return sorted(addresses, key=lambda address: address.family != socket.AF_INET)
 
 
 async def bound_socket(host: str, port: int, kind: socket.SocketKind) -> socket.socket:
-    """A non-blocking socket bound to the first endpoint that can be; OSError of the last when none can.
+    """Return a non-blocking socket bound to the first possible address; raise the last OSError if there is none.
 
-    "::" hears IPv4 too. A UDP port is never shared (no SO_REUSEADDR): a second listener would silently take
+    "::" also receives IPv4. UDP ports are not shared (no SO_REUSEADDR), because a second listener would silently take
     the datagrams of the first.
     """
-    endpoints = await resolve(host, port, kind)
-    for endpoint in endpoints[:-1]:
+    addresses = await resolve(host, port, kind)
+    for address in addresses[:-1]:
         with contextlib.suppress(OSError):
-            return bind_to(endpoint, kind)
-    return bind_to(endpoints[-1], kind)
+            return bind_to(address, kind)
+    return bind_to(addresses[-1], kind)
 
 
-async def is_free(host: str, port: int) -> bool:
-    """Whether nobody listens on that TCP port of this machine."""
+async def is_port_free(host: str, port: int) -> bool:
     try:
         (await bound_socket(host, port, socket.SOCK_STREAM)).close()
     except OSError:
@@ -61,31 +60,30 @@ async def is_free(host: str, port: int) -> bool:
     return True
 
 
-def bind_to(endpoint: Endpoint, kind: socket.SocketKind) -> socket.socket:
-    """A non-blocking socket bound to one endpoint."""
-    sock = socket.socket(endpoint.family, kind)
+def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
+    sock = socket.socket(address.family, kind)
     try:
         sock.setblocking(False)
-        if endpoint.family == socket.AF_INET6:
+        if address.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
-        if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):  # on Windows it would share the port
+        if kind is socket.SOCK_STREAM and hasattr(socket, "AF_UNIX"):  # on Windows this would share the port
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(endpoint.address)
+        sock.bind(address.address)
     except BaseException:
         sock.close()
         raise
     return sock
 
 
-def discard_unsent(sock: socket.socket) -> None:
-    """Without lingering the system forgets what it has not sent when it is closed, instead of sending it late."""
+def discard_on_close(sock: socket.socket) -> None:
+    """Make the kernel discard unsent data when the socket is closed (SO_LINGER 0)."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 def has_more(sock: socket.socket) -> Callable[[], object]:
-    """Tells, when called, whether something is there to be read: a third of the cost of reading in vain."""
-    if sys.platform == "win32":  # no poll there: read in vain
+    """Return a function that is truthy if data can be read; it costs a third of a failed read."""
+    if sys.platform == "win32":  # Windows has no poll
         return partial(bool, True)
     poll = select.poll()
     poll.register(sock, select.POLLIN)
@@ -94,8 +92,8 @@ def has_more(sock: socket.socket) -> Callable[[], object]:
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
-Peers = str | ipaddress.IPv4Address | ipaddress.IPv6Address | Network | Iterable[object]
-"""What ``peers`` may be: an IP address or network ("10.0.0.7", "10.0.0.0/24", those of `ipaddress`), or several."""
+PeerFilter = str | ipaddress.IPv4Address | ipaddress.IPv6Address | Network | Iterable[object]
+"""Value of ``peers``: IP addresses or networks ("10.0.0.7", "10.0.0.0/24", objects of `ipaddress`), one or several."""
 
 _KINDS = (
     str,
@@ -107,15 +105,14 @@ _KINDS = (
 
 
 class AllowedPeers:
-    """Who may be heard; None: everybody. InvalidArgument for what is no address or network, and for none at all."""
+    """Filter by IP address; None accepts all. Raises InvalidArgument for invalid or empty ``peers``."""
 
-    def __init__(self, peers: Peers | None) -> None:
+    def __init__(self, peers: PeerFilter | None) -> None:
         self._networks = None if peers is None else tuple(map(_network, _several(peers)))
         if self._networks == ():
-            raise InvalidArgument("peers is empty: name at least one IP address or network, or leave it out")
+            raise InvalidArgument("peers = [] is not allowed: at least one IP address or network, or None")
 
     def allows(self, host: str) -> bool:
-        """Whether this IP address is among them."""
         if self._networks is None:
             return True
         address = ipaddress.ip_address(host.partition("%")[0])
@@ -124,7 +121,7 @@ class AllowedPeers:
         return any(address in network for network in self._networks)
 
 
-def _several(peers: Peers) -> Iterable[object]:
+def _several(peers: PeerFilter) -> Iterable[object]:
     if isinstance(peers, Iterable) and not isinstance(
         peers, (str, bytes, ipaddress.IPv4Network, ipaddress.IPv6Network)
     ):
@@ -133,28 +130,28 @@ def _several(peers: Peers) -> Iterable[object]:
 
 
 def _network(item: object) -> Network:
-    error: object = "of another type"
+    error: object = "wrong type"
     if isinstance(item, _KINDS):
         try:
             return ipaddress.ip_network(item)
         except ValueError as refused:
             error = refused
     raise InvalidArgument(
-        f"peers: {shown(item)} is no IP address or network, such as '10.0.0.7' or '10.0.0.0/24' ({error})"
+        f"peers: {short_repr(item)} is not an IP address or network such as '10.0.0.7' or '10.0.0.0/24' ({error})"
     )
 
 
 def serial_ports() -> list[Any]:
-    """The serial ports of this computer, as pyserial lists them (``device``, ``description``), by their names."""
+    """Return the serial ports of this computer as pyserial objects (``device``, ``description``), sorted by name."""
     ports: list[Any] = importlib.import_module("serial.tools.list_ports").comports()
     return sorted(ports, key=lambda port: str(port.device))
 
 
-def network_port_error(host: str, port: int, *, udp: bool) -> OSError | None:
-    """What keeps us from listening at a port, errno.EADDRINUSE for one that is in use; None: nothing. IPv4 only."""
+def port_bind_error(host: str, port: int, *, udp: bool) -> OSError | None:
+    """Return the error of binding an IPv4 port (errno.EADDRINUSE if it is in use), or None if it is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if udp else socket.SOCK_STREAM) as sock:
         if not udp and os.name == "posix":
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # one just closed is free
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just closed is free
         try:
             sock.bind((host, port))
         except OSError as error:

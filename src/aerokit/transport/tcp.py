@@ -1,4 +1,4 @@
-"""TCP: connect to one server, or serve several clients."""
+"""TCP links: a client of one server, and a server for several clients."""
 
 from __future__ import annotations
 
@@ -13,70 +13,77 @@ import anyio
 
 from aerokit.transport.address import host_and_port
 from aerokit.transport.link import LINGER_S, BaseLink, Peer, PeerListener
-from aerokit.transport.outbox import Outbox, unsent_in_kernel
-from aerokit.transport.sockets import AllowedPeers, Endpoint, Peers, bound_socket, discard_unsent, resolve
+from aerokit.transport.outbox import Outbox, kernel_unsent_bytes
+from aerokit.transport.sockets import (
+    AllowedPeers,
+    PeerFilter,
+    SocketAddress,
+    bound_socket,
+    discard_on_close,
+    resolve,
+)
 
 CONNECT_TIMEOUT_S = 10.0
-"""Seconds that `TcpConnect.open` waits for the other side by default."""
+"""Default time-out of `TcpConnect.open`."""
 
 MAX_PENDING_BYTES = 256 * 1024
-"""With more than this written and not taken by the system, whole writes are dropped; so is what waits for a second."""
+"""Write buffer per connection. Writes beyond it are dropped, as is data that has waited for a second."""
 
 SEND_BUFFER = 16 * 1024
-"""So much the system may take (Linux doubles it) before the other side has acknowledged it: it is beyond recall."""
+"""Kernel send buffer (Linux doubles it). It is small because its data cannot be discarded."""
 
 NOT_SENT_LOW_WATER = 1024
-"""So much the system may take that it has never sent (TCP_NOTSENT_LOWAT, where there is one)."""
+"""Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
 
-TURNS_OF_AN_ACCEPT = 5
-"""Turns of the loop from a client that it has accepted to one that we know: before, nobody would close it."""
+# Loop iterations from accepting a client to `connection_made`. Before that, closing the link misses the client.
+ACCEPT_ITERATIONS = 5
+
 MAX_CLIENTS = 64
-"""Further clients of a listening link are turned away, or take the place of one that has said nothing yet."""
+"""Further clients are refused, or replace one that is not kept yet (`Link.keep_peer`)."""
 
 
 class _TcpLink(BaseLink):
-    """What both ends have in common: streams that outlive the link by `LINGER_S` at most."""
+    """Common base: connections that outlive the link by at most `LINGER_S`."""
 
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
-        self._streams: set[_Stream] = set()  # all that are not quite gone
+        self._streams: set[_Stream] = set()  # including closing ones
         self._stalled: set[_Stream] = set()
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; of all clients together."""
+        """See `Link.unsent_bytes`; of all clients."""
         return sum(stream.unsent_bytes for stream in self._streams)
 
     def discard_unsent(self) -> None:
-        """See `Link.discard_unsent`."""
         for stream in self._streams:
             stream.discard_unsent()
 
     @abstractmethod
-    def _stream_made(self, stream: _Stream) -> None: ...
+    def _on_connected(self, stream: _Stream) -> None: ...
 
     @abstractmethod
-    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None: ...
+    def _on_disconnected(self, stream: _Stream, error: Exception | None) -> None: ...
 
-    def _stream_begins(self, stream: _Stream) -> None:
+    def _add_stream(self, stream: _Stream) -> None:
         self._streams.add(stream)
         self._released.clear()
         if self._receiver is None:
             stream.close()
         else:
-            self._stream_made(stream)
+            self._on_connected(stream)
 
-    def _stream_ends(self, stream: _Stream, error: Exception | None) -> None:
+    def _remove_stream(self, stream: _Stream, error: Exception | None) -> None:
         self._streams.discard(stream)
         if not self._streams:
             self._released.set()
-        self._stream_lost(stream, error)
-        self._stream_stalled(stream, False)
+        self._on_disconnected(stream, error)
+        self._on_stalled(stream, False)
 
-    def _stream_stalled(self, stream: _Stream, is_stalled: bool) -> None:
+    def _on_stalled(self, stream: _Stream, is_stalled: bool) -> None:
         (self._stalled.add if is_stalled else self._stalled.discard)(stream)
-        self._tell_stalled(bool(self._stalled))
+        self._report_stalled(bool(self._stalled))
 
     def _release(self) -> None:
         for stream in tuple(self._streams):
@@ -84,7 +91,7 @@ class _TcpLink(BaseLink):
 
 
 class TcpConnect(_TcpLink):
-    """``tcp:`` connects to a server; the server's end of stream is a lost link."""
+    """``tcp:`` link: connects to a server. The link is lost when the server closes the connection."""
 
     def __init__(self, host: str, port: int, *, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         super().__init__("tcp", host, port)
@@ -93,11 +100,11 @@ class TcpConnect(_TcpLink):
 
     @property
     def local_address(self) -> tuple[str, int]:
-        """Our own host and port; ("", 0) when it is not open."""
+        """Own host and port; ("", 0) while the link is not open."""
         return self._stream.own_address if self._stream is not None else ("", 0)
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops what is more than `MAX_PENDING_BYTES`, or has waited for a second."""
+        """See `Link.write`. Drops data beyond `MAX_PENDING_BYTES`, and data that has waited for a second."""
         if self._stream is not None:
             self._stream.write(data)
 
@@ -106,21 +113,21 @@ class TcpConnect(_TcpLink):
             return await self._connect_to_any(await resolve(self._host, self._port, socket.SOCK_STREAM))
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
-    async def _connect_to_any(self, endpoints: list[Endpoint]) -> None:
+    async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
         first_error: OSError | None = None
-        for endpoint in endpoints:
+        for address in addresses:
             try:
-                return await self._connect_to(endpoint)
+                return await self._connect_to(address)
             except OSError as error:
                 first_error = first_error or error
         raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
 
-    async def _connect_to(self, endpoint: Endpoint) -> None:
+    async def _connect_to(self, address: SocketAddress) -> None:
         loop = asyncio.get_running_loop()
-        sock = socket.socket(endpoint.family, socket.SOCK_STREAM)
+        sock = socket.socket(address.family, socket.SOCK_STREAM)
         try:
             sock.setblocking(False)
-            await loop.sock_connect(sock, endpoint.address)
+            await loop.sock_connect(sock, address.address)
         except BaseException:
             sock.close()
             raise
@@ -128,16 +135,16 @@ class TcpConnect(_TcpLink):
         try:
             await loop.create_connection(lambda: stream, sock=sock)
         except BaseException:
-            self._stream = None  # it was never open: not a loss
+            self._stream = None  # the link was never open, so this is not a loss
             stream.close()
-            sock.close()  # uvloop leaves that to the garbage collector
-            self._stream_ends(stream, None)  # and does not tell the protocol
+            sock.close()  # uvloop leaves the socket to the garbage collector
+            self._remove_stream(stream, None)  # and does not call the protocol
             raise
 
-    def _stream_made(self, stream: _Stream) -> None:
+    def _on_connected(self, stream: _Stream) -> None:
         self._stream = stream
 
-    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
+    def _on_disconnected(self, stream: _Stream, error: Exception | None) -> None:
         if stream is self._stream:
             self._lose(_why_lost(error), error)
 
@@ -147,33 +154,33 @@ class TcpConnect(_TcpLink):
 
 
 class TcpListen(_TcpLink):
-    """``tcpin:`` serves clients; each is a peer, and losing one, or all of them, does not lose the link.
+    """``tcpin:`` link: serves clients. Each client is a peer; the link is not lost when clients disconnect.
 
-    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
-    IP addresses and networks that may connect (None: all); InvalidArgument for what is none.
+    With port 0 the system chooses one; `address` and `local_address` have it once the link is open. ``peers`` are the
+    IP addresses and networks that may connect; None: all.
     """
 
-    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
+    def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("tcpin", host, port)
         self._allowed = AllowedPeers(peers)
         self._kept: set[Peer] = set()
-        self._socket: socket.socket | None = None  # until the server has it
+        self._socket: socket.socket | None = None  # until the server owns it
         self._server: asyncio.AbstractServer | None = None
         self._local_address = ("", 0)
         self._clients: dict[Peer, _Stream] = {}
 
     @property
     def local_address(self) -> tuple[str, int]:
-        """Host and port this link listens on; ("", 0) before it is open."""
+        """Host and port of the listening socket; ("", 0) before the link is open."""
         return self._local_address
 
     @property
     def peers(self) -> tuple[Peer, ...]:
-        """The clients that are connected now."""
+        """Connected clients."""
         return tuple(self._clients)
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops for a client what is more than `MAX_PENDING_BYTES`, or has waited for a second."""
+        """See `Link.write`. Drops data for a client beyond `MAX_PENDING_BYTES`, or that has waited for a second."""
         if peer is None:
             for client in tuple(self._clients.values()):
                 client.write(data)
@@ -183,31 +190,28 @@ class TcpListen(_TcpLink):
             self._drop(1)
 
     def unsent_bytes_to(self, peer: Peer) -> int:
-        """See `Link.unsent_bytes_to`."""
         stream = self._clients.get(peer)
         return 0 if stream is None else stream.unsent_bytes
 
     def keep_peer(self, peer: Peer) -> None:
-        """See `Link.keep_peer`: it is not turned away for another one."""
+        """See `Link.keep_peer`. A kept client is not replaced by another one."""
         if peer in self._clients:
             self._kept.add(peer)
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`: it may be turned away for another one."""
+        """See `Link.forget_peer`. The client may be replaced by another one."""
         self._kept.discard(peer)
 
     def has_peer(self, peer: Peer) -> bool:
-        """See `Link.has_peer`."""
         return peer in self._clients
 
     def close_clients(self) -> None:
-        """Cut off all clients; they may come again."""
+        """Disconnect all clients. They may reconnect."""
         for stream in tuple(self._clients.values()):
             stream.close()
 
     async def wait_closed(self) -> None:
-        """See `Link.wait_closed`."""
-        for _ in range(TURNS_OF_AN_ACCEPT):
+        for _ in range(ACCEPT_ITERATIONS):
             await asyncio.sleep(0)
         await super().wait_closed()
         if self._server is not None and self._receiver is None:
@@ -219,13 +223,11 @@ class TcpListen(_TcpLink):
         self._local_address = sock.getsockname()[:2]
         self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(
-            lambda: _Stream(self), sock=sock, backlog=16, start_serving=False
-        )
+        self._server = await loop.create_server(lambda: _Stream(self), sock=sock, backlog=16, start_serving=False)
         self._socket = None
         await self._server.start_serving()
 
-    def _stream_made(self, stream: _Stream) -> None:
+    def _on_connected(self, stream: _Stream) -> None:
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
         if (host and not self._allowed.allows(host)) or not self._has_room():
             stream.close()
@@ -237,15 +239,15 @@ class TcpListen(_TcpLink):
     def _has_room(self) -> bool:
         if len(self._clients) < MAX_CLIENTS:
             return True
-        silent = next((peer for peer in self._clients if peer not in self._kept), None)
-        if not self._keeps_peers or silent is None:
+        unkept = next((peer for peer in self._clients if peer not in self._kept), None)
+        if not self._keeps_peers or unkept is None:
             return False
-        self._clients.pop(silent).close()
+        self._clients.pop(unkept).close()
         if isinstance(self._receiver, PeerListener):
-            self._receiver.peer_left(silent)
+            self._receiver.peer_left(unkept)
         return True
 
-    def _stream_lost(self, stream: _Stream, error: Exception | None) -> None:
+    def _on_disconnected(self, stream: _Stream, error: Exception | None) -> None:
         if self._clients.get(stream.peer) is stream:
             del self._clients[stream.peer]
             self._kept.discard(stream.peer)
@@ -255,7 +257,7 @@ class TcpListen(_TcpLink):
     def _release(self) -> None:
         self._clients.clear()
         if self._server is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed, and its sockets with it
+            with contextlib.suppress(RuntimeError):  # the loop and its sockets are closed
                 self._server.close()
         if self._socket is not None:
             self._socket.close()
@@ -264,7 +266,7 @@ class TcpListen(_TcpLink):
 
 
 class _Stream(asyncio.Protocol):
-    """One TCP connection: bounded in what it holds back and for how long, and in how long it lingers."""
+    """One TCP connection, with a bounded write buffer and a bounded linger time."""
 
     def __init__(self, link: _TcpLink) -> None:
         self._link = link
@@ -295,7 +297,7 @@ class _Stream(asyncio.Protocol):
             self._outbox.discard()
 
     def close(self) -> None:
-        """Sends what was written, for up to `LINGER_S`, and closes; at once when the connection is stalled."""
+        """Send remaining data for up to `LINGER_S`, then close. Close at once if the connection is stalled."""
         if self._transport is None or self._outbox is None or self._transport.is_closing():
             return
         with contextlib.suppress(RuntimeError):  # the loop is closed
@@ -308,16 +310,16 @@ class _Stream(asyncio.Protocol):
                 self._linger = self._loop.call_later(LINGER_S, self._abort)
 
     def _abort(self) -> None:
-        """What has not been sent is not sent any more, when nobody waits for it."""
+        """Close the connection and discard unsent data."""
         assert self._transport is not None
         sock = self._transport.get_extra_info("socket")
-        discard_unsent(sock)
+        discard_on_close(sock)
         self._transport.abort()
 
-    def connection_made(self, transport: Any) -> None:  # not every loop's is a Transport by its class
+    def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from Transport
         self._transport = transport
-        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may be gone already
-        transport.set_write_buffer_limits(high=0)  # what it cannot get rid of at once waits in the outbox
+        self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"  # it may have disconnected already
+        transport.set_write_buffer_limits(high=0)  # data that cannot be sent at once waits in the outbox
         sock = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -331,9 +333,9 @@ class _Stream(asyncio.Protocol):
             self._pending,
             limit=MAX_PENDING_BYTES,
             dropped=self._link._drop,
-            stalled=lambda is_stalled: self._link._stream_stalled(self, is_stalled),
+            stalled=lambda is_stalled: self._link._on_stalled(self, is_stalled),
         )
-        self._link._stream_begins(self)
+        self._link._add_stream(self)
 
     def data_received(self, data: bytes) -> None:
         peer = self.peer if isinstance(self._link, TcpListen) else None
@@ -350,19 +352,19 @@ class _Stream(asyncio.Protocol):
     def _pending(self) -> int:
         if self._transport is None or self._fd < 0:
             return 0
-        return self._transport.get_write_buffer_size() + unsent_in_kernel(self._fd)
+        return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._fd = -1  # another file may have the number soon
+        self._fd = -1  # the number may be reused
         if self._outbox is not None:
             self._outbox.discard()
             self._outbox.close()
         if self._linger is not None:
             self._linger.cancel()
-        self._link._stream_ends(self, exc)
+        self._link._remove_stream(self, exc)
 
 
 def _why_lost(error: Exception | None) -> str:
     if error is None:
-        return "the other side closed the connection"
+        return "the other end closed the connection"
     return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__

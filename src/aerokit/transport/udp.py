@@ -1,8 +1,7 @@
-"""UDP: listen for any number of peers, talk to one, or broadcast until somebody answers.
+"""UDP links: listen for many peers, connect to one, or broadcast until a peer answers.
 
-A non-blocking socket is drained in bounded bursts by ``loop.add_reader``, which costs a third of what
-stock asyncio's datagram transport does (one datagram per turn of the loop); that one is kept for loops
-without ``add_reader`` (Proactor on Windows).
+Sockets are read in bounded bursts with ``loop.add_reader``, which costs a third of asyncio's datagram transport (one
+datagram per loop iteration). That transport is used on loops without ``add_reader`` (Proactor on Windows).
 """
 
 from __future__ import annotations
@@ -17,23 +16,28 @@ from typing import Any
 
 from aerokit.transport.address import host_and_port
 from aerokit.transport.link import BaseLink, BurstListener, Peer
-from aerokit.transport.sockets import AllowedPeers, Endpoint, Peers, bind_to, bound_socket, has_more, resolve
+from aerokit.transport.sockets import (
+    AllowedPeers,
+    PeerFilter,
+    SocketAddress,
+    bind_to,
+    bound_socket,
+    has_more,
+    resolve,
+)
 
-DATAGRAMS_PER_WAKE_UP = 64
-"""So many are read in one go before everybody else on the loop gets a turn."""
+MAX_BURST_DATAGRAMS = 64
+"""Datagrams read in one loop iteration, so that other tasks can run."""
 
 MAX_PEERS = 256
-"""So many remote peers a listening link remembers; the one not heard from for longest is forgotten first.
+"""Peers that a listening link remembers, unless its receiver is a `PeerKeeper`. The least recent one is replaced."""
 
-A receiver that keeps peers (`PeerKeeper`) says itself who is remembered.
-"""
+REMOTE_TIMEOUT_S = 3.5
+"""Silence of the peer that answered a broadcast, after which its port or address may have changed."""
 
-QUIET_AFTER_S = 3.5
-"""Who has answered a broadcast and was not heard for so long may have another port, or another address, now."""
-
-_LARGEST_DATAGRAM = 65535
-_RECEIVE_BUFFER = 1024 * 1024  # a burst of a log download while the program is busy for a moment
-_PASSING = (
+_MAX_DATAGRAM_BYTES = 65535
+_RECEIVE_BUFFER = 1024 * 1024  # room for a burst of a log download while the program is busy
+_TRANSIENT_ERRORS = (
     errno.ENETDOWN,
     errno.ENETUNREACH,
     errno.EHOSTDOWN,
@@ -44,7 +48,7 @@ _PASSING = (
 
 
 class _UdpLink(BaseLink):
-    """What the three have in common: one socket, read in bursts."""
+    """Common base: one socket, read in bursts."""
 
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
@@ -58,7 +62,7 @@ class _UdpLink(BaseLink):
 
     @property
     def local_address(self) -> tuple[str, int]:
-        """Host and port this link is bound to; ("", 0) when it is not open."""
+        """Host and port of the bound socket; ("", 0) while the link is not open."""
         return self._socket.getsockname()[:2] if self._socket is not None else ("", 0)
 
     @abstractmethod
@@ -73,7 +77,7 @@ class _UdpLink(BaseLink):
         self._burst_listener = self._receiver if isinstance(self._receiver, BurstListener) else None
         self._socket = sock = await self._make_socket()
         self._has_more = has_more(sock)
-        _ask_for_buffers(sock)
+        _enlarge_buffer(sock)
         try:
             self._loop.add_reader(sock, self._drain)
         except NotImplementedError:
@@ -89,12 +93,12 @@ class _UdpLink(BaseLink):
             self._released.set()  # asyncio has closed the socket
             raise
 
-    def _transport_made(self, transport: asyncio.DatagramTransport) -> None:
+    def _transport_opened(self, transport: asyncio.DatagramTransport) -> None:
         self._transport = transport
-        if self._socket is None:  # closed meanwhile
+        if self._socket is None:  # the link was closed meanwhile
             self._release()
 
-    def _transport_gone(self, error: Exception | None) -> None:
+    def _transport_closed(self, error: Exception | None) -> None:
         self._transport = None
         self._released.set()
         self._lose(f"the socket failed: {error}" if error else "the socket was closed", error)
@@ -104,29 +108,27 @@ class _UdpLink(BaseLink):
         transport, self._transport = self._transport, None
         loop = None if self._loop is None or self._loop.is_closed() else self._loop
         if transport is not None and loop is not None:
-            transport.abort()  # _transport_gone comes on the next turn of the loop
+            transport.abort()  # _transport_closed runs in the next loop iteration
         if sock is not None and not self._transport_owns_socket:
             if loop is not None:
                 loop.remove_reader(sock)
             sock.close()
 
     @property
-    def tells_bursts(self) -> bool:
-        """See `Link.tells_bursts`."""
+    def reports_bursts(self) -> bool:
         return self._socket is not None and not self._transport_owns_socket
 
     def _drain(self) -> None:
-        """Reads what is there, at most a burst of it; the loop comes back while there is more."""
         self._read_burst()
         if self._burst_listener is not None and self._receiver is not None:
             self._burst_listener.burst_ended()
 
     def _read_burst(self) -> None:
-        for _ in range(DATAGRAMS_PER_WAKE_UP):
+        for _ in range(MAX_BURST_DATAGRAMS):
             if self._socket is None:  # closed by the receiver
                 return
             try:
-                data, source = self._socket.recvfrom(_LARGEST_DATAGRAM)
+                data, source = self._socket.recvfrom(_MAX_DATAGRAM_BYTES)
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
@@ -137,12 +139,11 @@ class _UdpLink(BaseLink):
                 return
 
     def _receive_failed(self, error: OSError) -> None:
-        """An earlier datagram of ours met a closed port, or the network is away: neither ends a UDP link."""
-        if not isinstance(error, ConnectionError) and error.errno not in _PASSING:
+        # A closed port at the other end, or a missing network, does not end a UDP link.
+        if not isinstance(error, ConnectionError) and error.errno not in _TRANSIENT_ERRORS:
             self._lose(f"the socket failed: {error.strerror or error}", error)
 
     def _send(self, data: bytes, address: Any) -> None:
-        """Sends one datagram, or drops and counts it."""
         if self._socket is None:
             return
         try:
@@ -152,43 +153,40 @@ class _UdpLink(BaseLink):
 
 
 class UdpListen(_UdpLink):
-    """``udpin:`` binds a port and talks to everybody who was heard on it; each of them is a peer.
+    """``udpin:`` link: binds a port. Each sender is a peer, and gets what is written to all.
 
-    Port 0 lets the system choose one; `address` and `local_address` say which once the link is open. ``peers`` are the
-    IP addresses and networks that are listened to (None: all); InvalidArgument for what is none.
+    With port 0 the system chooses one; `address` and `local_address` have it once the link is open. ``peers`` are the
+    IP addresses and networks to accept; None: all.
     """
 
-    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
+    def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("udpin", host, port)
         self._allowed = AllowedPeers(peers)
-        self._peers: dict[Peer, None] = {}  # the one heard last is at the end
-        self._heard_last: Peer = None
+        self._peers: dict[Peer, None] = {}  # most recent last
+        self._last_source: Peer = None
 
     @property
     def peers(self) -> tuple[Peer, ...]:
-        """All remembered peers, the one heard last comes first."""
+        """Remembered peers, most recent first."""
         return tuple(reversed(self._peers))
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; with nobody heard yet there is nobody to write to, which is not counted."""
+        """See `Link.write`. Data for all peers is not counted as dropped while there is no peer."""
         if peer is None:
-            for each in self._peers:
-                self._send(data, each)
+            for known_peer in self._peers:
+                self._send(data, known_peer)
         elif peer in self._peers:
             self._send(data, peer)
         else:
             self._drop(1)
 
     def keep_peer(self, peer: Peer) -> None:
-        """See `Link.keep_peer`."""
         self._peers[peer] = None
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`."""
         self._peers.pop(peer, None)
 
     def has_peer(self, peer: Peer) -> bool:
-        """See `Link.has_peer`."""
         return peer in self._peers
 
     async def _make_socket(self) -> socket.socket:
@@ -197,10 +195,10 @@ class UdpListen(_UdpLink):
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
-        if source != self._heard_last:
+        if source != self._last_source:
             if source not in self._peers and not self._allowed.allows(source[0]):
                 return
-            self._heard_last = source
+            self._last_source = source
             if not self._keeps_peers:
                 self._remember(source)
         self._deliver(data, source)
@@ -213,10 +211,10 @@ class UdpListen(_UdpLink):
 
 
 class UdpConnect(_UdpLink):
-    """``udpout:`` sends to one remote address and hears only that one: host and port must both be its.
+    """``udpout:`` link: sends to one remote address, and receives only from that host and port.
 
-    The socket stays unconnected: uvloop stops to read a connected one at the first "connection refused" of
-    the other side, which is nothing but a vehicle that has not started yet.
+    The socket is not connected, because uvloop stops reading a connected socket at the first "connection refused",
+    which only means that the vehicle has not started yet.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -224,13 +222,12 @@ class UdpConnect(_UdpLink):
         self._remote: Any = None
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`."""
         self._send(data, self._remote)
 
     async def _make_socket(self) -> socket.socket:
-        endpoint = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
-        self._remote = _name_of_remote(endpoint)
-        return bind_to(Endpoint(endpoint.family, ("", 0)), socket.SOCK_DGRAM)
+        remote = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
+        self._remote = _source_address(remote)
+        return bind_to(SocketAddress(remote.family, ("", 0)), socket.SOCK_DGRAM)
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
         if source == self._remote:
@@ -238,66 +235,62 @@ class UdpConnect(_UdpLink):
 
 
 class UdpBroadcast(_UdpLink):
-    """``udpbcast:`` (IPv4) broadcasts until somebody answers, then talks to that one only.
+    """``udpbcast:`` link (IPv4): broadcasts until a peer answers, then uses that peer only.
 
-    When nothing has come from there for 3.5 s, it broadcasts again and hears who answers; another port of the same host
-    is heard at once. What is for one peer is sent to that one, and never to everybody. ``peers`` are the IP addresses
-    and networks that are listened to (None: all).
+    After 3.5 s of silence it broadcasts again, and accepts another peer. Another port of the same host is accepted at
+    once. Data for one peer is never broadcast. ``peers`` are the IP addresses and networks to accept; None: all.
     """
 
-    # of _remote
-    _heard_at: float
+    _received_at: float  # set with _remote
 
-    def __init__(self, host: str, port: int, *, peers: Peers | None = None) -> None:
+    def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("udpbcast", host, port)
         self._allowed = AllowedPeers(peers)
-        self._everybody: Any = None
-        self._remote: Any = None  # who has answered
+        self._broadcast_address: Any = None
+        self._remote: Any = None  # the peer that answered
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`."""
-        everybody_or_it = self._everybody if self._is_quiet() else self._remote
-        self._send(data, everybody_or_it if peer is None else peer)
+        default = self._broadcast_address if self._is_remote_silent() else self._remote
+        self._send(data, default if peer is None else peer)
 
     def keep_peer(self, peer: Peer) -> None:
-        """See `Link.keep_peer`."""
-        self._remote, self._heard_at = peer, self._now()
+        self._remote, self._received_at = peer, self._now()
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()
 
-    def _is_quiet(self) -> bool:
-        return self._remote is None or self._now() - self._heard_at > QUIET_AFTER_S
+    def _is_remote_silent(self) -> bool:
+        return self._remote is None or self._now() - self._received_at > REMOTE_TIMEOUT_S
 
     async def _make_socket(self) -> socket.socket:
-        endpoint = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
-        self._everybody, self._remote = endpoint.address, None
-        sock = bind_to(Endpoint(socket.AF_INET, ("", 0)), socket.SOCK_DGRAM)
+        remote = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
+        self._broadcast_address, self._remote = remote.address, None
+        sock = bind_to(SocketAddress(socket.AF_INET, ("", 0)), socket.SOCK_DGRAM)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
         if source == self._remote:
-            self._heard_at = self._now()
-        elif not self._may_answer(source):
+            self._received_at = self._now()
+        elif not self._is_accepted(source):
             return
         elif not self._keeps_peers:
             self.keep_peer(source)
         self._deliver(data, source if self._keeps_peers else None)
 
-    def _may_answer(self, source: Any) -> bool:
-        is_its_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
-        return (is_its_host or self._is_quiet()) and self._allowed.allows(source[0])
+    def _is_accepted(self, source: Any) -> bool:
+        is_same_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
+        return (is_same_host or self._is_remote_silent()) and self._allowed.allows(source[0])
 
 
 class _DatagramProtocol(asyncio.DatagramProtocol):
-    """Reception on loops that have no add_reader."""
+    """Reads the socket on loops without add_reader."""
 
     def __init__(self, link: _UdpLink) -> None:
         self._link = link
 
-    def connection_made(self, transport: Any) -> None:  # not every loop's is a DatagramTransport by its class
-        self._link._transport_made(transport)
+    def connection_made(self, transport: Any) -> None:  # not every loop's transport inherits from it
+        self._link._transport_opened(transport)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         if self._link._socket is not None:
@@ -308,17 +301,17 @@ class _DatagramProtocol(asyncio.DatagramProtocol):
             self._link._receive_failed(exc)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._link._transport_gone(exc)
+        self._link._transport_closed(exc)
 
 
-def _name_of_remote(endpoint: Endpoint) -> Any:
-    """The address that datagrams from there will bear (0.0.0.0 is this machine); OSError without a route."""
-    with socket.socket(endpoint.family, socket.SOCK_DGRAM) as probe:
-        probe.connect(endpoint.address)
+def _source_address(remote: SocketAddress) -> Any:
+    """Return the source address of datagrams from there (0.0.0.0 is this machine). OSError without a route."""
+    with socket.socket(remote.family, socket.SOCK_DGRAM) as probe:
+        probe.connect(remote.address)
         return probe.getpeername()
 
 
-def _ask_for_buffers(sock: socket.socket) -> None:
+def _enlarge_buffer(sock: socket.socket) -> None:
     with contextlib.suppress(OSError):
         if sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) < _RECEIVE_BUFFER:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)

@@ -1,4 +1,4 @@
-"""``aerokit.connect``: from an address to a vehicle, for the time of an ``async with`` block."""
+"""``aerokit.connect``: opens a connection and finds the vehicle, for the duration of an ``async with`` block."""
 
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ import anyio
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit.connection.bus import raisable
-from aerokit.connection.components import is_autopilot
+from aerokit.connection.bus import copy_exception
 from aerokit.connection.connection import Connection
-from aerokit.connection.opening import no_vehicle_reason, open_connection
-from aerokit.connection.own_heartbeat import OwnHeartbeat
-from aerokit.connection.routes import MOST_ROUTES
-from aerokit.connection.tasks import Background
+from aerokit.connection.heartbeats import OwnHeartbeat, is_autopilot
+from aerokit.connection.opening import explain_no_vehicle, open_connection
+from aerokit.connection.routes import MAX_ROUTES
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import AerokitError, BusyError, ConnectFailed, InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavComponent
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.transport.link import Link
-from aerokit.vehicle.commanding.context import Bridge
+from aerokit.vehicle.commanding.context import VehicleContext
 from aerokit.vehicle.session.rates import check_rate
-from aerokit.vehicle.session.session import Talk
+from aerokit.vehicle.session.session import VehicleSession
 from aerokit.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -39,17 +38,17 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.mavlink.signing import Signing
-    from aerokit.transport.sockets import Peers
+    from aerokit.transport.sockets import PeerFilter
 
-__all__ = ["connect", "tell_how_it_is_left", "vehicles_on"]
+__all__ = ["connect", "vehicles_on", "warn_if_left_flying"]
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-FRESH_HEARTBEAT_S = 2.0
-"""A heartbeat heard longer ago says nothing about now: the next one is waited for."""
+# An older heartbeat does not prove that the vehicle is present now, so the search waits for the next one.
+HEARTBEAT_MAX_AGE_S = 2.0
 
-HEARTBEATS_ALONE = 3
-"""So many heartbeats of another component and none of component 1 make it the vehicle's autopilot."""
+# This many heartbeats of one component, with none from component 1, make it the vehicle's autopilot.
+MIN_LONE_HEARTBEATS = 3
 
 
 @checked
@@ -68,69 +67,69 @@ async def connect(
     signing: Signing | None = None,
     record: str | os.PathLike[str] | None = None,
     reconnect: bool = False,
-    peers: Peers | None = None,
+    peers: PeerFilter | None = None,
     may_move: bool = False,
     heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     share: Iterable[str | Endpoint | Link] = (),
 ) -> AsyncIterator[Vehicle]:
-    """Connect to a vehicle for the time of the ``async with`` block.
+    """Connect to a vehicle for the duration of the ``async with`` block.
 
-    Returns at its first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the asyncio
-    loop that is already running: nothing outlives the block, and what the block raises comes out of it as it is.
+    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the
+    running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
-        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …;
-            a link; several of these that lead to the vehicle (docs/how-to/several-links.md); or a connection that is
-            open already, for several vehicles on one link: what follows ``rates`` here is then said where it is opened.
-        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot that is heard.
+        address: ``"udpin:0.0.0.0:14550"``, ``"tcp:127.0.0.1:5760"``, ``"/dev/ttyACM0,57600"``, a ``.tlog`` file …; a
+            link; several of these that lead to the same vehicle (docs/how-to/several-links.md); or an open
+            connection, to use several vehicles on one link: the arguments after ``rates`` then belong to the call
+            that opened it.
+        system_id: the vehicle's MAVLink system id, 1–255; None takes the first autopilot found.
         timeout: seconds to wait for its first heartbeat, above 0.
-        rates: message class → Hz (above 0, at most 1000), asked for instead of the default rates; ``{}`` asks for
+        rates: message class → Hz (above 0, at most 1000), requested instead of the default rates; ``{}`` requests
             nothing.
         source_system: our own system id.
-        source_component: our own component id, 0–255; 0, which is nobody's, for programs that always were that.
-        baud: of a serial link whose address names none.
-        dialect: the messages that are understood.
-        mavlink_version: of what we send, 1 or 2.
-        signing: signs everything we send; what is not signed with its key is refused (docs/signing.md). None: neither.
-        record: a ``.tlog`` file for everything received and sent; an existing file is replaced.
-        reconnect: whether a link that is lost is opened again until it is back, instead of ending the connection.
-        peers: the IP addresses and networks that are listened to: ``"10.0.0.7"``, ``["10.0.0.0/24"]``. For links to
-            which anybody can send: udpin, udpbcast, tcpin. None: all.
-        may_move: whether the vehicle, once silent, may come back from another IP address without going on where it
-            stopped, by sequence numbers and time since boot (rebooted, with a new address). Else it is not listened to
-            there (``MoveRefused``), for it might be anybody.
-        heartbeat: what our own HEARTBEAT says, and on what condition it is sent; None: none is, and the vehicle
-            knows of no ground station: PX4 sends no texts then, and a ``udpout:`` link stays silent.
-        share: where ground stations and other programs are, or come, that use the same link:
-            ``["tcpin:127.0.0.1:5760"]`` (docs/hub.md). They should have other ids than this program. For an open
-            connection: ``async with aerokit.hub.shared(connection, […])``.
+        source_component: our own component id, 0–255. 0 is not a valid component id; some old programs send it.
+        baud: baud rate of a serial link whose address has none.
+        dialect: the message definitions to use.
+        mavlink_version: version of the frames we send, 1 or 2.
+        signing: signs everything we send, and rejects frames that are not signed with its key (docs/signing.md).
+            None: no signatures.
+        record: a ``.tlog`` file that receives all traffic in both directions; an existing file is replaced.
+        reconnect: reopen a lost link until it is back, instead of ending the connection.
+        peers: accept datagrams and connections only from these IP addresses and networks: ``"10.0.0.7"``,
+            ``["10.0.0.0/24"]``. For links that anybody can send to: udpin, udpbcast, tcpin. None: accept all.
+        may_move: accept a silent vehicle from a new IP address even if its sequence numbers and time since boot do
+            not continue (it rebooted and has a new address). Otherwise that address is refused
+            (``RouteChangeRefused``), because it may belong to another sender.
+        heartbeat: contents and condition of our own HEARTBEAT. None: no heartbeat is sent, and the vehicle sees no
+            ground station: PX4 then sends no status texts, and a ``udpout:`` link stays silent.
+        share: addresses at which ground stations and other programs use the same link: ``["tcpin:127.0.0.1:5760"]``
+            (docs/hub.md). They should use other ids than this program. For an open connection use ``async with
+            aerokit.hub.shared(connection, […])``.
 
     Raises:
-        InvalidArgument: an argument is wrong. Nothing was opened.
-        BusyError: this system has a vehicle object on this connection already.
-        LinkOpenError: the link, one to share it on, or the file to record to, could not be opened.
-        LinkLost, ConnectionClosed: the link went down while waiting, or the connection was closed.
-        ConnectFailed: no heartbeat of such a vehicle came in time; the text says what was heard instead.
+        InvalidArgument: an argument is invalid. Nothing was opened.
+        BusyError: this connection already has a vehicle object for this system.
+        LinkOpenError: the link, a shared link or the recording could not be opened.
+        LinkLost, ConnectionClosed: the link failed while waiting, or the connection was closed.
+        ConnectFailed: no heartbeat of such a vehicle arrived in time; the text says what was received instead.
     """
     _check(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
     if isinstance(address, Connection):
         if record is not None:
             raise InvalidArgument("record = … is not allowed here: the connection is open; use its record()")
         if signing is not None:
-            raise InvalidArgument(
-                "signing = … is not allowed here: the connection is open; set its attribute signing"
-            )
+            raise InvalidArgument("signing = … is not allowed here: the connection is open; set its attribute signing")
         if reconnect:
             raise InvalidArgument(
-                "reconnect = True is not allowed here: the connection is open; say it to open_connection"
+                "reconnect = True is not allowed here: the connection is open; pass it to open_connection"
             )
         if heartbeat != OwnHeartbeat():
             raise InvalidArgument(
-                "heartbeat = … is not allowed here: the connection is open; say it to open_connection"
+                "heartbeat = … is not allowed here: the connection is open; pass it to open_connection"
             )
         if peers is not None or may_move:
             raise InvalidArgument(
-                "peers and may_move are not allowed here: the connection is open; say it to open_connection"
+                "peers and may_move are not allowed here: the connection is open; pass it to open_connection"
             )
         if share:
             raise InvalidArgument(
@@ -162,18 +161,17 @@ async def connect(
 
 
 def _hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
-    """The hub that others use the link by, checked before anything is opened; None: there are no others."""
+    """Create the hub for ``share``, validated before anything is opened; None without ``share``."""
     endpoints = tuple(share)
     if not endpoints:
         return None
-    from aerokit.hub.hub import Hub  # few programs share
+    from aerokit.hub.hub import Hub  # Imported here because few programs share a link.
 
     return Hub(endpoints, dialect=dialect)
 
 
 @asynccontextmanager
 async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
-    """Let others use the link, too, for the time of the block."""
     if hub is None:
         yield
         return
@@ -186,9 +184,7 @@ def _check(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
     if system_id is not None and not 1 <= system_id <= 255:
-        raise InvalidArgument(
-            f"system_id = {system_id} is not allowed: 1 to 255, or None for the first heard"
-        )
+        raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255, or None for the first one found")
     if not timeout > 0:
         raise InvalidArgument(f"timeout = {timeout} is not allowed: above 0")
     for message_type, hz in (rates or {}).items():
@@ -204,39 +200,39 @@ async def _attached(
     timeout: float,
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
-    """Find a vehicle on an open connection and keep it for the time of the block."""
-    bridge, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
+    """Find a vehicle on an open connection and keep it for the duration of the block."""
+    context, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     is_cut_short = False
     try:
-        bridge.talk.start(heartbeat, rates)
+        context.session.start(heartbeat, rates)
         yield vehicle
     except BaseException:
         is_cut_short = True
         raise
     finally:
         try:
-            is_given_up = await bridge.finish()
+            is_given_up = await context.finish()
             if is_cut_short or is_given_up:
-                tell_how_it_is_left(vehicle)
+                warn_if_left_flying(vehicle)
         finally:
-            bridge.talk.close()
+            context.session.close()
             connection.attached.discard(vehicle.system_id)
-            await bridge.talk.background.aclose()
+            await context.session.background.aclose()
 
 
-def tell_how_it_is_left(vehicle: Vehicle) -> None:
-    """Log what a vehicle does that a program lets go in flight without having meant to, if it does so by its orders."""
-    if vehicle._arbiter.is_obeyed and not vehicle.is_surely_disarmed:
-        logger.warning("vehicle %d is let go: %s", vehicle.system_id, vehicle.describe_now())
+def warn_if_left_flying(vehicle: Vehicle) -> None:
+    """Log a warning if the block is left while the vehicle executes this program's orders."""
+    if vehicle._arbiter.may_be_executing and not vehicle.is_confirmed_disarmed:
+        logger.warning("the block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
 
 
 async def _find_vehicle(connection: Connection, system_id: int | None, timeout: float) -> _Found:
-    """The vehicle of the first heartbeat that will do, listening from the instant it came."""
+    """Return the vehicle of the first acceptable heartbeat."""
     connection.raise_if_ended()
     search = _Search(connection, system_id)
-    for known in connection.heard.values():
+    for known in connection.heartbeats.values():
         frame = known.received_frame
-        if frame is not None and connection.now() - frame.received_at <= FRESH_HEARTBEAT_S:
+        if frame is not None and connection.now() - frame.received_at <= HEARTBEAT_MAX_AGE_S:
             search.take(known)
     detachments = [
         connection.bus.attach(Heartbeat, search.take, system_id=system_id or 0),
@@ -251,17 +247,17 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
         search.forget()
     raise ConnectFailed(
         f"no heartbeat of {search.wanted} within {timeout:g} s on {connection.link.address}:"
-        f" {no_vehicle_reason(connection, system_id)}"
+        f" {explain_no_vehicle(connection, system_id)}"
     )
 
 
-_Found = tuple[Bridge, Vehicle, Heartbeat]
+_Found = tuple[VehicleContext, Vehicle, Heartbeat]
 
 
 class _Search:
-    """Makes the vehicle as soon as it is heard, inside the delivery of its heartbeat: what follows is not missed.
+    """Creates the vehicle inside the delivery of its heartbeat, so that no later message is missed.
 
-    A recording that is replayed as fast as it goes brings many frames in one turn of the loop.
+    A recording replayed at full speed delivers many frames in one iteration of the loop.
     """
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:
@@ -273,7 +269,6 @@ class _Search:
         self.wanted = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
     def take(self, heartbeat: Heartbeat) -> None:
-        """One heartbeat off the link."""
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
@@ -282,29 +277,28 @@ class _Search:
         try:
             if frame.system_id in self._connection.attached:
                 raise BusyError(f"system {frame.system_id} has a vehicle object on this connection already")
-            bridge = Bridge(Talk(self._connection, frame.system_id, frame.component_id, heartbeat))
-            self._found = (bridge, Vehicle(bridge), heartbeat)
+            context = VehicleContext(VehicleSession(self._connection, frame.system_id, frame.component_id, heartbeat))
+            self._found = (context, Vehicle(context), heartbeat)
             self._connection.attached.add(frame.system_id)
         except Exception as error:
             self._error = error
         self._ended.set()
 
     def _is_alone(self, frame: Frame) -> bool:
-        """A component that says it is an autopilot gives the system's first autopilot the time to be heard."""
+        """Return True once component 1 has had time to send a heartbeat, if this autopilot is another component."""
         source = (frame.system_id, frame.component_id)
-        if source not in self._others and len(self._others) >= MOST_ROUTES:
+        if source not in self._others and len(self._others) >= MAX_ROUTES:
             return False
         self._others[source] = self._others.get(source, 0) + 1
-        return self._others[source] >= HEARTBEATS_ALONE
+        return self._others[source] >= MIN_LONE_HEARTBEATS
 
     def abort(self, error: Exception) -> None:
-        """The connection has ended."""
         if not self._ended.is_set():
-            self._error = raisable(error)
+            self._error = copy_exception(error)
             self._ended.set()
 
     async def result(self) -> _Found:
-        """The vehicle, now its finder's to close, and its first heartbeat."""
+        """Return the vehicle, which the caller must close, and its first heartbeat."""
         await self._ended.wait()
         if self._found is None:
             assert self._error is not None
@@ -313,12 +307,12 @@ class _Search:
         return found
 
     def forget(self) -> None:
-        """Close the vehicle if nobody took it: the wait was cancelled just then."""
+        """Close the vehicle if the caller was cancelled before it took the result."""
         self._ended.set()
         if self._found is not None:
-            talk = self._found[0].talk
-            talk.close()
-            self._connection.attached.discard(talk.system_id)
+            session = self._found[0].session
+            session.close()
+            self._connection.attached.discard(session.system_id)
 
     def _is_wanted(self, frame: Frame, heartbeat: Heartbeat) -> bool:
         return frame.system_id != 0 and self._system_id in (None, frame.system_id) and is_autopilot(heartbeat)
@@ -331,18 +325,19 @@ async def vehicles_on(
     rates: Mapping[type[Message], float] | None = None,
     on_found: Callable[[Vehicle], object] | None = None,
 ) -> AsyncIterator[Mapping[int, Vehicle]]:
-    """Connect to each vehicle that is heard on a connection, as soon as it is heard, for the time of the block.
+    """Connect to every vehicle found on a connection, for the duration of the block.
 
-    A vehicle that falls silent stays: its cells have ages, and its ``link_state`` says so. One that this program has
-    a vehicle object of already is left out.
+    A vehicle that falls silent stays in the mapping: its cells have ages, and ``link_state`` reports the silence.
+    Vehicles that this program has connected to otherwise are left out.
 
     Args:
         connection: of :func:`aerokit.open_connection`.
-        rates: message class → Hz, asked of each, as by :func:`aerokit.connect`; ``{}`` asks for nothing.
-        on_found: called with each new vehicle, in the loop.
+        rates: message class → Hz, requested from each vehicle, as by :func:`aerokit.connect`; ``{}`` requests
+            nothing.
+        on_found: called in the loop with each new vehicle.
 
     Returns:
-        System id → vehicle, in the order in which they were heard; it grows while the block lasts.
+        System id → vehicle, in the order in which they were found; grows while the block lasts.
 
     Raises:
         ConnectionClosed, LinkLost: the connection has ended.
@@ -357,8 +352,9 @@ async def vehicles_on(
                 if on_found is not None:
                     on_found(vehicle)
                 await asyncio.Event().wait()
-        except AerokitError as error:  # silent again at once, known already, or the connection has ended
-            logger.info("system %d is not followed: %s", system_id, error)
+        # The vehicle fell silent again, is connected already, or the connection has ended.
+        except AerokitError as error:
+            logger.info("system %d was not connected: %s", system_id, error)
 
     async def look_out() -> None:
         try:
@@ -366,9 +362,9 @@ async def vehicles_on(
                 if found.system_id not in vehicles:
                     tasks.start(partial(keep, found.system_id))
         except AerokitError as error:
-            logger.info("no more vehicles are looked for: %s", error)
+            logger.info("the search for vehicles has ended: %s", error)
 
-    tasks = Background(connection.fail)
+    tasks = BackgroundTasks(connection.fail)
     tasks.start(look_out)
     try:
         yield vehicles

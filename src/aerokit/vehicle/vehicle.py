@@ -1,4 +1,4 @@
-"""``Vehicle``: one drone, rover, boat or submarine, as its program sees it."""
+"""The public `Vehicle` object: one drone, rover, boat or submarine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.mavlink.messages import ParamValue
 from aerokit.vehicle.commanding.arming import ArmingActions
 from aerokit.vehicle.commanding.flight import FlightActions, ModeActions
-from aerokit.vehicle.commanding.messaging import TalkActions
+from aerokit.vehicle.commanding.messaging import MessagingActions
 from aerokit.vehicle.commanding.travel import LookActions, TravelActions
 from aerokit.vehicle.missions.context import PlanContext
 from aerokit.vehicle.state.field import MESSAGE_IDS
@@ -19,10 +19,9 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.signing import Signing
     from aerokit.vehicle.camera.cameras import Camera, Cameras
-    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.guided import Guided
-    from aerokit.vehicle.components.component import Component, ComponentStatus
-    from aerokit.vehicle.components.components import Components
+    from aerokit.vehicle.components.component import Component, Components, ComponentStatus
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.files.logs import Logs
     from aerokit.vehicle.gimbal.gimbal import Gimbal, Gimbals
@@ -37,43 +36,45 @@ TELL_OF_GIMBALS = tuple(
     for name in ("GimbalDeviceAttitudeStatus", "GimbalManagerStatus", "MountStatus", "MountOrientation")
 )
 
-TELL_OF_PICTURES = tuple(
-    MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger")
-)
-"""By their names: few vehicles send one of them, and no other program needs their classes."""
+TELL_OF_PICTURES = tuple(MESSAGE_IDS[name] for name in ("CameraImageCaptured", "CameraFeedback", "CameraTrigger"))
+"""Message ids of camera triggers. Looked up by name, because only programs that use cameras need the classes."""
 
 
 @checks_arguments
-class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, TalkActions):
-    """One vehicle. Coroutines talk to it, properties never do; everything has a deadline and can be cancelled.
+class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions, ModeActions, MessagingActions):
+    """One remote vehicle. Coroutines send commands to it; properties only read. Every call can be cancelled.
 
-    Made by :func:`aerokit.connect`. State is in cells (``vehicle.position.value``, ``.age``, ``.fresh(within=1)``,
-    ``await vehicle.mode.wait_until(...)``), SI units and degrees, the unit in the name. Other threads may read the
-    cells; the parts (``mission``, ``parameters`` …) are made when they are first used, on the loop's thread.
+    Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
+    ``.fresh(within=1)``, ``await vehicle.mode.wait_until(...)``) in SI units and degrees, with the unit in the name.
+    Other threads may read the cells. Sub-objects (``mission``, ``parameters`` …) are created on first use, in the
+    event loop's thread.
     """
 
-    def __init__(self, bridge: Bridge) -> None:
-        super().__init__(bridge)
-        self._plans = PlanContext(bridge, lambda: self.files)
-        first = partial(self.connection.bus.attach_first, system_id=self.system_id)
-        bridge.talk.at_close(
+    def __init__(self, context: VehicleContext) -> None:
+        super().__init__(context)
+        self._plans = PlanContext(context, lambda: self.files)
+        first = partial(self.connection.bus.create_on_first, system_id=self.system_id)
+        context.session.at_close(
             first(TELL_OF_GIMBALS, lambda: self.gimbal),
             first([ParamValue.ID], lambda: self.parameters),
             first(TELL_OF_PICTURES, lambda: self._cameras),
         )
 
-    # Parts are made, and imported, when they are first used, or when the vehicle first says what they listen to.
+    # Sub-objects are imported and created on first use, or when the vehicle first sends a message that they
+    # handle.
 
     @property
     def components(self) -> StateCell[tuple[ComponentStatus, ...]]:
-        """What is on board, as far as it was heard: autopilot, cameras, gimbals, companions, receivers, others.
+        """The components seen on board: autopilot, cameras, gimbals, companion computers, receivers and others.
 
-        Cameras and gimbals without a component id of their own are known once one of their messages has come.
+        Cameras and gimbals without a component id of their own appear after their first message.
         """
         return self._components.cell
 
     def component(self, component_id: int) -> Component:
-        """One of them, to talk to: ``vehicle.component(100).command(…)``. It need not have been heard yet.
+        """Return the component with this id, to send commands to it: ``vehicle.component(100).command(…)``.
+
+        The component need not have been seen yet.
 
         Raises:
             InvalidArgument: the id is not from 1 to 255.
@@ -82,34 +83,35 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
 
     @cached_property
     def _components(self) -> Components:
-        from aerokit.vehicle.components.components import Components
+        from aerokit.vehicle.components.component import Components
 
-        return Components(self._bridge, lambda: self.files, lambda: self.parameters)
+        return Components(self._context, lambda: self.files, lambda: self.parameters)
 
     @property
     def camera(self) -> Camera:
-        """The first camera that is heard: one with a component id of its own before those behind the autopilot.
+        """The first camera found. One with a component id of its own comes before those behind the autopilot.
 
-        Its calls wait for it a moment; ``camera_at`` gives any other one.
+        Its calls wait briefly until a camera is found; ``camera_at`` returns any other one.
         """
         return self._cameras.first
 
     @property
     def cameras(self) -> StateCell[tuple[int, ...]]:
-        """The numbers of the cameras that have been heard, for ``camera_at``.
+        """The numbers of the cameras found so far, for ``camera_at``.
 
-        Component ids (100 to 105), and 1 to 6 for those behind the autopilot once they have told of a picture.
+        A number is a component id (100 to 105), or 1 to 6 for a camera behind the autopilot that has reported a
+        picture.
         """
         return self._cameras.cell
 
     def camera_at(self, number: int) -> Camera:
-        """One camera by its number; it need not have been heard yet.
+        """Return the camera with this number. It need not have been found yet.
 
         Args:
-            number: its component id (100 to 105, at most 255), or 1 to 6 behind the autopilot.
+            number: its component id (100 to 105, at most 255), or 1 to 6 for a camera behind the autopilot.
 
         Raises:
-            InvalidArgument: there can be no such camera.
+            InvalidArgument: no camera can have this number.
         """
         return self._cameras.at(number)
 
@@ -117,65 +119,65 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
     def _cameras(self) -> Cameras:
         from aerokit.vehicle.camera.cameras import Cameras
 
-        return Cameras(self._bridge, self._components)
+        return Cameras(self._context, self._components)
 
     @cached_property
     def guided(self) -> Guided:
         """Set-point streams: velocity, position, acceleration, attitude."""
         from aerokit.vehicle.commanding.guided import Guided
 
-        return Guided(self._bridge)
+        return Guided(self._context)
 
     @cached_property
     def gimbal(self) -> Gimbal:
-        """The first gimbal: where it points, and orders to it."""
+        """The first gimbal: its attitude, and commands to it."""
         return self.gimbals.first
 
     @cached_property
     def gimbals(self) -> Gimbals:
-        """All gimbals that it carries."""
+        """All gimbals of the vehicle."""
         from aerokit.vehicle.gimbal.gimbal import Gimbals
 
-        return Gimbals(self._bridge)
+        return Gimbals(self._context)
 
     @cached_property
     def files(self) -> Files:
-        """The files on it, by MAVFTP."""
+        """The vehicle's file system, accessed by MAVFTP."""
         from aerokit.vehicle.files.files import Files
 
-        return Files(self._talk.transfers)
+        return Files(self._session.transfers)
 
     @cached_property
     def logs(self) -> Logs:
-        """Its flight logs."""
+        """The vehicle's flight logs."""
         from aerokit.vehicle.files.logs import Logs
 
-        return Logs(self._talk.transfers, self.files)
+        return Logs(self._session.transfers, self.files)
 
     @cached_property
     def parameters(self) -> Parameters:
-        """The autopilot's parameters: download, get, set, transactions, what was changed."""
+        """The autopilot's parameters: download, get, set, transactions, change notifications."""
         from aerokit.vehicle.parameters.parameters import Parameters
 
-        return Parameters(self._talk, self.files)
+        return Parameters(self._session, self.files)
 
     @cached_property
     def mission(self) -> MissionControl:
-        """The mission it holds: upload, download, start, pause, wait until it is finished."""
+        """The vehicle's mission: upload, download, start, pause, wait until finished."""
         from aerokit.vehicle.missions.mission import MissionControl
 
         return MissionControl(self._plans)
 
     @cached_property
     def fence(self) -> FenceControl:
-        """The fence it holds."""
+        """The vehicle's geofence."""
         from aerokit.vehicle.missions.plans import FenceControl
 
         return FenceControl(self._plans)
 
     @cached_property
     def rally(self) -> RallyControl:
-        """The rally points it holds."""
+        """The vehicle's rally points."""
         from aerokit.vehicle.missions.plans import RallyControl
 
         return RallyControl(self._plans)
@@ -184,38 +186,38 @@ class Vehicle(ReadOnly, FlightActions, TravelActions, LookActions, ArmingActions
         return f"<Vehicle {self.system_id}/{self.component_id} {self.autopilot.firmware}, {self.describe_link()}>"
 
     async def setup_signing(self, signing: Signing | None, *, timeout: float = 5.0) -> None:
-        """Give the vehicle a key (SETUP_SIGNING), and sign and check with it from then on; None takes the key away.
+        """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
-        **The key travels in clear**: do this over a cable or a link that nobody listens to. Returns when the
-        vehicle's frames are signed with the key (None: when they are not signed any more); until then what was in use
-        remains in use. All on this connection need the key then, or ``signing.allow_unsigned``. Cancelled, the vehicle
-        may have taken the key all the same. See docs/signing.md.
+        **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames
+        are signed with the key (None: when they are no longer signed). Until then the previous setting remains
+        active. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``. After a
+        cancellation the vehicle may have accepted the key nevertheless. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle uses it.
+            timeout: seconds until the vehicle must use it.
 
         Raises:
-            NotSupported: we or the vehicle speak MAVLink 1, which has no signatures. Nothing was sent.
-            OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
-            OperationTimeout: it went on as before; the text has what it said.
-            BusyError: another vehicle on this connection is just being given a key. Nothing was sent.
+            NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
+            OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
+            OperationTimeout: the vehicle did not change; the text includes its status texts.
+            BusyError: another key exchange is in progress on this connection. Nothing was sent.
         """
         from aerokit.vehicle.session.signing import set_up_signing
 
-        await set_up_signing(self._talk, signing, timeout)
+        await set_up_signing(self._session, signing, timeout)
 
 
 def overview(vehicle: Vehicle) -> dict[str, Any]:
-    """What is known of a vehicle, for showing and for other programs; nothing is asked of it.
+    """Return a summary of the vehicle's state as to_jsonable values, for display and for other programs. Sends nothing.
 
     Returns:
         ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` (``state`` as of
-        :class:`aerokit.LinkState`, ``heartbeat_age_s``, and how many frames of the vehicle came and were lost on the
-        way, by their numbers) and ``states``: for each state of docs/states.md that the vehicle has told, ``value``
-        (as :func:`aerokit._internal.plain.plain` gives it) and ``age_s``, seconds since it was told.
+        :class:`aerokit.LinkState`, ``heartbeat_age_s``, frames received and frames lost by their sequence numbers)
+        and ``states``: for each state of docs/states.md that has a value, ``value`` (converted by
+        :func:`aerokit._internal.formatting.to_jsonable`) and ``age_s``, its age in seconds.
     """
-    from aerokit._internal.plain import plain
+    from aerokit._internal.formatting import to_jsonable
 
     received, lost = vehicle.connection.counts(vehicle.system_id)
     telemetry, link = vehicle.telemetry, vehicle.link_state.latest
@@ -226,12 +228,12 @@ def overview(vehicle: Vehicle) -> dict[str, Any]:
         "vehicle_type": vehicle.autopilot.vehicle_type,
         "link": {
             "state": None if link is None else link.value,
-            "heartbeat_age_s": plain(vehicle.heartbeat_age),
+            "heartbeat_age_s": to_jsonable(vehicle.heartbeat_age),
             "frames_received": received,
             "frames_lost": lost,
         },
         "states": {
-            name: {"value": plain(cell.value), "age_s": plain(cell.age)}
+            name: {"value": to_jsonable(cell.value), "age_s": to_jsonable(cell.age)}
             for name, cell in telemetry.cells.items()
             if cell.is_known
         },

@@ -1,4 +1,4 @@
-"""The command line: what it prints, how it ends, and that it brings the vehicle down whatever happens."""
+"""The command line: output, exit codes, and the safe end of flights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ posix_only = pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
 
 @contextmanager
 def program(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """``aerokit`` as a process of its own, its output line by line."""
+    """Run ``aerokit`` in a subprocess with piped output."""
     with subprocess.Popen(
         [sys.executable, "-m", "aerokit", *arguments],
         stdout=subprocess.PIPE,
@@ -87,26 +87,26 @@ def read_rest(process: subprocess.Popen[str]) -> str:
     ],
     ids=" ".join,
 )
-def test_wrong_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_arguments_exit_with_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
     assert exit_.value.code == 2
     assert re.search(r"error: ", capsys.readouterr().err)
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_option_prints_version(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(["--version"])
     assert exit_.value.code == 0
     assert capsys.readouterr().out == f"aerokit {aerokit.__version__}\n"
 
 
-def test_an_address_where_nobody_listens(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_demo_on_refused_connection_exits_with_code_3(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["demo", "--connect", "tcp:127.0.0.1:1", "--record", str(tmp_path / "flight.tlog")]) == 3
     assert "aerokit: cannot open tcp:127.0.0.1:1" in capsys.readouterr().err
 
 
-def test_an_address_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_on_used_port_exits_with_code_3(capsys: pytest.CaptureFixture[str]) -> None:
     with served_copter() as address:
         assert main(["sim", address.replace("tcp:", "tcpin:")]) == 3
     assert capsys.readouterr().err.startswith("aerokit: cannot ")
@@ -116,7 +116,7 @@ def test_an_address_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("address", ["tcp:127.0.0.1:1", "/dev/no-such-device,57600"])
-def test_demo_that_cannot_connect_leaves_the_last_recording(
+def test_demo_connection_failure_keeps_last_recording(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -126,10 +126,8 @@ def test_demo_that_cannot_connect_leaves_the_last_recording(
     assert last.read_bytes() == b"the last flight"
 
 
-@pytest.mark.parametrize(
-    ("vehicle", "firmware"), [("copter", "ArduCopter"), exhaustive(pytest.param("px4", "PX4"))]
-)
-def test_demo_on_its_own_vehicle(
+@pytest.mark.parametrize(("vehicle", "firmware"), [("copter", "ArduCopter"), exhaustive(pytest.param("px4", "PX4"))])
+def test_demo_on_simulated_vehicle_flies_square_and_lands(
     vehicle: str, firmware: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     record = tmp_path / "flight.tlog"
@@ -146,21 +144,21 @@ def test_demo_on_its_own_vehicle(
         str(record),
     ]
     assert main(["demo", *arguments]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for text in (
         f"found {firmware}",
         "ready, home is",
-        "at the north-east corner",
+        "reached the north-east corner",
         "disarmed",
         "flown ",
         f"recorded in {record}",
     ):
-        assert text in told
+        assert text in printed
     assert sum(1 for _ in read_tlog(record)) > 100
 
 
 @pytest.mark.exhaustive
-def test_demo_that_is_refused_says_why(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_demo_arming_refusal_prints_reason(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.refuse(400, text="Arm: Motors not spinning freely")
     with served([copter]) as address:
@@ -169,7 +167,7 @@ def test_demo_that_is_refused_says_why(capsys: pytest.CaptureFixture[str], tmp_p
 
 
 @posix_only
-def test_ctrl_c_before_a_vehicle_is_found(tmp_path: Path) -> None:
+def test_demo_ctrl_c_while_connecting_exits_with_code_130(tmp_path: Path) -> None:
     record = str(tmp_path / "flight.tlog")
     with program("demo", "--connect", "udpin:127.0.0.1:0", "--record", record) as process:
         read_until(process, "connecting to")
@@ -179,66 +177,64 @@ def test_ctrl_c_before_a_vehicle_is_found(tmp_path: Path) -> None:
 
 
 @posix_only
-def test_ctrl_c_in_the_air_lands_the_vehicle(tmp_path: Path) -> None:
+def test_demo_ctrl_c_in_air_lands_vehicle(tmp_path: Path) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     with served([copter]) as address, in_the_air(address, tmp_path) as process:
         process.send_signal(signal.SIGINT)
-        told = read_rest(process)
+        printed = read_rest(process)
         assert (
-            "interrupted, in GUIDED, still armed, " in told
-            or "interrupted, holding in BRAKE, still armed" in told
+            "interrupted, in GUIDED, still armed, " in printed
+            or "interrupted, holding in BRAKE, still armed" in printed
         )
-        assert "landing here" in told
-        assert "disarmed" in told
+        assert "landing here" in printed
+        assert "disarmed" in printed
         assert process.returncode == 130
         assert (copter.is_armed, copter.is_landed) == (False, True)
 
 
 @pytest.mark.exhaustive
 @posix_only
-def test_a_second_ctrl_c_leaves_it_landing(tmp_path: Path) -> None:
+def test_demo_second_ctrl_c_exits_while_landing(tmp_path: Path) -> None:
     with served_copter() as address, in_the_air(address, tmp_path) as process:
         process.send_signal(signal.SIGINT)
         read_until(process, "mode LAND")
         process.send_signal(signal.SIGINT)
-        assert "interrupted again: left in LAND, still armed, " in read_rest(process)
+        assert "interrupted again; no further commands: vehicle in LAND, still armed, " in read_rest(process)
         assert process.returncode == 130
 
 
 @posix_only
 @pytest.mark.parametrize("mode", ["LOITER", exhaustive("BRAKE")])
-def test_a_pilot_who_takes_over_keeps_the_vehicle(mode: str, tmp_path: Path) -> None:
+def test_demo_mode_change_by_pilot_is_not_overruled(mode: str, tmp_path: Path) -> None:
     with (
         served([SimulatedCopter(boot_time_s=0.0)], "tcpin:127.0.0.1:0") as address,
         in_the_air(address, tmp_path) as process,
         aerokit.sync.connect(address, source_system=254) as pilot,
     ):
         pilot.set_mode(mode)
-        told = read_rest(process)
-        assert f"the mode changed to {mode}" in told
-        assert f"left to whoever put it into {mode}" in told
+        printed = read_rest(process)
+        assert f"the mode changed to {mode}" in printed
+        assert f"another party changed the mode to {mode}" in printed
         assert process.returncode == 1
         assert pilot.is_armed
 
 
 @pytest.mark.exhaustive
-def test_demo_leaves_a_vehicle_that_flies_already_alone(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_demo_on_flying_vehicle_sends_no_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with served_copter() as address, aerokit.sync.connect(address) as pilot:
         pilot.wait_ready()
         pilot.arm()
         pilot.take_off(5)
-        pilot.set_mode("BRAKE")  # in which it could not be armed
+        pilot.set_mode("BRAKE")
         record = str(tmp_path / "flight.tlog")
         assert main(["demo", "--connect", address, "--record", record]) == 1
-        assert "it is left to whoever armed it (holding in BRAKE, still armed, " in capsys.readouterr().out
+        assert "the vehicle was armed by another party (holding in BRAKE, still armed, " in capsys.readouterr().out
         assert (pilot.mode_name, pilot.is_armed) == ("BRAKE", True)
 
 
 @pytest.mark.exhaustive
 @posix_only
-def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
+def test_demo_closed_stdout_does_not_end_flight(tmp_path: Path) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     with served([copter]) as address, in_the_air(address, tmp_path, side_m=3) as process:
         assert process.stdout is not None
@@ -249,7 +245,7 @@ def test_a_reader_who_goes_does_not_end_the_flight(tmp_path: Path) -> None:
 
 @contextmanager
 def in_the_air(address: str, directory: Path, *, side_m: float = 30) -> Iterator[subprocess.Popen[str]]:
-    """The demonstration on its way to the first corner."""
+    """Run the demo until it is at altitude."""
     arguments = ["--connect", address, "--altitude", "4", "--side", str(side_m)]
     with program("demo", *arguments, "--record", str(directory / "flight.tlog")) as process:
         read_until(process, "at altitude")
@@ -259,13 +255,13 @@ def in_the_air(address: str, directory: Path, *, side_m: float = 30) -> Iterator
 # ---------------------------------------------------------------------------------------- sim
 
 
-def test_sim_refuses_a_parameter_that_the_vehicle_has_not(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_unknown_parameter_exits_with_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--parameter", "NO_SUCH=1"]) == 2
     assert "NO_SUCH" in capsys.readouterr().err
 
 
 @posix_only
-def test_sim_serves_until_ctrl_c() -> None:
+def test_sim_serves_vehicle_until_ctrl_c() -> None:
     with program(
         "sim", "tcpin:127.0.0.1:0", "--system-id", "9", "--speedup", "20", "--parameter", "rtl_alt=2000"
     ) as process:

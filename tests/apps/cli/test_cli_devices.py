@@ -1,4 +1,4 @@
-"""`aerokit camera|gimbal`: what they print, what they leave on disk, and their exit codes."""
+"""`aerokit camera|gimbal`: output, files and exit codes."""
 
 from __future__ import annotations
 
@@ -32,24 +32,22 @@ def address(camera: SimulatedCamera, gimbal: SimulatedGimbal) -> Iterator[str]:
 
 @pytest.fixture(autouse=True)
 def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "aerokit.apps.cli.vehicle_command.LISTEN_S", 0.0
-    )  # tests/apps/cli has several vehicles
+    monkeypatch.setattr("aerokit.apps.cli.connecting._OTHER_VEHICLES_TIMEOUT_S", 0.0)
 
 
 @pytest.fixture
 def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command that talks to the copter; gives exit code, standard output and standard error."""
+    """Run a command on the copter; return exit code, stdout and stderr."""
 
     def run(*arguments: str) -> tuple[int, str, str]:
         code = main([*arguments, "--connect", address])
-        told = capsys.readouterr()
-        return code, told.out, told.err
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
 
     return run
 
 
-def test_what_the_camera_is(run: Run) -> None:
+def test_camera_info_prints_model_capabilities_and_storage(run: Run) -> None:
     code, out, _ = run("camera", "info")
     assert code == 0
     assert "100  aerokit Simulated camera" in out
@@ -57,7 +55,7 @@ def test_what_the_camera_is(run: Run) -> None:
     assert "card 1: " in out
 
 
-def test_pictures_are_taken_and_fetched(run: Run, camera: SimulatedCamera, tmp_path: Path) -> None:
+def test_camera_photo_takes_and_downloads_pictures(run: Run, camera: SimulatedCamera, tmp_path: Path) -> None:
     before = camera.image_count
     code, out, _ = run("camera", "photo", "--to", str(tmp_path))
     assert (code, camera.image_count) == (0, before + 1)
@@ -69,7 +67,7 @@ def test_pictures_are_taken_and_fetched(run: Run, camera: SimulatedCamera, tmp_p
     assert len(out.splitlines()) == 2
 
 
-def test_mode_video_and_zoom(run: Run, camera: SimulatedCamera) -> None:
+def test_camera_mode_video_and_zoom_change_camera(run: Run, camera: SimulatedCamera) -> None:
     assert run("camera", "mode", "video")[0] == 0
     assert run("camera", "video", "start")[0] == 0
     assert run("camera", "video", "stop")[0] == 0
@@ -78,34 +76,34 @@ def test_mode_video_and_zoom(run: Run, camera: SimulatedCamera) -> None:
     assert camera.zoom == pytest.approx(30)
 
 
-def test_streams_have_addresses(run: Run) -> None:
+def test_camera_streams_prints_addresses(run: Run) -> None:
     code, out, _ = run("camera", "streams")
     assert code == 0
     assert "rtsp://127.0.0.1:8554/main" in out
 
 
-def test_formatting_asks_first(run: Run, camera: SimulatedCamera) -> None:
+def test_camera_format_without_yes_formats_nothing(run: Run, camera: SimulatedCamera) -> None:
     run("camera", "photo")
-    assert run("camera", "format") == (1, "nothing was formatted\n", "")
+    assert run("camera", "format") == (1, "not confirmed; nothing was formatted\n", "")
     assert camera.image_count > 0
     assert run("camera", "format", "--yes")[0] == 0
     assert camera.image_count == 0
 
 
-def test_a_camera_that_is_not_there(run: Run) -> None:
+def test_camera_info_of_missing_camera_times_out(run: Run) -> None:
     code, _, err = run("camera", "info", "--camera", "105", "--patience", "1")
     assert code == 4
     assert "105" in err
 
 
 @pytest.mark.parametrize("wrong", [["photo", "--count", "0"], ["zoom", "101"], ["mode", "x"], ["video"]])
-def test_wrong_arguments(run: Run, wrong: list[str]) -> None:
+def test_camera_invalid_arguments_exit_with_code_2(run: Run, wrong: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         run("camera", *wrong)
     assert caught.value.code == 2
 
 
-def test_the_gimbal_points(run: Run, gimbal: SimulatedGimbal) -> None:
+def test_gimbal_point_changes_attitude(run: Run, gimbal: SimulatedGimbal) -> None:
     assert run("gimbal", "point", "-45", "20")[0] == 0
     code, out, _ = run("gimbal", "info")
     assert code == 0
@@ -114,7 +112,7 @@ def test_the_gimbal_points(run: Run, gimbal: SimulatedGimbal) -> None:
 
 
 @pytest.mark.exhaustive
-def test_the_gimbal_goes_back_to_neutral_and_is_released(run: Run, gimbal: SimulatedGimbal) -> None:
+def test_gimbal_neutral_and_release_succeed(run: Run, gimbal: SimulatedGimbal) -> None:
     assert run("gimbal", "neutral")[0] == 0
     assert "pitch 0" in run("gimbal", "info")[1]
     assert run("gimbal", "release")[0] == 0

@@ -1,4 +1,4 @@
-"""``aerokit sim``: fleets, forms of addresses, pseudo-terminals, the picture at the end."""
+"""``aerokit sim``: fleets, address templates, pseudo-terminals, pictures."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from recorded import SHORT
 
 from aerokit.apps.cli import main
-from aerokit.apps.cli.arguments import EACH_ITS_OWN, each_with_its_own, place_of
+from aerokit.apps.cli.arguments import DEFAULT_SIM_ADDRESS, expand_address, is_address_template
 from aerokit.apps.cli.main import make_parser
 from aerokit.apps.cli.sim import _client_address, simulated_fleet
 from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4
-from aerokit.sim.track import true_point
+from aerokit.testing.track import true_point
 
 # ---------------------------------------------------------------------------------------- addresses
 
@@ -22,20 +22,20 @@ from aerokit.sim.track import true_point
 @pytest.mark.parametrize(
     ("form", "first", "third"),
     [
-        (EACH_ITS_OWN, "tcpin:127.0.0.1:5760", "tcpin:127.0.0.1:5780"),
+        (DEFAULT_SIM_ADDRESS, "tcpin:127.0.0.1:5760", "tcpin:127.0.0.1:5780"),
         ("udpout:127.0.0.1:{14550+n}", "udpout:127.0.0.1:14550", "udpout:127.0.0.1:14552"),
         ("pty:/tmp/ttyV{n}", "pty:/tmp/ttyV0", "pty:/tmp/ttyV2"),
         ("udpin:0.0.0.0:145{id}", "udpin:0.0.0.0:1457", "udpin:0.0.0.0:1459"),
     ],
 )
-def test_a_form_gives_each_vehicle_an_address(form: str, first: str, third: str) -> None:
-    assert each_with_its_own(form)
-    assert (place_of(form, 0, 7), place_of(form, 2, 9)) == (first, third)
+def test_address_template_expands_for_each_vehicle(form: str, first: str, third: str) -> None:
+    assert is_address_template(form)
+    assert (expand_address(form, 0, 7), expand_address(form, 2, 9)) == (first, third)
 
 
-def test_any_other_address_is_for_all() -> None:
-    assert not each_with_its_own("udpout:127.0.0.1:14550")
-    assert place_of("udpout:127.0.0.1:14550", 3, 4) == "udpout:127.0.0.1:14550"
+def test_plain_address_is_no_template() -> None:
+    assert not is_address_template("udpout:127.0.0.1:14550")
+    assert expand_address("udpout:127.0.0.1:14550", 3, 4) == "udpout:127.0.0.1:14550"
 
 
 @pytest.mark.parametrize(
@@ -54,22 +54,22 @@ def test_any_other_address_is_for_all() -> None:
     ],
     ids=" ".join,
 )
-def test_wrong_arguments_of_sim(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_invalid_arguments_exit_with_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(["sim", *arguments])
     assert exit_.value.code == 2
     assert "error: " in capsys.readouterr().err
 
 
-def test_system_ids_end_at_255(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_system_ids_above_255_are_rejected(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--count", "10", "--system-id", "250"]) == 2
-    assert "above 255" in capsys.readouterr().err
+    assert "the maximum is 255" in capsys.readouterr().err
 
 
 # ------------------------------------------------------------------------------------------- fleets
 
 
-def test_a_fleet_stands_side_by_side() -> None:
+def test_simulated_fleet_is_placed_in_row_eastwards() -> None:
     fleet = simulated_fleet("px4", 3, system_id=4, spacing_m=10.0, battery_percent=50.0)
     assert [vehicle.system_id for vehicle in fleet] == [4, 5, 6]
     places = [true_point(vehicle) for vehicle in fleet]
@@ -79,39 +79,37 @@ def test_a_fleet_stands_side_by_side() -> None:
     assert all(isinstance(vehicle, SimulatedPx4) and vehicle.battery.percent == 50 for vehicle in fleet)
 
 
-def test_what_a_kind_has_not_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_unknown_option_or_recording_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--vehicle", "px4", "--parameter", "RTL_ALT=3000"]) == 2
     assert "the simulated vehicle has no parameter 'RTL_ALT'; similar: " in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["sim", "--vehicle", "nowhere.tlog"])
-    assert "there is no recording 'nowhere.tlog'" in capsys.readouterr().err
+    assert "recording 'nowhere.tlog' does not exist" in capsys.readouterr().err
 
 
-def test_options_reach_the_vehicle() -> None:
+def test_simulated_fleet_passes_options_to_vehicle() -> None:
     (copter,) = simulated_fleet("copter", 1, boot_text=True, boot_time_s=0.0, parameters={"RTL_ALT": 2000.0})
     assert isinstance(copter, SimulatedCopter)
     assert copter.parameters["RTL_ALT"] == 2000
     assert copter.timeline.ready == 0
 
 
-def test_sim_ends_after_its_duration_with_a_picture(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_sim_after_duration_writes_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "track.svg"
     addresses = ["udpout:127.0.0.1:{45550+n}", "tcpin:127.0.0.1:0"]
     arguments = ["--count", "2", "--speedup", "100", "--duration", "5", "--picture", str(picture)]
     assert main(["sim", *addresses, *arguments]) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0].startswith("system 1 on udpout:127.0.0.1:45550")
-    assert told[1].startswith("system 2 on udpout:127.0.0.1:45551")
-    assert told[2].startswith("systems 1 to 2 on tcpin:127.0.0.1:")
-    assert told[3] == "try: aerokit demo --connect udpin:127.0.0.1:45550"
-    assert told[4:] == ["stopped", f"track in {picture}"]
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("system 1 on udpout:127.0.0.1:45550")
+    assert printed[1].startswith("system 2 on udpout:127.0.0.1:45551")
+    assert printed[2].startswith("systems 1 to 2 on tcpin:127.0.0.1:")
+    assert printed[3] == "try: aerokit demo --connect udpin:127.0.0.1:45550"
+    assert printed[4:] == ["stopped", f"track written to {picture}"]
     assert picture.read_text().count("<polyline") == 4
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
-def test_sim_tells_the_name_of_the_other_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_pty_prints_name_of_other_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port = tmp_path / "ttyV0"
     assert main(["sim", f"pty:{port}", "--speedup", "100", "--duration", "1"]) == 0
     assert f"try: aerokit demo --connect {port}\n" in capsys.readouterr().out
@@ -129,17 +127,17 @@ def test_sim_tells_the_name_of_the_other_end(tmp_path: Path, capsys: pytest.Capt
         ),
     ],
 )
-def test_the_address_for_clients_on_a_network_finds_it(options: str, client: str) -> None:
+def test_zenoh_client_address_connects_to_listening_endpoint(options: str, client: str) -> None:
     assert _client_address("zenohin://f/a", f"zenohin://f/a{options}") == client
 
 
-def test_numbers_below_0_are_no_options() -> None:
+def test_negative_coordinates_are_parsed_as_values() -> None:
     options = make_parser("sim").parse_args(["sim", "--home", "-35.36,149.16,-2.5", "--wind", "-3,-.5"])
     assert options.home == (-35.36, 149.16, -2.5)
     assert options.wind == (-3.0, -0.5)
 
 
-def test_a_recording_is_served(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_serves_recording(capsys: pytest.CaptureFixture[str]) -> None:
     path = str(SHORT / "px4-quad.tlog")
     arguments = ["udpout:127.0.0.1:45560", "--speedup", "100", "--duration", "20", "--vehicle", path]
     assert main(["sim", *arguments]) == 0

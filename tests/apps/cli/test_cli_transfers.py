@@ -1,4 +1,4 @@
-"""`aerokit params|mission|files|logs`: what they print, what they leave on disk, and their exit codes."""
+"""`aerokit params|mission|files|logs`: output, files and exit codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from served_copter import served
 
 from aerokit.apps.cli import main
 from aerokit.apps.cli.terminal import progress_bar
-from aerokit.protocols.exchange import Progress
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter
 
 WAYPOINTS = """QGC WPL 110
@@ -39,12 +39,12 @@ def address(copter: SimulatedCopter) -> Iterator[str]:
 
 @pytest.fixture
 def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command that talks to the copter; gives exit code, standard output and standard error."""
+    """Run a command on the copter; return exit code, stdout and stderr."""
 
     def run(*arguments: str) -> tuple[int, str, str]:
         code = main([*arguments, "--connect", address])
-        told = capsys.readouterr()
-        return code, told.out, told.err
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
 
     return run
 
@@ -53,7 +53,7 @@ def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "aerokit.apps.cli.vehicle_command.LISTEN_S", 0.0
+        "aerokit.apps.cli.connecting._OTHER_VEHICLES_TIMEOUT_S", 0.0
     )  # there is one; tests/apps/cli has several
 
 
@@ -76,14 +76,16 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=" ".join,
 )
-def test_wrong_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_transfer_commands_invalid_arguments_exit_with_code_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(arguments)
     assert exit_.value.code == 2
     assert "error: " in capsys.readouterr().err
 
 
-def test_a_name_that_cannot_be_is_no_fault_of_the_vehicle(run: Run) -> None:
+def test_params_get_with_invalid_name_exits_with_code_2(run: Run) -> None:
     code, _, err = run("params", "get", "A_NAME_OF_MORE_THAN_16")
     assert code == 2
     assert "A_NAME_OF_MORE_THAN_16" in err
@@ -92,21 +94,21 @@ def test_a_name_that_cannot_be_is_no_fault_of_the_vehicle(run: Run) -> None:
 # ------------------------------------------------------------------------------------ parameters
 
 
-def test_get_and_set(run: Run) -> None:
+def test_params_set_and_get_round_trip(run: Run) -> None:
     assert run("params", "set", "WPNAV_SPEED=725.5", "LOG_BITMASK=0xFF")[0] == 0
     code, out, _ = run("params", "get", "WPNAV_SPEED", "LOG_BITMASK")
     assert code == 0
     assert [line.split() for line in out.splitlines()] == [["WPNAV_SPEED", "725.5"], ["LOG_BITMASK", "255"]]
 
 
-def test_one_that_cannot_be_set_is_told_and_the_others_are_set(run: Run) -> None:
+def test_params_set_with_unknown_name_sets_the_others(run: Run) -> None:
     code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
     assert code == 1
     assert "WPNAV_ACCEL      210          set" in out
     assert "NO_SUCH          not set: " in out
 
 
-def test_list_by_pattern_and_what_was_changed(run: Run) -> None:
+def test_params_list_filters_by_pattern_and_changed(run: Run) -> None:
     run("params", "set", "WPNAV_RADIUS=333")
     code, out, _ = run("params", "list", "wpnav_r*", "--changed")
     assert code == 0
@@ -114,19 +116,19 @@ def test_list_by_pattern_and_what_was_changed(run: Run) -> None:
 
 
 @pytest.mark.parametrize("format_", ["missionplanner", "mavproxy", "qgroundcontrol"])
-def test_save_diff_and_load(format_: str, run: Run) -> None:
+def test_params_save_diff_and_load_round_trip(format_: str, run: Run) -> None:
     assert run("params", "save", "mine.param", "--format", format_)[0] == 0
     assert run("params", "diff", "mine.param")[0] == 0
     run("params", "set", "WPNAV_SPEED_UP=311")
     code, out, _ = run("params", "diff", "mine.param")
     assert code == 1
     assert "WPNAV_SPEED_UP" in out
-    assert "1 of 1349 differ" in out
+    assert "1 of 1349 parameters differ" in out
     assert run("params", "load", "mine.param")[0] == 0
     assert run("params", "diff", "mine.param")[0] == 0
 
 
-def test_a_damaged_file_is_told_before_anything_is_sent(capsys: pytest.CaptureFixture[str]) -> None:
+def test_params_load_of_damaged_file_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     Path("mine.param").write_text("WPNAV_SPEED,fast\n")
     assert main(["params", "load", "mine.param", "--connect", "tcp:127.0.0.1:1"]) == 6
     assert "mine.param" in capsys.readouterr().err
@@ -135,7 +137,7 @@ def test_a_damaged_file_is_told_before_anything_is_sent(capsys: pytest.CaptureFi
 # -------------------------------------------------------------------------------------- missions
 
 
-def test_check_needs_no_vehicle(capsys: pytest.CaptureFixture[str]) -> None:
+def test_mission_check_works_without_vehicle(capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(WAYPOINTS)
     assert main(["mission", "check", "m.waypoints"]) == 0
     assert "mission: 3 items\n    0  NAV_TAKEOFF" in capsys.readouterr().out
@@ -144,16 +146,16 @@ def test_check_needs_no_vehicle(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("old", "new"), [("47.398\t", "91\t"), ("QGC WPL 110", "something else"), ("2\t0\t3\t16", "2\t0\t77\t16")]
 )
-def test_check_refuses(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mission_check_of_invalid_file_fails(old: str, new: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(WAYPOINTS.replace(old, new))
-    assert main(["mission", "check", "m.waypoints"]) in (2, 6)  # what no item can be, or no file
+    assert main(["mission", "check", "m.waypoints"]) in (2, 6)  # an invalid item, or an invalid file
     assert capsys.readouterr().err.startswith("aerokit: ")
 
 
-def test_upload_show_download_clear(run: Run) -> None:
+def test_mission_upload_show_download_and_clear(run: Run) -> None:
     Path("m.waypoints").write_text(WAYPOINTS)
     code, out, _ = run("mission", "upload", "m.waypoints")
-    assert (code, out) == (0, "mission: 3 items are on vehicle 1\n")
+    assert (code, out) == (0, "mission: 3 items uploaded to vehicle 1\n")
     code, out, _ = run("mission", "show", "mission", "fence")
     assert "    1  NAV_WAYPOINT                     47.3980000 8.5456000 15 m" in out
     assert "fence: 0 items" in out
@@ -165,7 +167,7 @@ def test_upload_show_download_clear(run: Run) -> None:
     assert run("mission", "show")[1] == "mission: 0 items\n"
 
 
-def test_a_mission_is_not_started_on_a_disarmed_vehicle(run: Run) -> None:
+def test_mission_start_on_disarmed_vehicle_is_refused(run: Run) -> None:
     code, _, err = run("mission", "start")
     assert code == 5
     assert "not armed" in err
@@ -174,7 +176,7 @@ def test_a_mission_is_not_started_on_a_disarmed_vehicle(run: Run) -> None:
 # ---------------------------------------------------------------------------------- files, logs
 
 
-def test_files(run: Run) -> None:
+def test_files_actions_round_trip(run: Run) -> None:
     Path("here.txt").write_bytes(b"some bytes")
     assert run("files", "mkdir", "/box")[0] == 0
     assert run("files", "put", "here.txt", "/box/a.txt")[:2] == (0, "/box/a.txt: 10 bytes\n")
@@ -190,7 +192,7 @@ def test_files(run: Run) -> None:
     assert "no such file" in err
 
 
-def test_logs(run: Run) -> None:
+def test_logs_get_downloads_newest_log(run: Run) -> None:
     code, out, _ = run("logs", "list")
     assert code == 0
     newest, size, *_ = out.splitlines()[-1].split()
@@ -203,10 +205,10 @@ def test_logs(run: Run) -> None:
     assert run("logs", "get", "4711")[0] == 2
 
 
-def test_logs_are_not_erased_unasked(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logs_erase_without_yes_erases_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     before = run("logs", "list")[1]
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    assert run("logs", "erase")[:2] == (1, "nothing was erased\n")
+    assert run("logs", "erase")[:2] == (1, "not confirmed; nothing was erased\n")
     assert run("logs", "list")[1] == before
     assert run("logs", "erase", "--yes")[:2] == (0, "erased\n")
     assert run("logs", "list")[1] == ""
@@ -215,20 +217,20 @@ def test_logs_are_not_erased_unasked(run: Run, monkeypatch: pytest.MonkeyPatch) 
 # -------------------------------------------------------------------------------------- progress
 
 
-def test_the_progress_bar_shows_what_is_done(
+def test_progress_bar_on_terminal_shows_percentage(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     threads = threading.active_count()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     with progress_bar("flight.bin", "B") as show:
-        show(Progress(0, None, 0.0))
-        show(Progress(512 * 1024, 1024 * 1024, 1.0))
-        show(Progress(1024 * 1024, 1024 * 1024, 2.0))
+        show(TransferProgress(0, None, 0.0))
+        show(TransferProgress(512 * 1024, 1024 * 1024, 1.0))
+        show(TransferProgress(1024 * 1024, 1024 * 1024, 2.0))
     assert "flight.bin: 100%" in capsys.readouterr().err
     assert threading.active_count() == threads
 
 
-def test_there_is_no_progress_bar_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_bar_without_terminal_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_bar("flight.bin", "B") as show:
-        show(Progress(512, 1024, 1.0))
+        show(TransferProgress(512, 1024, 1.0))
     assert capsys.readouterr().err == ""

@@ -1,4 +1,4 @@
-"""``aerokit doctor``: each thing that can be wrong is found, by what is really on a link, a port, a terminal."""
+"""``aerokit doctor``: findings on real links, ports and terminals."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from cli_harness import GROUND_STATION, run_on_messages
 from pymavlink.dialects.v20 import common
-from test_link_commands import GROUND_STATION, saying
 
 from aerokit import messages as m
 from aerokit.apps.cli import doctor, main
@@ -31,16 +31,16 @@ posix_only = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-termina
 @pytest.mark.parametrize(
     ("sources", "noise", "code", "text"),
     [
-        ([], b"", 3, "not a single byte was heard"),
+        ([], b"", 3, "no bytes were received"),
         ([], bytes(range(200)) * 3, 3, "but no MAVLink frame: wrong baud rate, or another protocol?"),
         ([(1, 1, HEARTBEAT)], b"", 0, "ok    sender: system 1, component 1: autopilot, MAVLink 2"),
-        ([(1, 1, HEARTBEAT)], b"console> " * 20, 1, "bytes are no MAVLink"),
-        ([(254, 190, GROUND_STATION)], b"", 3, "they look like our own, which come back"),
+        ([(1, 1, HEARTBEAT)], b"console> " * 20, 1, "bytes are not MAVLink"),
+        ([(254, 190, GROUND_STATION)], b"", 3, "they seem to be an echo of what this program sends"),
         (
             [(1, 1, HEARTBEAT), (255, 190, GROUND_STATION)],
             b"",
             0,
-            "another ground station uses our ids (255/190)",
+            "another ground station uses the ids of aerokit programs (255/190)",
         ),
         ([(1, 1, HEARTBEAT), (1, 2, HEARTBEAT)], b"", 1, "system 1 has 2 autopilots (components 1, 2)"),
         (
@@ -49,19 +49,19 @@ posix_only = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-termina
             1,
             "two senders use system 1, component 1",
         ),
-        ([], FROM_SYSTEM_0, 1, "somebody uses system id 0, which is nobody's"),
-        ([(1, 100, m.Heartbeat(30, 8, 0, 0, 4, 3))], b"", 1, "only components that are no autopilot"),
+        ([], FROM_SYSTEM_0, 1, "a sender uses system id 0, which means broadcast"),
+        ([(1, 100, m.Heartbeat(30, 8, 0, 0, 4, 3))], b"", 1, "only components that are not autopilots"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_is_on_a_link(
+def test_doctor_reports_findings_of_link(
     sources: Iterable[tuple[int, int, Message]],
     noise: bytes,
     code: int,
     text: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert saying(sources, "doctor", noise=noise) == code
+    assert run_on_messages(sources, "doctor", noise=noise) == code
     assert text in capsys.readouterr().out
 
 
@@ -69,8 +69,8 @@ def test_what_is_on_a_link(
 
 
 @contextmanager
-def feeding(write: object, *pieces: bytes) -> Iterator[None]:
-    """Write these over and over, in a thread."""
+def repeated_writes(write: object, *pieces: bytes) -> Iterator[None]:
+    """Write the pieces repeatedly, in a thread."""
     ended = threading.Event()
 
     def feed() -> None:
@@ -87,8 +87,8 @@ def feeding(write: object, *pieces: bytes) -> Iterator[None]:
         thread.join()
 
 
-def listened_to(*writers: FrameEncoder, seconds: str = "0.5", options: tuple[str, ...] = ()) -> int:
-    """Have senders examined that send to a UDP port, each from a socket of its own; the exit code."""
+def doctor_of_senders(*writers: FrameEncoder, seconds: str = "0.5", options: tuple[str, ...] = ()) -> int:
+    """Run `aerokit doctor` on a UDP port with these senders, each with its own socket; return the exit code."""
     port = free_udp_port()
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in writers]
 
@@ -97,7 +97,7 @@ def listened_to(*writers: FrameEncoder, seconds: str = "0.5", options: tuple[str
             sock.sendto(encoder.encode(HEARTBEAT, 1.8e9), ("127.0.0.1", port))
 
     try:
-        with feeding(send, b""):
+        with repeated_writes(send, b""):
             return main(["doctor", f"udpin:127.0.0.1:{port}", "--seconds", seconds, *options])
     finally:
         for sock in sockets:
@@ -111,55 +111,55 @@ def free_udp_port() -> int:
         return port
 
 
-def test_two_vehicles_with_the_same_id(capsys: pytest.CaptureFixture[str]) -> None:
-    code = listened_to(FrameEncoder(1, 1), FrameEncoder(1, 1))
+def test_doctor_two_senders_with_same_ids_is_problem(capsys: pytest.CaptureFixture[str]) -> None:
+    code = doctor_of_senders(FrameEncoder(1, 1), FrameEncoder(1, 1))
     assert code == 1
-    assert "two senders use system 1, component 1: one of them is not listened to" in capsys.readouterr().out
+    assert "two senders use system 1, component 1; the messages of one are ignored" in capsys.readouterr().out
 
 
-def test_mavlink_1(capsys: pytest.CaptureFixture[str]) -> None:
-    code = listened_to(FrameEncoder(1, 1, version=1))
+def test_doctor_mavlink_1_sender_is_note(capsys: pytest.CaptureFixture[str]) -> None:
+    code = doctor_of_senders(FrameEncoder(1, 1, version=1))
     assert code == 0
     out = capsys.readouterr().out
     assert "note  sender: system 1, component 1: autopilot, MAVLink 1" in out
     assert "SERIALn_PROTOCOL 2" in out
 
 
-def test_frames_that_are_signed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_signed_frames_without_key_is_problem(capsys: pytest.CaptureFixture[str]) -> None:
     encoder = FrameEncoder(1, 1)
     encoder.signing = Signing(SigningKey.from_passphrase("secret"))
-    code = listened_to(encoder)
+    code = doctor_of_senders(encoder)
     assert code == 1
-    assert "1/1 signs its frames, and no key is given" in capsys.readouterr().out
+    assert "1/1 signs its frames, but no key is given" in capsys.readouterr().out
 
 
-def test_the_wrong_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_wrong_signing_key_is_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     key = tmp_path / "key"
     key.write_text("another secret")
     encoder = FrameEncoder(1, 1)
     encoder.signing = Signing(SigningKey.from_passphrase("secret"))
-    assert listened_to(encoder, options=("--signing-key", str(key))) == 3
+    assert doctor_of_senders(encoder, options=("--signing-key", str(key))) == 3
     assert "BAD   signing: frames were refused" in capsys.readouterr().out
 
 
-def test_a_lossy_link(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_lossy_link_is_problem(capsys: pytest.CaptureFixture[str]) -> None:
     class Lossy(FrameEncoder):
         def encode(self, message: Message, now: float = 0.0) -> bytes:
             for _ in range(2):
                 super().encode(message, now)
             return super().encode(message, now)
 
-    code = listened_to(Lossy(1, 1), seconds="0.8")
+    code = doctor_of_senders(Lossy(1, 1), seconds="0.8")
     assert code == 1
     assert re.search(r"BAD   loss: system 1: 6\d\.\d % of \d+ frames lost", capsys.readouterr().out)
 
 
-def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_used_udp_port_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("0.0.0.0", 0))
         port = sock.getsockname()[1]
         finding = check_network_port(port, "a test", udp=True)
-        assert (finding.level, finding.text) == ("note", "another program has it (a test)")
+        assert (finding.level, finding.text) == ("note", "in use by another program (a test)")
         assert main(["doctor", f"udpin:0.0.0.0:{port}"]) == 3
         assert "BAD   link: cannot open udpin:" in capsys.readouterr().out
     assert check_network_port(port, "a test", udp=True).level == "ok"
@@ -172,18 +172,18 @@ def test_a_port_that_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("baud", "code", "text"),
     [
-        (115200, 0, "ok    baud rate: MAVLink is heard on {device} at 115200"),
-        (57600, 1, "BAD   baud rate: MAVLink is heard on {device} at 115200, not at 57600"),
+        (115200, 0, "ok    baud rate: {device} receives MAVLink at 115200"),
+        (57600, 1, "BAD   baud rate: {device} receives MAVLink at 115200, not at 57600"),
     ],
 )
-def test_the_baud_rate_is_found(
+def test_doctor_finds_baud_rate_of_serial_port(
     baud: int, code: int, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The far end sends at 115200: at another rate of the near one, noise."""
+    """The far end sends at 115200; at other rates the near end receives noise."""
     import termios
     import tty
 
-    monkeypatch.setattr(doctor, "BAUD_S", 0.5)
+    monkeypatch.setattr(doctor, "BAUD_RATE_TIMEOUT_S", 0.5)
     ours, theirs = os.openpty()
     try:
         tty.setraw(theirs)
@@ -193,10 +193,10 @@ def test_the_baud_rate_is_found(
         def send(_: bytes) -> None:
             frame = encoder.encode(HEARTBEAT)
             right = termios.tcgetattr(ours)[5] == termios.B115200
-            with suppress(BlockingIOError):  # nobody reads just now
+            with suppress(BlockingIOError):  # the buffer is full
                 os.write(ours, frame if right else bytes(each ^ 0xA5 for each in frame))
 
-        with feeding(send, b""):
+        with repeated_writes(send, b""):
             assert main(["doctor", f"{device},{baud}", "--seconds", "0.3"]) == code
         out = capsys.readouterr().out
         assert text.format(device=device) in out
@@ -207,28 +207,30 @@ def test_the_baud_rate_is_found(
 
 
 @posix_only
-def test_a_silent_serial_port(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(doctor, "BAUD_S", 0.1)
+def test_doctor_silent_serial_port_exits_with_code_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "BAUD_RATE_TIMEOUT_S", 0.1)
     ours, theirs = os.openpty()
     try:
         assert main(["doctor", os.ttyname(theirs), "--seconds", "0.2"]) == 3
-        assert "not a single byte was heard" in capsys.readouterr().out
+        assert "no bytes were received" in capsys.readouterr().out
     finally:
         os.close(ours)
         os.close(theirs)
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may use everything")
-def test_a_port_that_one_may_not_use(tmp_path: Path) -> None:
+def test_doctor_serial_port_without_permission_is_problem(tmp_path: Path) -> None:
     device = tmp_path / "ttyX"
     device.touch(mode=0)
     finding = check_serial_port(str(device))
     assert finding.level == "problem"
-    assert "you may not use it" in finding.text
+    assert "permission denied" in finding.text
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_port_that_another_program_uses(tmp_path: Path) -> None:
+def test_doctor_serial_port_in_use_names_program(tmp_path: Path) -> None:
     import subprocess
 
     device = tmp_path / "ttyX"
@@ -244,38 +246,38 @@ def test_a_port_that_another_program_uses(tmp_path: Path) -> None:
         other.stdout.readline()
         finding = check_serial_port(str(device))
         assert finding.level == "problem"
-        assert f"(process {other.pid}) uses it" in finding.text
+        assert f"(process {other.pid})" in finding.text
     assert check_serial_port(str(device)).level == "ok"
 
 
 # ----------------------------------------------------------------------------------- installation
 
 
-def test_the_computer(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_without_address_checks_computer(capsys: pytest.CaptureFixture[str]) -> None:
     main(["doctor"])
     out = capsys.readouterr().out
     for text in (
         "ok    aerokit: ",
         "UDP port 14550",
         "TCP port 5760",
-        "aerokit doctor ADDRESS looks at a link",
+        "check a link: aerokit doctor ADDRESS",
     ):
         assert text in out
 
 
-def test_files_of_the_other_aerokit_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit._internal.imports.complaint", lambda *_, **__: "mixed")
+def test_doctor_mixed_installation_is_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit._internal.imports.installation_problem", lambda *_, **__: "mixed")
     assert any(each.level == "problem" and each.text == "mixed" for each in check_installation())
 
 
-def test_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_missing_extra_prints_pip_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("aerokit.apps.cli.doctor.find_spec", lambda name: None if name == "textual" else 1)
     lacking = [each for each in check_installation() if each.subject == "extras" and each.level == "note"]
-    assert [each.text for each in lacking] == ["monitor is not whole: textual not installed"]
+    assert [each.text for each in lacking] == ["monitor is incomplete: textual not installed"]
     assert "pip install 'aerokit-mavlink[monitor]'" in lacking[0].do
 
 
-def test_all_extras_are_looked_for() -> None:
+def test_doctor_extras_match_pyproject() -> None:
     text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
     section = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
     extras = set(re.findall(r"^(\w+) = ", section, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""``aerokit hub``: its arguments, what it tells, and how it ends."""
+"""``aerokit hub``: arguments, output and exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def endpoints(*arguments: str) -> dict[str, Endpoint]:
     return {each.name: each for each in found}
 
 
-def test_endpoints_and_what_may_pass() -> None:
+def test_hub_options_configure_endpoints() -> None:
     found = endpoints(
         "radio=/dev/ttyUSB0,57600", "udpout:10.0.0.7:14550", "tablet=tcpin:0.0.0.0:5760",
         "--read-only", "tablet", "--patient", "radio", "--only", "HEARTBEAT,GPS_*@tablet", "--block", "DEBUG*",
@@ -34,13 +34,13 @@ def test_endpoints_and_what_may_pass() -> None:
     )  # fmt: skip
     assert list(found) == ["radio", "udpout:10.0.0.7:14550", "tablet"]
     radio, out, tablet = found.values()
-    assert (radio.address, radio.patient, radio.read_only) == ("/dev/ttyUSB0,57600", True, False)
+    assert (radio.address, radio.retry_open, radio.read_only) == ("/dev/ttyUSB0,57600", True, False)
     assert (tablet.read_only, tablet.only, tablet.block) == (True, ("HEARTBEAT", "GPS_*"), ("DEBUG*",))
     assert (radio.only, radio.rates) == ((), {"VFR_HUD": 1.0})
     assert out.rates == {"ATTITUDE": 5.0, "*": 10.0, "VFR_HUD": 1.0}
 
 
-def test_signing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hub_signed_option_needs_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AEROKIT_SIGNING_KEY", raising=False)
     with pytest.raises(InvalidArgument, match="--signed needs a key"):
         endpoints("a=pty", "--signed", "a")
@@ -54,20 +54,22 @@ def test_signing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("arguments", "text"),
     [
         (["a=nonsense:1:2"], "nonsense"),
-        (["a=pty", "--rate", "ATTITUDE"], "is no rate"),
+        (["a=pty", "--rate", "ATTITUDE"], "is not a rate"),
         (["a=pty", "--record", "x.bin"], "does not end in .tlog"),
-        (["a=pty", "--read-only", "b"], "there is no endpoint 'b'; there are: a"),
-        (["radio=pty", "--read-only", "raido"], "there is no endpoint 'raido' (did you mean 'radio'?)"),
-        (["a=pty", "--block", "DEBUG*@b"], "there is no endpoint 'b'"),
-        (["a=pty", "--only", "@a"], "names no message"),
-        (["a=pty", "--rate", ""], "names no message"),
-        (["a=pty", "--block", "DEBUG*@"], "names no endpoint behind the @"),
-        (["a=tcpin:127.0.0.1:0", "--only", "NO_SUCH"], "fits no message"),
-        (["a=tcpin:127.0.0.1:0", "a=tcpin:127.0.0.1:0"], "two endpoints are called 'a'"),
+        (["a=pty", "--read-only", "b"], "no endpoint is named 'b'; endpoints: a"),
+        (["radio=pty", "--read-only", "raido"], "no endpoint is named 'raido' (did you mean 'radio'?)"),
+        (["a=pty", "--block", "DEBUG*@b"], "no endpoint is named 'b'"),
+        (["a=pty", "--only", "@a"], "has no message name"),
+        (["a=pty", "--rate", ""], "has no message name"),
+        (["a=pty", "--block", "DEBUG*@"], "has no endpoint after the @"),
+        (["a=tcpin:127.0.0.1:0", "--only", "NO_SUCH"], "matches no message"),
+        (["a=tcpin:127.0.0.1:0", "a=tcpin:127.0.0.1:0"], "two endpoints have the name 'a'"),
         ([], "required"),
     ],
 )
-def test_what_is_wrong_is_said(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hub_invalid_arguments_exit_with_code_2(
+    arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     try:
         code = main(["hub", *arguments])
     except SystemExit as ended:
@@ -76,7 +78,7 @@ def test_what_is_wrong_is_said(arguments: list[str], text: str, capsys: pytest.C
     assert text in capsys.readouterr().err
 
 
-def test_it_passes_frames_on_tells_and_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hub_forwards_frames_prints_events_and_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hub.tlog"
     arguments = [
         "a=tcpin:127.0.0.1:0",
@@ -91,22 +93,22 @@ def test_it_passes_frames_on_tells_and_records(tmp_path: Path, capsys: pytest.Ca
     async def run() -> int:
         options = make_parser("hub").parse_args(["hub", *arguments])
         running = asyncio.ensure_future(options.run(options))
-        told: list[dict[str, Any]] = []
-        while not any(each["type"] == "hub" for each in told):
+        printed: list[dict[str, Any]] = []
+        while not any(each["type"] == "hub" for each in printed):
             await asyncio.sleep(0.01)
-            told += records(capsys.readouterr().out)
-        (hub,) = (each for each in told if each["type"] == "hub")
-        assert [each["kind"] for each in told if each["type"] == "hub_event"] == ["opened", "opened"]
+            printed += records(capsys.readouterr().out)
+        (hub,) = (each for each in printed if each["type"] == "hub")
+        assert [each["kind"] for each in printed if each["type"] == "hub_event"] == ["opened", "opened"]
         host, _, port = hub["endpoints"][0].partition(":")[2].rpartition(":")
         _, writer = await asyncio.open_connection(host, int(port))
         writer.write(FrameEncoder(1, 1).encode(COPTER))
-        told.clear()
-        while not any(each["type"] == "endpoint" and each["frames_in"] for each in told):
+        printed.clear()
+        while not any(each["type"] == "endpoint" and each["frames_in"] for each in printed):
             await asyncio.sleep(0.01)
-            told += records(capsys.readouterr().out)
-        ends = [each for each in told if each["type"] == "endpoint" and each["name"] == "a"]
+            printed += records(capsys.readouterr().out)
+        ends = [each for each in printed if each["type"] == "endpoint" and each["name"] == "a"]
         assert [1, 1] in next(each for each in ends if each["frames_in"])["systems"]
-        assert [each["kind"] for each in told if each["type"] == "hub_event"] == ["client_joined"]
+        assert [each["kind"] for each in printed if each["type"] == "hub_event"] == ["client_joined"]
         writer.close()
         ctrl_c()
         return int(await running)
@@ -114,18 +116,18 @@ def test_it_passes_frames_on_tells_and_records(tmp_path: Path, capsys: pytest.Ca
     assert asyncio.run(run()) == 0
     assert [raw[5] for _, raw in read_tlog(path)] == [1]
     assert main(["hub", "a=tcpin:127.0.0.1:0", "--record", str(path)]) != 0
-    assert "is there already; nothing was recorded" in capsys.readouterr().err
+    assert "file exists; nothing was recorded" in capsys.readouterr().err
 
 
-def test_lines_for_people(capsys: pytest.CaptureFixture[str]) -> None:
+def test_hub_prints_statistics_as_text(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["hub", "a=tcpin:127.0.0.1:0", "--seconds", "0.1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("a: tcpin:127.0.0.1:")
     assert lines[1] == "1 endpoint, for 0.1 s"
-    assert lines[-1] == "a: 0 frames in, 0 out, 0 lost; heard nobody"
+    assert lines[-1] == "a: 0 frames in, 0 out, 0 lost; systems none"
 
 
-def test_nothing_recorded_leaves_no_file(tmp_path: Path) -> None:
+def test_hub_empty_recording_is_removed(tmp_path: Path) -> None:
     path = tmp_path / "hub.tlog"
     for _ in range(2):
         assert main(["hub", "a=tcpin:127.0.0.1:0", "--seconds", "0.1", "--record", str(path)]) == 0

@@ -1,4 +1,4 @@
-"""Which signals bring a vehicle down before the program ends."""
+"""Signals that end a flight safely before the program exits."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there are no si
 
 
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_it_is_told_and_what_was_before_comes_back(number: str) -> None:
+def test_on_interrupt_calls_callback_and_restores_handlers(number: str) -> None:
     tests_own = signal.getsignal(signal.Signals[number])
     if tests_own is signal.SIG_IGN:  # pytest itself runs under nohup
         signal.signal(signal.Signals[number], signal.SIG_DFL)
     before = signal.getsignal(signal.Signals[number])
 
     async def wait() -> None:
-        told = anyio.Event()
-        with on_interrupt(told.set):
+        printed = anyio.Event()
+        with on_interrupt(printed.set):
             signal.raise_signal(signal.Signals[number])
             with anyio.fail_after(100):
-                await told.wait()
+                await printed.wait()
 
     try:
         anyio.run(wait)
@@ -34,18 +34,18 @@ def test_it_is_told_and_what_was_before_comes_back(number: str) -> None:
         signal.signal(signal.Signals[number], tests_own)
 
 
-def test_under_nohup_the_end_of_the_terminal_is_nothing() -> None:
+def test_on_interrupt_under_nohup_ignores_sighup() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    told: list[None] = []
+    printed: list[None] = []
 
     async def go_on() -> None:
-        with on_interrupt(lambda: told.append(None)):
+        with on_interrupt(lambda: printed.append(None)):
             signal.raise_signal(signal.SIGHUP)
             await anyio.sleep(0.01)
 
     try:
         anyio.run(go_on)
-        assert not told
+        assert not printed
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

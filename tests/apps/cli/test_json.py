@@ -1,4 +1,4 @@
-"""``--json``: every record has the fields that docs/command-line.md lists, whatever command prints it."""
+"""``--json``: the records of all commands have the fields that docs/command-line.md lists."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import pytest
 from cli_harness import DOCUMENT, HOME, MISSION, documented, records, run_with
 
 from aerokit.apps.cli import main
-from aerokit.apps.cli.commands import COMMANDS
-from aerokit.apps.cli.main import make_parser
-from aerokit.apps.cli.output import describe
+from aerokit.apps.cli.main import COMMANDS, make_parser
+from aerokit.apps.cli.output import exit_codes_help
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 SEEN: set[str] = set()
-TOLD_ELSEWHERE = {
+TESTED_ELSEWHERE = {
     "conversion",
     "serving",
     "bridging",
@@ -26,7 +25,7 @@ TOLD_ELSEWHERE = {
     "hub_event",
     "endpoint",
 }
-"""By commands that need an extra, a browser or a viewer; and what is rare."""
+"""Records of commands that need an extra, a browser or a viewer."""
 RARE = {"missed", "gimbal_silent", "interrupted"}
 
 
@@ -92,44 +91,44 @@ GROUPS = {
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_records_are_as_documented(group: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_records_match_documentation(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(MISSION)
     run_with(copter(), *([*arguments, "--json"] for arguments in GROUPS[group]))
-    told = records(capsys.readouterr().out)
-    assert len(told) >= len(GROUPS[group])
-    SEEN.update(record["type"] for record in told)
+    printed = records(capsys.readouterr().out)
+    assert len(printed) >= len(GROUPS[group])
+    SEEN.update(record["type"] for record in printed)
 
 
-def test_a_flight(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_fly_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(MISSION)
     assert main(["fly", "m.waypoints", "--sim", "--speedup", "50", "--json"]) == 0
-    told = records(capsys.readouterr().out)
-    assert told[-1]["type"] == "flight_summary"
-    SEEN.update(record["type"] for record in told)
+    printed = records(capsys.readouterr().out)
+    assert printed[-1]["type"] == "flight_summary"
+    SEEN.update(record["type"] for record in printed)
 
 
-def test_the_demonstration(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_demo_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--altitude", "3", "--side", "3", "--speedup", "50", "--json"]) == 0
-    told = records(capsys.readouterr().out)
-    assert [each["type"] for each in told[:2]] == ["simulated", "connecting"]
-    assert told[-1]["recorded_in"] == "demo.tlog"
-    SEEN.update(record["type"] for record in told)
+    printed = records(capsys.readouterr().out)
+    assert [each["type"] for each in printed[:2]] == ["simulated", "connecting"]
+    assert printed[-1]["recorded_in"] == "demo.tlog"
+    SEEN.update(record["type"] for record in printed)
 
 
-def test_the_simulator(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_sim_matches_documentation(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["sim", "tcpin:127.0.0.1:0", "--duration", "1", "--speedup", "20", "--picture", "track.svg"]
     assert main([*arguments, "--json"]) == 0
-    told = records(capsys.readouterr().out)
-    assert [each["type"] for each in told] == ["simulated", "stopped", "saved"]
-    SEEN.update(record["type"] for record in told)
+    printed = records(capsys.readouterr().out)
+    assert [each["type"] for each in printed] == ["simulated", "stopped", "saved"]
+    SEEN.update(record["type"] for record in printed)
 
 
-def test_every_documented_record_was_seen() -> None:
-    """Runs behind the others of this file, which stay together."""
-    assert set(documented()) - SEEN == TOLD_ELSEWHERE | RARE
+def test_json_every_documented_record_was_seen() -> None:
+    """Runs after the other tests of this file, in the same process."""
+    assert set(documented()) - SEEN == TESTED_ELSEWHERE | RARE
 
 
-def test_all_commands_have_it_but_those_that_say_so() -> None:
+def test_json_option_exists_for_all_but_two_commands() -> None:
     without = set()
     for command in COMMANDS:
         own = below(make_parser(command.name))[command.name]
@@ -140,17 +139,17 @@ def test_all_commands_have_it_but_those_that_say_so() -> None:
 
 
 def below(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """The parsers of its commands or actions; none if it has none."""
+    """Return the subparsers of a parser."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             return dict(action.choices)
     return {}
 
 
-def test_exit_codes_are_as_documented() -> None:
+def test_exit_codes_match_documentation() -> None:
     table = DOCUMENT.read_text(encoding="utf-8").partition("## Exit codes")[2].partition("## JSON")[0]
     rows = re.findall(r"^\| (\d+) \| (.*) \|$", table, re.MULTILINE)
-    assert "Exit codes: " + ", ".join(f"{code} {text}" for code, text in rows) + "." == describe()
+    assert "Exit codes: " + ", ".join(f"{code} {text}" for code, text in rows) + "." == exit_codes_help()
 
 
 def test_every_command_is_documented() -> None:

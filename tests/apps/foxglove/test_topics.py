@@ -1,4 +1,4 @@
-"""Topics as values: what the viewer is told fits what the vehicle said, and the schemas fit the messages."""
+"""Foxglove topics: messages match the vehicle state, and the schemas match the messages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLACE = Position(47.4, 8.5, altitude_amsl_m=500.0, altitude_relative_m=12.0)
 
 
 def fits(value: Any, schema: Any) -> bool:
-    """As much of JSON schema as we write."""
+    """Check a value against the parts of JSON Schema that aerokit uses."""
     kinds: dict[str, Any] = {
         "object": dict,
         "array": list,
@@ -59,7 +59,7 @@ def rotated(rotation: dict[str, float], x: float, y: float, z: float) -> tuple[f
         (Attitude(0, 0, 0), (0, 0, 1), (0, 0, 1)),
     ],
 )
-def test_axes_are_those_of_the_viewer(
+def test_rotation_uses_axes_of_viewer(
     attitude: Attitude, axis: tuple[float, float, float], points: tuple[float, float, float]
 ) -> None:
     fields = topics.frame_transform(0.0, 1, (1, 2, 3), attitude)
@@ -68,7 +68,7 @@ def test_axes_are_those_of_the_viewer(
     assert fields["child_frame_id"] == "vehicle_1"
 
 
-def test_the_first_place_at_the_height_of_home_is_the_origin_of_the_map() -> None:
+def test_map_origin_is_first_position_at_home_height() -> None:
     frame = topics.MapFrame()
     assert frame.east_north_up_m(PLACE) == pytest.approx((0, 0, 12))
     assert frame.east_north_up_m(PLACE.offset(north_m=100, east_m=-20, up_m=5)) == pytest.approx(
@@ -76,7 +76,7 @@ def test_the_first_place_at_the_height_of_home_is_the_origin_of_the_map() -> Non
     )
 
 
-def test_a_location_is_in_the_units_of_the_viewer() -> None:
+def test_location_fix_uses_units_of_viewer() -> None:
     fix = topics.location_fix(1_700_000_000.25, 7, PLACE, 90.0, Velocity(1.0, 2.0, 3.0))
     assert fix["timestamp"] == {"sec": 1_700_000_000, "nsec": 250_000_000}
     assert (fix["latitude"], fix["longitude"], fix["altitude"]) == (47.4, 8.5, 500.0)
@@ -84,15 +84,13 @@ def test_a_location_is_in_the_units_of_the_viewer() -> None:
     assert fix["velocity"] == {"x": 2.0, "y": 1.0, "z": -3.0}
 
 
-@pytest.mark.parametrize(
-    ("severity", "level"), [(0, 5), (2, 5), (3, 4), (4, 3), (5, 2), (6, 2), (7, 1), (99, 0)]
-)
-def test_severities_are_levels_of_the_viewer(severity: int, level: int) -> None:
+@pytest.mark.parametrize(("severity", "level"), [(0, 5), (2, 5), (3, 4), (4, 3), (5, 2), (6, 2), (7, 1), (99, 0)])
+def test_severity_maps_to_log_level(severity: int, level: int) -> None:
     entry = topics.log_entry(5.0, 1, StatusText(severity, "hello"))
     assert (entry["level"], entry["message"], entry["name"]) == (level, "hello", "vehicle_1")
 
 
-def test_messages_fit_their_schemas() -> None:
+def test_messages_match_schemas() -> None:
     attitude = Attitude(1.0, 2.0, 3.0)
     written = [
         (topics.location_fix(1.0, 1, PLACE), topics.LOCATION_FIX),
@@ -108,13 +106,13 @@ def test_messages_fit_their_schemas() -> None:
         assert fits(json.loads(topics.encoded(fields)), schema), schema
 
 
-def test_a_field_that_is_not_known_yet_has_its_type_all_the_same() -> None:
+def test_schema_of_unknown_field_has_declared_type() -> None:
     schema = topics.state_topic(3, "home", Home(1.0, 2.0, 3.0)).schema
     assert schema["properties"]["north_m"] == {"type": "number"}
     assert schema["title"] == "aerokit.home"
 
 
-def test_a_raw_message_has_the_units_in_its_schema_and_never_a_key() -> None:
+def test_raw_topic_has_units_and_no_secrets() -> None:
     position = m.GlobalPositionInt(1, 474000000, 85000000, 5, 6, 7, 8, 9, 10)
     topic = topics.raw_topic(1, 1, m.GlobalPositionInt)
     assert topic.name == "/mavlink/1/1/GLOBAL_POSITION_INT"
@@ -126,6 +124,6 @@ def test_a_raw_message_has_the_units_in_its_schema_and_never_a_key() -> None:
     assert "secret_key" not in topics.raw_topic(1, 1, m.SetupSigning).schema["properties"]
 
 
-def test_what_is_no_number_is_null() -> None:
+def test_nan_is_encoded_as_null() -> None:
     nowhere = m.VfrHud(math.nan, math.inf, 0, 0, 0.0, 0.0)
     assert json.loads(topics.encoded(topics.raw_fields(nowhere)))["airspeed"] is None

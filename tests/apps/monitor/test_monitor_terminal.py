@@ -1,4 +1,4 @@
-"""``aerokit monitor`` in a real pseudo-terminal that is closed: the process ends and gives its port back."""
+"""``aerokit monitor`` in a pseudo-terminal that is closed: the process ends and frees its port."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from exhaustive import exhaustive
 
-from aerokit.apps.cli.monitor import END_WITHIN_S
+from aerokit.apps.cli.listening import EXIT_TIMEOUT_S
 from aerokit.apps.cli.output import INTERRUPTED
 
 if sys.platform == "win32":
@@ -28,7 +28,7 @@ MONITOR = "import sys; from aerokit.apps.cli.main import main; sys.exit(main(['m
 BLOCKED = f"""
 import time
 from aerokit.apps.monitor.app import Monitor
-Monitor.look = lambda self: time.sleep(3600)
+Monitor.update_view = lambda self: time.sleep(3600)
 {MONITOR}
 """
 
@@ -66,7 +66,7 @@ def wait_until_drawn(terminal: int) -> None:
 
 
 @pytest.mark.parametrize("later_s", [0.0, *map(exhaustive, [0.3, 0.7, 1.1])])
-def test_monitor_whose_terminal_closes_ends_and_gives_its_port_back(later_s: float) -> None:
+def test_closed_terminal_ends_monitor_and_frees_port(later_s: float) -> None:
     address = free_address()
     with in_a_terminal(MONITOR.format(address=address)) as (process, terminal):
         wait_until_drawn(terminal)
@@ -82,12 +82,12 @@ def test_monitor_whose_terminal_closes_ends_and_gives_its_port_back(later_s: flo
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, exhaustive(signal.SIGHUP)])
-def test_monitor_whose_loop_is_blocked_ends_by_a_signal(number: signal.Signals) -> None:
+def test_signal_ends_monitor_with_blocked_loop(number: signal.Signals) -> None:
     with in_a_terminal(BLOCKED.format(address=free_address())) as (process, terminal):
         wait_until_drawn(terminal)
         time.sleep(0.5)  # longer does no harm: it is blocked then
         began = time.monotonic()
         process.send_signal(number)
         assert process.wait(LIMIT_S) == INTERRUPTED
-        assert time.monotonic() - began >= END_WITHIN_S - 0.5
+        assert time.monotonic() - began >= EXIT_TIMEOUT_S - 0.5
         os.close(terminal)

@@ -1,4 +1,4 @@
-"""``aerokit bridge zenoh``: states of every vehicle on a link, for whoever listens."""
+"""``aerokit bridge zenoh``: states of every vehicle on a link."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
-async def test_states_of_all_vehicles_on_a_link(capsys: pytest.CaptureFixture[str]) -> None:
+async def test_bridge_zenoh_publishes_states_of_all_vehicles(capsys: pytest.CaptureFixture[str]) -> None:
     endpoint = f"tcp/127.0.0.1:{(port := free_port())}"
     config = zenoh.Config()
     for key, value in (
@@ -32,10 +32,10 @@ async def test_states_of_all_vehicles_on_a_link(capsys: pytest.CaptureFixture[st
         ("scouting/multicast/enabled", False),
     ):
         config.insert_json5(key, json.dumps(value))
-    heard: dict[str, Any] = {}
+    received: dict[str, Any] = {}
 
     def hear(sample: Any) -> None:
-        heard[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())["value"]
+        received[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())["value"]
 
     network = f"zenoh://north/box?connect={endpoint}"
     arguments = ["bridge", "zenoh", "udpin:127.0.0.1:0", network, "--json", "--rate", "20"]
@@ -47,27 +47,25 @@ async def test_states_of_all_vehicles_on_a_link(capsys: pytest.CaptureFixture[st
         async with simulated_link(vehicles) as options.address:
             command = asyncio.get_running_loop().create_task(options.run(options))
             keys = {f"aerokit/north/box/state/{n}/{name}" for n in (1, 2) for name in ("mode", "link")}
-            await eventually(lambda: keys <= heard.keys())
+            await eventually(lambda: keys <= received.keys())
             os.kill(os.getpid(), signal.SIGINT)
             assert await command == 0
         del subscriber
         listener.close()
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [each["type"] for each in told] == ["publishing", "bridged_vehicle", "bridged_vehicle"]
-    assert told[0]["network"] == network
+    printed = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [each["type"] for each in printed] == ["publishing", "bridged_vehicle", "bridged_vehicle"]
+    assert printed[0]["network"] == network
 
 
 @pytest.mark.parametrize("network", ["tcp:127.0.0.1:5763", "zenoh://north", "north/box"])
-def test_a_network_is_wanted_before_anything_is_opened(
-    network: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bridge_zenoh_with_other_address_exits_with_code_2(network: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         make_parser("bridge").parse_args(["bridge", "zenoh", "zenoh://north/box", network])
     assert ended.value.code == 2
-    assert "argument NETWORK: " in (told := capsys.readouterr().err)
-    assert "zenoh://" in told
+    assert "argument NETWORK: " in (printed := capsys.readouterr().err)
+    assert "zenoh://" in printed
 
 
-def test_the_vehicles_address_may_be_left_out() -> None:
+def test_bridge_zenoh_uses_default_vehicle_address() -> None:
     options = make_parser("bridge").parse_args(["bridge", "zenoh", "zenoh://north/box"])
     assert (options.network, options.rate) == ("zenoh://north/box", 5.0)

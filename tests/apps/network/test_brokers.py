@@ -1,4 +1,4 @@
-"""States over MQTT, by a real broker: where they arrive, and that nothing comes late."""
+"""States over MQTT with a real broker: topics, reconnection, and no late messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from zenoh_network import HoldingProxy, eventually, free_port
 import aerokit
 from aerokit.apps.cli.main import make_parser
 from aerokit.apps.network import publishing
-from aerokit.apps.network.broker import _OverLink
+from aerokit.apps.network.mqtt_publisher import _LinkPublisher
 from aerokit.apps.network.publishing import publisher_for
 from aerokit.errors import LinkOpenError
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -51,24 +51,24 @@ def address(port: int, login: str = "") -> str:
 
 
 def waiting(publisher: Any) -> dict[str, bytes]:
-    """What has not been sent yet."""
-    assert isinstance(publisher, _OverLink)
+    """Return the unsent values."""
+    assert isinstance(publisher, _LinkPublisher)
     link: Any = publisher._link._link
     found: dict[str, bytes] = link._waiting
     return found
 
 
-async def test_states_arrive_as_the_schema_says(broker: Broker) -> None:
+async def test_mqtt_states_match_schema(broker: Broker) -> None:
     by_name = {each["properties"]["state"]["const"]: each for each in SCHEMA["oneOf"]}
     async with (
-        broker.heard() as heard,
+        broker.heard() as received,
         simulated_link(SimulatedCopter()) as link,
         aerokit.connect(link) as vehicle,
         publishing(vehicle, address(broker.port), rate_hz=20),
     ):
         wanted = {topic(f"1/{name}") for name in ("mode", "armed", "position", "link")}
-        await eventually(lambda: wanted <= {each[0] for each in heard})
-    states = [each for each in heard if "alive" not in each[0]]
+        await eventually(lambda: wanted <= {each[0] for each in received})
+    states = [each for each in received if "alive" not in each[0]]
     for where, data, is_retained in states:
         message = json.loads(data)
         assert where == topic(f"1/{message['state']}")
@@ -76,41 +76,41 @@ async def test_states_arrive_as_the_schema_says(broker: Broker) -> None:
         assert not is_retained
 
 
-async def test_a_broker_killed_and_started_again(broker: Broker, caplog: pytest.LogCaptureFixture) -> None:
+async def test_mqtt_broker_restart_reconnects(broker: Broker, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "aerokit")
 
-    def told(text: str) -> bool:
+    def is_logged(text: str) -> bool:
         return any(text in each.getMessage() for each in caplog.records)
 
     line = HoldingProxy(broker.port)
     async with line, publisher_for(address(line.port)) as publisher:
-        async with broker.heard() as heard:
+        async with broker.heard() as received:
             publisher.put("1/mode", b"first")
-            await eventually(lambda: any(each[1] == b"first" for each in heard))
+            await eventually(lambda: any(each[1] == b"first" for each in received))
         broker.kill()
         await line.__aexit__()
-        await eventually(lambda: told("trying to open it again"))
+        await eventually(lambda: is_logged("reopening it"))
         for number in range(20_000):
             publisher.put(f"1/{number}", b"old")
         assert len(waiting(publisher)) == 0
         await broker.start()
-        async with broker.heard() as heard:  # nothing gets through before somebody listens
+        async with broker.heard() as received:  # subscribes before any message passes
             again = HoldingProxy(broker.port)
             again.port = line.port
             async with again:
 
                 def arrives() -> bool:
                     publisher.put("1/mode", b"new")
-                    return any(each[1] == b"new" for each in heard)
+                    return any(each[1] == b"new" for each in received)
 
                 await eventually(arrives)
-                await eventually(lambda: told("is back after"))
-        assert {each[1] for each in heard} - {b"online", b"offline"} == {b"new"}
+                await eventually(lambda: is_logged("is back after"))
+        assert {each[1] for each in received} - {b"online", b"offline"} == {b"new"}
 
 
 @asynccontextmanager
 async def stalled() -> AsyncIterator[int]:
-    """The port of a broker that takes a client and then reads no more."""
+    """Yield the port of a broker that accepts a client, and then stops reading."""
     writers: list[asyncio.StreamWriter] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -125,7 +125,7 @@ async def stalled() -> AsyncIterator[int]:
             writer.close()
 
 
-async def test_a_broker_that_takes_nothing_gets_the_latest_and_no_more() -> None:
+async def test_stalled_broker_receives_latest_state_only() -> None:
     async with stalled() as port, publisher_for(address(port)) as publisher:
         for number in range(2000):
             for name in "abc":
@@ -136,14 +136,14 @@ async def test_a_broker_that_takes_nothing_gets_the_latest_and_no_more() -> None
     await eventually(lambda: len(asyncio.all_tasks()) <= 2)
 
 
-async def test_no_broker() -> None:
+async def test_mqtt_without_broker_raises() -> None:
     port = free_port()
     with pytest.raises(LinkOpenError, match=f"127.0.0.1:{port}/north/alpha: Connect.*is the broker running"):
         async with publisher_for(address(port, f"{USER}:geheim@")):
             pass
 
 
-async def test_somebody_who_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_mqtt_silent_server_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     before = asyncio.all_tasks()
     monkeypatch.setattr(sys.modules["aerokit.apps.network.mqtt_publisher"], "CONNECT_TIMEOUT_S", 0.2)
     silent = await asyncio.start_server(lambda _r, w: writers.append(w), "127.0.0.1", 0)
@@ -158,7 +158,7 @@ async def test_somebody_who_says_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
     await eventually(lambda: asyncio.all_tasks() <= before)
 
 
-async def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_mqtt_password_is_never_shown(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     async with Broker(tmp_path, with_password=True) as broker:
         port = broker.port
@@ -167,11 +167,11 @@ async def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> No
                 pass
         login = f"{USER}:{quote(PASSWORD, safe='')}@"
         async with (
-            broker.heard((USER, PASSWORD)) as heard,
+            broker.heard((USER, PASSWORD)) as received,
             publisher_for(address(port, login)) as publisher,
         ):
             publisher.put("1/mode", b"1")
-            await eventually(lambda: any(each[1] == b"1" for each in heard))
+            await eventually(lambda: any(each[1] == b"1" for each in received))
             assert "alpha" in repr(publisher)
             assert PASSWORD not in repr(publisher)
     chain: BaseException | None = refused.value
@@ -181,7 +181,7 @@ async def test_passwords(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> No
     assert not any(word in caplog.text for word in ("geheim", PASSWORD, quote(PASSWORD, safe="")))
 
 
-async def test_the_blocks_end_and_cancellation_leave_nothing(broker: Broker) -> None:
+async def test_mqtt_block_exit_and_cancellation_release_everything(broker: Broker) -> None:
     before = asyncio.all_tasks()
     where = address(broker.port)
     async with publisher_for(where) as publisher:
@@ -211,31 +211,31 @@ async def test_the_blocks_end_and_cancellation_leave_nothing(broker: Broker) -> 
         await eventually(lambda: asyncio.all_tasks() <= before)
 
 
-async def test_who_is_there_by_mqtt(broker: Broker) -> None:
+async def test_mqtt_alive_topic_shows_presence(broker: Broker) -> None:
     alive = "aerokit/north/alpha/alive"
-    async with broker.heard() as heard, HoldingProxy(broker.port) as line:
+    async with broker.heard() as received, HoldingProxy(broker.port) as line:
         async with publisher_for(address(line.port)):
-            await eventually(lambda: (alive, b"online", False) in heard)
-            async with broker.heard() as later:  # whoever comes later is told, too
+            await eventually(lambda: (alive, b"online", False) in received)
+            async with broker.heard() as later:  # a later subscriber gets the retained message
                 await eventually(lambda: (alive, b"online", True) in later)
-        await eventually(lambda: heard[-1][:2] == (alive, b"offline"))
+        await eventually(lambda: received[-1][:2] == (alive, b"offline"))
         async with publisher_for(address(line.port)):
-            await eventually(lambda: heard[-1][:2] == (alive, b"online"))
-            await line.__aexit__()  # no goodbye: the broker says it
-            await eventually(lambda: heard[-1][:2] == (alive, b"offline"))
+            await eventually(lambda: received[-1][:2] == (alive, b"online"))
+            await line.__aexit__()  # no DISCONNECT, so the broker sends the last will
+            await eventually(lambda: received[-1][:2] == (alive, b"offline"))
 
 
-async def test_the_command(broker: Broker, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_bridge_mqtt_publishes_states(broker: Broker, capsys: pytest.CaptureFixture[str]) -> None:
     network = address(broker.port, f"{USER}:geheim@")
     options = make_parser("bridge").parse_args(["bridge", "mqtt", network, "--json", "--rate", "20"])
-    async with broker.heard() as heard, simulated_link(SimulatedCopter()) as options.address:
+    async with broker.heard() as received, simulated_link(SimulatedCopter()) as options.address:
         command = asyncio.get_running_loop().create_task(options.run(options))
-        await eventually(lambda: topic("1/mode") in {each[0] for each in heard})
+        await eventually(lambda: topic("1/mode") in {each[0] for each in received})
         os.kill(os.getpid(), signal.SIGINT)
         assert await command == 0
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [each["type"] for each in told] == ["publishing", "bridged_vehicle"]
-    assert told[0]["network"] == address(broker.port)
+    printed = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [each["type"] for each in printed] == ["publishing", "bridged_vehicle"]
+    assert printed[0]["network"] == address(broker.port)
 
 
 @pytest.mark.parametrize(
@@ -248,12 +248,10 @@ async def test_the_command(broker: Broker, capsys: pytest.CaptureFixture[str]) -
         "http://alpha:geheim@host/north/alpha",
     ],
 )
-def test_a_broker_is_wanted_before_anything_is_opened(
-    network: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bridge_mqtt_with_invalid_address_exits_with_code_2(network: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         make_parser("bridge").parse_args(["bridge", "mqtt", network])
     assert ended.value.code == 2
-    assert "argument NETWORK: " in (told := capsys.readouterr().err)
-    assert "mqtt://" in told
-    assert "geheim" not in told
+    assert "argument NETWORK: " in (printed := capsys.readouterr().err)
+    assert "mqtt://" in printed
+    assert "geheim" not in printed

@@ -1,4 +1,4 @@
-"""A broker that is not what it seems: what it sends reaches no vehicle, and the program flies on."""
+"""A hostile broker: its messages reach no vehicle, and the program keeps flying."""
 
 from __future__ import annotations
 
@@ -40,34 +40,33 @@ def publish(topic: bytes, payload: bytes) -> bytes:
 
 
 @asynccontextmanager
-async def broker(says: bytes) -> AsyncIterator[tuple[int, list[bytes]]]:
-    """Takes everybody, and answers the first state with something; the port, and what has come since."""
-    heard: list[bytes] = []
-    has_spoken = False
+async def broker(answer: bytes) -> AsyncIterator[tuple[int, list[bytes]]]:
+    """Accept every client, and send ``answer`` after the first state; yield the port and the data received since."""
+    received: list[bytes] = []
+    has_answered = False
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        nonlocal has_spoken
+        nonlocal has_answered
         writer.write(CONNACK)
         with suppress(ConnectionError):
             while data := await reader.read(65536):
-                if has_spoken:
-                    heard.append(data)
+                if has_answered:
+                    received.append(data)
                 elif b"/state/1/" in data:
-                    has_spoken = True
-                    writer.write(says)
+                    has_answered = True
+                    writer.write(answer)
         writer.close()
 
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     async with server:
-        yield server.sockets[0].getsockname()[1], heard
+        yield server.sockets[0].getsockname()[1], received
 
 
 @pytest.mark.parametrize(
-    "says",
+    "answer",
     sampled(
         [
-            publish(b"aerokit/north/alpha/state/1/mode", b"{}" * 1000)
-            + publish(b"aerokit/north/alpha/to/1", ORDER),
+            publish(b"aerokit/north/alpha/state/1/mode", b"{}" * 1000) + publish(b"aerokit/north/alpha/to/1", ORDER),
             b"\x30\xff\xff\xff\xff\xff\xff",  # a length that never ends
             b"\x30\x01\x00",  # shorter than its own topic
             publish(b"\xff\xfe", b"no text") * 100,
@@ -77,16 +76,16 @@ async def broker(says: bytes) -> AsyncIterator[tuple[int, list[bytes]]]:
     ),
     ids=["orders", "length", "short", "topic", "goodbye"],
 )
-async def test_what_a_broker_sends_reaches_no_vehicle(says: bytes, caplog: pytest.LogCaptureFixture) -> None:
+async def test_messages_of_hostile_broker_reach_no_vehicle(answer: bytes, caplog: pytest.LogCaptureFixture) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with (
-        broker(says) as (port, heard),
+        broker(answer) as (port, received),
         simulated_link(copter, speedup=10.0) as link,
         aerokit.connect(link) as vehicle,
         publisher_for(f"mqtt://127.0.0.1:{port}/north/alpha") as publisher,
         publishing(vehicle, publisher, rate_hz=50),
     ):
-        await eventually(lambda: b"".join(heard).count(b"/state/1/") >= 3)
+        await eventually(lambda: b"".join(received).count(b"/state/1/") >= 3)
         assert vehicle.connection.is_open
         assert not copter.is_armed
     assert "Traceback" not in caplog.text

@@ -1,4 +1,4 @@
-"""Two machines: one has the vehicle's link and a hub, and is killed and replaced while the other one flies."""
+"""Two machines: the one with the vehicle's link and a hub is killed and replaced, while the other one flies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zenoh_network import free_port, router
 import aerokit
 from aerokit import events
 from aerokit.sim import SimulatedCopter, open_simulator
-from aerokit.sim.kinds import wait_longer
+from aerokit.sim.kinds import scale_timeouts
 
 pytest.importorskip("zenoh")
 pytestmark = [
@@ -43,10 +43,10 @@ def hub(*addresses: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.mark.exhaustive
-async def test_a_machine_is_killed_and_replaced_in_flight() -> None:
+async def test_killed_hub_is_replaced_in_flight() -> None:
     vehicle_port, port = free_port(), free_port()
     copter = SimulatedCopter(boot_time_s=0.0)
-    wait_longer([copter], SPEEDUP)
+    scale_timeouts([copter], SPEEDUP)
     machine = (f"tcp:127.0.0.1:{vehicle_port}", f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}")
     address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&timeout=2"
     with router(port):

@@ -1,4 +1,4 @@
-"""The whole API through a zenoh network, and state for others; real time, real sockets."""
+"""The API over a zenoh network, and published state, in real time on real sockets."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from zenoh_network import HoldingProxy, eventually, free_port, router
 
 import aerokit
 from aerokit import VelocitySetpoint, events
-from aerokit.apps.network import found, publishing
+from aerokit.apps.network import discover, publishing
 from aerokit.errors import CommandRejected, LinkOpenError
 from aerokit.missions import Mission, return_to_launch, take_off, waypoint
 from aerokit.sim import SimulatedCopter, open_simulator
-from aerokit.sim.kinds import wait_longer
+from aerokit.sim.kinds import scale_timeouts
 
 zenoh: Any = pytest.importorskip("zenoh")
 pytestmark = pytest.mark.anyio
@@ -33,14 +33,14 @@ def anyio_backend() -> str:
 async def copter_at(port: int) -> AsyncIterator[SimulatedCopter]:
     """A simulated copter, which a router has as ``alpha``."""
     copter = SimulatedCopter(boot_time_s=0.0)
-    wait_longer([copter], SPEEDUP)
+    scale_timeouts([copter], SPEEDUP)
     address = f"zenohin://north/alpha?connect=tcp/127.0.0.1:{port}"
     with router(port):
         async with open_simulator(copter, address, speedup=SPEEDUP):
             yield copter
 
 
-async def test_the_whole_api() -> None:
+async def test_zenoh_link_supports_whole_api() -> None:
     port = free_port()
     address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client=ground-1"
     async with copter_at(port), aerokit.connect(address) as vehicle:
@@ -66,11 +66,11 @@ async def test_the_whole_api() -> None:
             await stream.fly(VelocitySetpoint(north_m_s=2), 0.3)
         await vehicle.land()
         link: Any = vehicle.connection.link
-        assert link.helm == "ground-1"
+        assert link.lease_holder == "ground-1"
         assert link.dropped_writes == 0
 
 
-async def test_the_one_without_the_helm_is_told() -> None:
+async def test_zenoh_client_without_control_is_refused() -> None:
     port = free_port()
     address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{port}&client="
     async with (
@@ -83,11 +83,11 @@ async def test_the_one_without_the_helm_is_told() -> None:
         with two.subscribe(events.OrderRefused, capacity=8) as refusals:
             with pytest.raises(CommandRejected) as refused:  # reasons are waited for; not a time-out
                 await two.arm(timeout=100)
-            assert "network: one has the helm" in refused.value.reasons
+            assert "network: one has control" in refused.value.reasons
             refusal = await refusals.get(timeout=100)
-            assert (refusal.message, refusal.reason, refusal.helm) == (
+            assert (refusal.message, refusal.reason, refusal.lease_holder) == (
                 "COMMAND_LONG",
-                "one has the helm",
+                "one has control",
                 "one",
             )
         assert len(await two.parameters.download()) > 100  # anybody reads
@@ -96,31 +96,27 @@ async def test_the_one_without_the_helm_is_told() -> None:
 
 
 @pytest.mark.exhaustive
-async def test_a_reconnecting_program_lives_through_a_partition() -> None:
+async def test_zenoh_reconnect_survives_partition() -> None:
     port = free_port()
     async with copter_at(port), HoldingProxy(port) as line:
         address = f"zenoh://north/alpha?connect=tcp/127.0.0.1:{line.port}"
         async with aerokit.connect(address, reconnect=True) as vehicle:
             await vehicle.wait_ready()
             line.hold()
-            await vehicle.link_state.wait_until(
-                lambda state: state is not aerokit.LinkState.CONNECTED, timeout=10
-            )
+            await vehicle.link_state.wait_until(lambda state: state is not aerokit.LinkState.CONNECTED, timeout=10)
             line.release()
-            await vehicle.link_state.wait_until(
-                lambda state: state is aerokit.LinkState.CONNECTED, timeout=10
-            )
+            await vehicle.link_state.wait_until(lambda state: state is aerokit.LinkState.CONNECTED, timeout=10)
             await vehicle.set_mode("GUIDED")
             await vehicle.arm()
 
 
-async def test_state_for_other_programs() -> None:
+async def test_zenoh_publishes_states() -> None:
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
-    heard: dict[str, dict[str, Any]] = {}
+    received: dict[str, dict[str, Any]] = {}
 
     def hear(sample: Any) -> None:
-        heard[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())
+        received[str(sample.key_expr)] = json.loads(sample.payload.to_bytes())
 
     async with copter_at(port), aerokit.connect(f"zenoh://north/alpha?connect={endpoint}") as vehicle:
         config = zenoh.Config()
@@ -133,16 +129,14 @@ async def test_state_for_other_programs() -> None:
         other = zenoh.open(config)
         subscriber: Any = other.declare_subscriber("aerokit/north/*/state/**", hear)
         async with publishing(vehicle, f"zenoh://north/alpha?connect={endpoint}", rate_hz=20):
-            await eventually(lambda: "aerokit/north/alpha/state/1/position" in heard)
-            position = heard["aerokit/north/alpha/state/1/position"]
-            assert position["value"]["latitude_deg"] == pytest.approx(
-                vehicle.position.value.latitude_deg, abs=1e-4
-            )
-            assert await found("north", connect=[endpoint], wait=0.2) == ["alpha"]
+            await eventually(lambda: "aerokit/north/alpha/state/1/position" in received)
+            position = received["aerokit/north/alpha/state/1/position"]
+            assert position["value"]["latitude_deg"] == pytest.approx(vehicle.position.value.latitude_deg, abs=1e-4)
+            assert await discover("north", connect=[endpoint], wait=0.2) == ["alpha"]
         del subscriber
         other.close()
 
 
-async def test_no_network() -> None:
+async def test_zenoh_without_network_raises() -> None:
     with pytest.raises(LinkOpenError):
-        await found("north", connect=[f"tcp/127.0.0.1:{free_port()}"])
+        await discover("north", connect=[f"tcp/127.0.0.1:{free_port()}"])

@@ -1,4 +1,4 @@
-"""A flight with the application on it, an HTTP client in memory, and a raw WebSocket client of ASGI."""
+"""A simulated flight that is served, with an in-memory HTTP client and an ASGI WebSocket client."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Stage:
     client: httpx.AsyncClient
     keys: int = 0
 
-    async def give(self, order: str, body: object = None, **headers: str) -> httpx.Response:
-        """Give vehicle 1 an order, with a new key unless there is one in ``headers``."""
+    async def submit(self, order: str, body: object = None, **headers: str) -> httpx.Response:
+        """POST an order for vehicle 1, with a new key unless ``headers`` has one."""
         self.keys += 1
         sent = {"Authorization": f"Bearer {TOKEN}", "Idempotency-Key": f"key-{self.keys:08}", **headers}
         sent = {name.replace("_", "-"): value for name, value in sent.items()}
@@ -46,7 +46,7 @@ async def open_stage(*, ready: bool = True, **options: Any) -> AsyncIterator[Sta
 
 @dataclass
 class Socket:
-    """What a server does for one WebSocket; ``is_slow`` holds what it sends up, as a full socket does."""
+    """An ASGI server's side of one WebSocket; clear ``flows`` to block sending, like a full socket."""
 
     app: ServeApp
     path: str = "/api/stream"

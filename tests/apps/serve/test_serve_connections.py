@@ -1,4 +1,4 @@
-"""Connections of `aerokit serve` on real sockets: strangers without the token keep no owner out."""
+"""Connections of `aerokit serve` on real sockets: clients without the token cannot block the owner."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import aerokit
 import aerokit.apps.serve.guard as connections
 from aerokit.apps.cli.serve import config_of
 from aerokit.apps.serve import make_app
-from aerokit.apps.serve.guard import MAX_STRANGERS
+from aerokit.apps.serve.guard import MAX_ANONYMOUS_CONNECTIONS
 from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -30,21 +30,21 @@ def anyio_backend() -> str:
     return "asyncio"
 
 
-Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+TcpStream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 GIVEN = (200, 202)
 HALF = b"GET /api HTTP/1.1\r\nHost: 127"
 
 
 class Server:
-    """The application as `aerokit serve` serves it, and who connects to it."""
+    """The application on a real port, with client connections."""
 
     def __init__(self, server: uvicorn.Server) -> None:
         self._server = server
         self.port = server.servers[0].sockets[0].getsockname()[1]
-        self._streams: list[Stream] = []
+        self._streams: list[TcpStream] = []
         self._keys = 0
 
-    async def connect(self, *, first: bytes = b"", host: str = "127.0.0.1") -> Stream:
+    async def connect(self, *, first: bytes = b"", host: str = "127.0.0.1") -> TcpStream:
         stream = await asyncio.open_connection("127.0.0.1", self.port, local_addr=(host, 0))
         self._streams.append(stream)
         stream[1].write(first)
@@ -63,8 +63,8 @@ class Server:
     def open_connections(self) -> int:
         return len(self._server.server_state.connections)
 
-    async def order(self, stream: Stream) -> int:
-        """Have the owner order `hold`; the status of the answer."""
+    async def order(self, stream: TcpStream) -> int:
+        """Order `hold` with the token; return the status code."""
         self._keys += 1
         head = (
             f"POST /api/vehicles/1/hold?wait=false HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n"
@@ -73,18 +73,18 @@ class Server:
         return await ask(stream, head.encode())
 
 
-def has_ended(stream: Stream) -> bool:
+def has_ended(stream: TcpStream) -> bool:
     return stream[0].at_eof() or stream[0].exception() is not None
 
 
-async def end_of(stream: Stream) -> bytes:
-    """What comes until the server ends the connection."""
+async def end_of(stream: TcpStream) -> bytes:
+    """Read until the server closes the connection."""
     with anyio.fail_after(100), suppress(ConnectionResetError):
         return await stream[0].read()
     return b""
 
 
-async def ask(stream: Stream, request: bytes) -> int:
+async def ask(stream: TcpStream, request: bytes) -> int:
     reader, writer = stream
     writer.write(request)
     with anyio.fail_after(100):
@@ -116,33 +116,33 @@ async def open_server() -> AsyncIterator[Server]:
 
 
 @pytest.mark.parametrize("first", [b"", HALF], ids=["silent", "half"])
-async def test_half_requests_of_strangers_keep_no_order_out(first: bytes) -> None:
+async def test_partial_anonymous_requests_do_not_block_command(first: bytes) -> None:
     async with open_server() as server:
         owner = await server.connect()
         assert await server.order(owner) in GIVEN
         await server.flood(200, first)
         assert await server.order(await server.connect()) in GIVEN
         assert await server.order(owner) in GIVEN, "his own connection is not ended for strangers"
-        assert server.open_connections() <= MAX_STRANGERS + 2
+        assert server.open_connections() <= MAX_ANONYMOUS_CONNECTIONS + 2
 
 
-async def test_whole_requests_of_strangers_keep_no_order_out() -> None:
+async def test_idle_anonymous_connections_do_not_block_command() -> None:
     async with open_server() as server:
         request = b"GET /api/vehicles HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
         await server.flood(200, request)
         assert await server.order(await server.connect()) in GIVEN
         assert await ask(await server.connect(), request) == 200
-        assert server.open_connections() <= MAX_STRANGERS + 2
+        assert server.open_connections() <= MAX_ANONYMOUS_CONNECTIONS + 2
 
 
-async def test_strangers_of_one_address_end_no_connection_of_another_one() -> None:
+async def test_flood_from_one_address_keeps_connection_of_another() -> None:
     async with open_server() as server:
         page = await server.connect(host="127.0.0.2")
         await server.flood(200)
         assert await ask(page, b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") == 200
 
 
-async def test_headers_that_do_not_come_end_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_headers_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     whole = b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     async with open_server() as server:
@@ -157,7 +157,7 @@ async def test_headers_that_do_not_come_end_the_connection(monkeypatch: pytest.M
         assert not has_ended(second), "it has uvicorn's time for the next request"
 
 
-async def test_bytes_that_trickle_in_win_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_slow_headers_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     async with open_server() as server:
         stream = await server.connect(first=HALF)
@@ -168,7 +168,7 @@ async def test_bytes_that_trickle_in_win_no_time(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("noise", [b"\x16\x03\x01 TLS\r\n\r\n", b"GET /" + b"x" * 100_000, b"\xfd" * 1000])
-async def test_a_request_that_is_no_http_is_refused(noise: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_non_http_request_is_refused(noise: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     async with open_server() as server:
         assert (await end_of(await server.connect(first=noise)))[9:12] in (b"400", b"")
@@ -186,7 +186,7 @@ def stream(server: Server, token: str | None = TOKEN, **options: Any) -> Any:
 @pytest.mark.parametrize(
     "said", ["x" * 2_000, "x" * 2_000_000, b"\0" * 2_000_000], ids=["text", "long text", "long bytes"]
 )
-async def test_a_socket_that_speaks_is_ended_before_its_message_is_read(said: str | bytes) -> None:
+async def test_websocket_client_message_closes_connection(said: str | bytes) -> None:
     async with open_server() as server, stream(server) as socket:
         with pytest.raises(websockets.ConnectionClosed), anyio.fail_after(100):
             await socket.send(said)
@@ -195,7 +195,7 @@ async def test_a_socket_that_speaks_is_ended_before_its_message_is_read(said: st
         assert await server.order(await server.connect()) in GIVEN
 
 
-async def test_a_stream_lasts_longer_than_a_request_may_take(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_stream_outlives_request_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     async with open_server() as server, stream(server, None) as viewer:
         until = asyncio.get_running_loop().time() + 1.0
@@ -206,7 +206,7 @@ async def test_a_stream_lasts_longer_than_a_request_may_take(monkeypatch: pytest
         assert await viewer.recv()
 
 
-async def test_a_page_of_another_site_gets_no_stream() -> None:
+async def test_cross_site_websocket_is_refused() -> None:
     """Cross-site WebSocket hijacking, and a name that was pointed here (DNS rebinding)."""
     async with open_server() as server:
         for wrong in ({"origin": "http://evil.example"}, {"origin": f"http://127.0.0.1:{server.port + 1}"}):
@@ -217,7 +217,7 @@ async def test_a_page_of_another_site_gets_no_stream() -> None:
             assert await own.recv()
 
 
-async def test_streams_opened_and_dropped_leave_nothing() -> None:
+async def test_dropped_streams_release_everything() -> None:
     async with open_server() as server:
         for _ in range(100):
             reader, writer = await server.connect(
@@ -234,7 +234,7 @@ async def test_streams_opened_and_dropped_leave_nothing() -> None:
                 await asyncio.sleep(0.01)
 
 
-async def test_headers_that_nobody_asked_for_come_back_in_no_header() -> None:
+async def test_request_headers_are_not_reflected() -> None:
     async with open_server() as server:
         evil = b"%0d%0aSet-Cookie:%20a=b"
         for path in (
@@ -243,15 +243,13 @@ async def test_headers_that_nobody_asked_for_come_back_in_no_header() -> None:
             b"/api?refresh=" + evil,
             b"/api/vehicles/1/" + evil,
         ):
-            reader, writer = await server.connect(
-                first=b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-            )
+            reader, writer = await server.connect(first=b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             with anyio.fail_after(100):
                 assert b"set-cookie" not in (await reader.readuntil(b"\r\n\r\n")).lower()
             writer.close()
 
 
-async def test_a_request_hidden_in_another_one_is_refused() -> None:
+async def test_request_smuggling_is_refused() -> None:
     """Two lengths, or a length and chunks: what a proxy takes for a body would be a request here."""
     hidden = b"POST /api/vehicles/1/land HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     async with open_server() as server:
@@ -259,9 +257,7 @@ async def test_a_request_hidden_in_another_one_is_refused() -> None:
             b"Content-Length: 0\r\nContent-Length: 60",
             b"Content-Length: 4\r\nTransfer-Encoding: chunked",
         ):
-            request = (
-                b"POST /api/vehicles/1/hold HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n\r\n" + hidden
-            )
+            request = b"POST /api/vehicles/1/hold HTTP/1.1\r\nHost: 127.0.0.1\r\n" + lengths + b"\r\n\r\n" + hidden
             answer = await end_of(await server.connect(first=request))
             assert answer.count(b"HTTP/1.1 ") == 1
             assert answer[9:12] in (b"400", b"401")

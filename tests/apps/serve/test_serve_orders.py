@@ -1,4 +1,4 @@
-"""Orders by HTTP: awaited, given once, never late, never to another vehicle, by nobody without the token."""
+"""Orders over HTTP: results, idempotency, outdated state, unknown vehicles, tokens."""
 
 from __future__ import annotations
 
@@ -18,22 +18,26 @@ pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
-async def test_a_flight() -> None:
+async def test_commands_fly_vehicle() -> None:
     async with open_stage() as stage:
         answers = [
-            await stage.give("mode", {"mode": "guided"}),
-            await stage.give("arm"),
-            await stage.give("take_off", {"altitude_m": 10}),
+            await stage.submit("mode", {"mode": "guided"}),
+            await stage.submit("arm"),
+            await stage.submit("take_off", {"altitude_m": 10}),
         ]
         here = stage.flight.vehicle.position.value.offset(north_m=15)
         place = {"latitude_deg": here.latitude_deg, "longitude_deg": here.longitude_deg}
-        answers += [await stage.give("go_to", place), await stage.give("hold"), await stage.give("land")]
+        answers += [
+            await stage.submit("go_to", place),
+            await stage.submit("hold"),
+            await stage.submit("land"),
+        ]
         assert [(each.status_code, each.json()["state"]) for each in answers] == [(200, "done")] * 6
         assert stage.flight.vehicle.position.value.distance_to(here) < 3
 
 
 @pytest.mark.parametrize("is_open", [False, True])
-async def test_who_gives_an_order_without_the_token_gives_none(is_open: bool) -> None:
+async def test_command_without_token_is_refused(is_open: bool) -> None:
     async with open_stage(open_reading=is_open) as stage:
         stage.flight.wire.forget()
         wrong = [None, "Bearer ", f"Bearer {TOKEN}x", f"Basic {TOKEN}", "Bearer ä"]
@@ -45,9 +49,7 @@ async def test_who_gives_an_order_without_the_token_gives_none(is_open: bool) ->
                 answer = await stage.client.post(path, headers=headers)
                 assert answer.status_code == 401
                 assert answer.headers["content-type"] == "application/problem+json"
-            answer = await stage.client.put(
-                "/api/vehicles/1/parameters/RTL_ALT", json={"value": 1}, headers=headers
-            )
+            answer = await stage.client.put("/api/vehicles/1/parameters/RTL_ALT", json={"value": 1}, headers=headers)
             assert answer.status_code == 401
             refresh = await stage.client.get("/api/vehicles/1/mission?refresh=true", headers=headers)
             assert refresh.status_code == 401, "it costs the vehicle's link something"
@@ -60,21 +62,19 @@ async def test_who_gives_an_order_without_the_token_gives_none(is_open: bool) ->
         ("take_off", {}, "altitude_m is missing"),
         ("take_off", {"altitude_m": "high"}, "a number"),
         ("take_off", {"altitude_m": -3}, "altitude_m = -3"),
-        ("take_off", {"altitude_m": 5, "force": True}, "no argument"),
+        ("take_off", {"altitude_m": 5, "force": True}, "unknown argument"),
         ("go_to", {"latitude_deg": 95, "longitude_deg": 0}, "latitude"),
         ("mode", {"mode": "GIUDED"}, "did you mean 'GUIDED'"),
         ("mode", {"mode": True}, "mode = True is no"),
         ("mission/start", {"item": -1}, "item"),
-        ("mission/start", {"item": True}, "item = True is no integer"),
-        ("arm", ["x"], "no JSON object"),
+        ("mission/start", {"item": True}, "item = True is not of type integer"),
+        ("arm", ["x"], "not a JSON object"),
     ],
 )
-async def test_wrong_arguments_are_refused_before_anything_is_sent(
-    order: str, body: object, text: str
-) -> None:
+async def test_invalid_arguments_send_nothing(order: str, body: object, text: str) -> None:
     async with open_stage() as stage:
         stage.flight.wire.forget()
-        answer = await stage.give(order, body)
+        answer = await stage.submit(order, body)
         assert (answer.status_code, answer.json()["status"]) == (400, 400)
         assert text in answer.json()["detail"]
         assert stage.flight.wire.mode_orders() == []
@@ -103,12 +103,10 @@ async def test_wrong_arguments_are_refused_before_anything_is_sent(
         (b'{"altitude_m": 10}', {"Sec-Fetch-Site": "cross-site"}, 403),
     ],
 )
-async def test_hostile_requests(content: bytes, headers: dict[str, str], status: int) -> None:
+async def test_hostile_requests_are_refused(content: bytes, headers: dict[str, str], status: int) -> None:
     async with open_stage() as stage:
         usual = {**BEARER, "Content-Type": "application/json", "Idempotency-Key": "12345678", "Host": HOST}
-        answer = await stage.client.post(
-            "/api/vehicles/1/take_off", content=content, headers={**usual, **headers}
-        )
+        answer = await stage.client.post("/api/vehicles/1/take_off", content=content, headers={**usual, **headers})
         assert answer.status_code == status
         assert "default-src 'none'" in answer.headers["content-security-policy"]
         assert "access-control-allow-origin" not in answer.headers
@@ -123,8 +121,8 @@ async def test_hostile_requests(content: bytes, headers: dict[str, str], status:
         ("mode", b'{"mode": "x\\udfff"}'),
     ],
 )
-async def test_what_json_cannot_tell_is_not_kept(order: str, content: bytes) -> None:
-    """Else nobody could read the list of orders any more, nor open the stream."""
+async def test_values_beyond_json_are_refused(order: str, content: bytes) -> None:
+    """Otherwise the list of orders and the stream would fail for every client."""
     async with open_stage() as stage:
         headers = {**BEARER, "Content-Type": "application/json", "Idempotency-Key": "12345678"}
         answer = await stage.client.post(f"/api/vehicles/1/{order}", content=content, headers=headers)
@@ -133,7 +131,7 @@ async def test_what_json_cannot_tell_is_not_kept(order: str, content: bytes) -> 
         assert (listed.status_code, listed.json()) == (200, {"orders": []})
 
 
-async def test_another_vehicle_is_never_meant() -> None:
+async def test_unknown_vehicle_id_is_refused() -> None:
     async with open_stage() as stage:
         for name in ("2", "0", "256", "-1", "1.0", "٣", "one"):
             answer = await stage.client.post(
@@ -144,75 +142,73 @@ async def test_another_vehicle_is_never_meant() -> None:
         assert stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM) == []
 
 
-async def test_an_order_is_given_once() -> None:
+async def test_repeated_key_sends_command_once() -> None:
     async with open_stage() as stage:
-        answers = [await stage.give("arm", Idempotency_Key="the-same-key") for _ in range(3)]
+        answers = [await stage.submit("arm", Idempotency_Key="the-same-key") for _ in range(3)]
         assert [each.json()["state"] for each in answers] == ["done"] * 3
         assert len(stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM)) == 1
-        other = await stage.give("disarm", Idempotency_Key="the-same-key")
+        other = await stage.submit("disarm", Idempotency_Key="the-same-key")
         assert (other.status_code, other.json()["error"]) == (409, "KeyUsed")
         assert stage.flight.copter.is_armed
 
 
-async def test_nor_when_its_result_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("aerokit.apps.serve.orders.MOST_KEPT", 3)
+async def test_repeated_key_after_result_expiry_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit.apps.serve.orders.MAX_RESULTS", 3)
     async with open_stage() as stage:
-        await stage.give("arm", Idempotency_Key="the-same-key")
-        await stage.give("disarm")
+        await stage.submit("arm", Idempotency_Key="the-same-key")
+        await stage.submit("disarm")
         for _ in range(4):
-            await stage.give("mode", {"mode": "NONE"})
-        again = await stage.give("arm", Idempotency_Key="the-same-key")
+            await stage.submit("mode", {"mode": "NONE"})
+        again = await stage.submit("arm", Idempotency_Key="the-same-key")
         assert (again.status_code, again.json()["error"]) == (409, "KeyUsed")
         assert not stage.flight.copter.is_armed
 
 
-async def test_a_flood_of_keys_fills_no_memory_and_every_one_is_used_once(
+async def test_keys_are_bounded_and_single_use(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("aerokit.apps.serve.orders.MOST_KEPT", 5)
-    monkeypatch.setattr("aerokit.apps.serve.orders.MOST_KEYS", 20)
+    monkeypatch.setattr("aerokit.apps.serve.orders.MAX_RESULTS", 5)
+    monkeypatch.setattr("aerokit.apps.serve.orders.MAX_USED_KEYS", 20)
     async with open_stage() as stage:
         for number in range(40):
-            await stage.give("disarm", Idempotency_Key=f"flood-{number:04}")
+            await stage.submit("disarm", Idempotency_Key=f"flood-{number:04}")
         orders = stage.app._orders
-        assert (len(orders._kept), len(orders._spent)) == (5, 20)
+        assert (len(orders._records), len(orders._used_keys)) == (5, 20)
         for number in (39, 20):
-            answer = await stage.give("arm", Idempotency_Key=f"flood-{number:04}")
+            answer = await stage.submit("arm", Idempotency_Key=f"flood-{number:04}")
             assert answer.json()["error"] == "KeyUsed"
         assert not stage.flight.copter.is_armed
 
 
-async def test_refusals_have_their_reasons() -> None:
+async def test_refusal_contains_reasons() -> None:
     async with open_stage() as stage:
-        stage.flight.copter.faults.refuse(
-            MavCmd.COMPONENT_ARM_DISARM, MavResult.FAILED, "Arm: Compass not healthy"
-        )
-        refused = await stage.give("arm")
+        stage.flight.copter.faults.refuse(MavCmd.COMPONENT_ARM_DISARM, MavResult.FAILED, "Arm: Compass not healthy")
+        refused = await stage.submit("arm")
         assert (refused.status_code, refused.json()["error"]) == (409, "CommandRejected")
         assert "Arm: Compass not healthy" in refused.json()["reasons"]
-        not_armed = await stage.give("take_off", {"altitude_m": 5})
+        not_armed = await stage.submit("take_off", {"altitude_m": 5})
         assert (not_armed.status_code, not_armed.json()["error"]) == (409, "OperationRejected")
 
 
-async def test_a_silent_vehicle() -> None:
+async def test_silent_vehicle_accepts_safe_commands_only() -> None:
     async with open_stage() as stage:
         stage.flight.copter.faults.silent = True
         await anyio.sleep(5)
         stage.flight.wire.forget()
-        answer = await stage.give("arm")
+        answer = await stage.submit("arm")
         assert (answer.status_code, answer.json()["error"]) == (503, "HeartbeatTimeout")
         assert stage.flight.wire.commands(MavCmd.COMPONENT_ARM_DISARM) == []
-        landing = await stage.give("land")  # what brings it to rest is tried
+        landing = await stage.submit("land")  # what brings it to rest is tried
         assert landing.status_code in (503, 504)
         assert stage.flight.wire.mode_orders() != []
 
 
-async def test_a_client_that_goes_away_changes_nothing() -> None:
+async def test_disconnected_client_does_not_cancel_command() -> None:
     async with open_stage() as stage:
         await stage.flight.take_off()
         there = stage.flight.vehicle.position.value.offset(north_m=40)
         place = {"latitude_deg": there.latitude_deg, "longitude_deg": there.longitude_deg}
-        asking = asyncio.ensure_future(stage.give("go_to", place, Idempotency_Key="gone-away"))
+        asking = asyncio.ensure_future(stage.submit("go_to", place, Idempotency_Key="gone-away"))
         await anyio.sleep(3)
         asking.cancel()
         await asyncio.wait([asking])
@@ -223,19 +219,19 @@ async def test_a_client_that_goes_away_changes_nothing() -> None:
         assert record.json()["state"] == "done"
 
 
-async def test_a_newer_order_overrules_and_the_older_one_says_so() -> None:
+async def test_newer_command_overrules_older_one() -> None:
     async with open_stage() as stage:
         await stage.flight.take_off()
         there = stage.flight.vehicle.position.value.offset(north_m=90)
         place = {"latitude_deg": there.latitude_deg, "longitude_deg": there.longitude_deg}
-        started = await stage.give("go_to?wait=false", place, Idempotency_Key="older-one")
+        started = await stage.submit("go_to?wait=false", place, Idempotency_Key="older-one")
         assert (started.status_code, started.json()["state"]) == (202, "running")
-        assert (await stage.give("hold")).status_code == 200
+        assert (await stage.submit("hold")).status_code == 200
         older = (await stage.client.get("/api/orders/older-one", headers=BEARER)).json()
         assert (older["state"], older["problem"]["status"]) == ("failed", 409)
 
 
-async def test_the_end_of_the_server_ends_in_holding() -> None:
+async def test_server_shutdown_holds_vehicle() -> None:
     async with open_flight() as flight:
         await flight.take_off()
         there = flight.vehicle.position.value.offset(north_m=90)
@@ -243,17 +239,17 @@ async def test_the_end_of_the_server_ends_in_holding() -> None:
             orders = app._orders
             go_to = next(each for each in ORDERS if each.name == "go_to")
             place = {"latitude_deg": there.latitude_deg, "longitude_deg": there.longitude_deg}
-            given = orders.give(flight.vehicle, go_to, place, "12345678", None)
+            given = orders.submit(flight.vehicle, go_to, place, "12345678", None)
             await anyio.sleep(3)
         assert given.state == "failed"
         await anyio.sleep(3)
         assert flight.vehicle.mode_name == "BRAKE"
 
 
-async def test_read_only() -> None:
+async def test_read_only_server_refuses_commands() -> None:
     async with open_stage(read_only=True, open_reading=True) as stage:
         for kind in ORDERS:
-            answer = await stage.give(kind.name, {})
+            answer = await stage.submit(kind.name, {})
             assert (answer.status_code, answer.json()["error"]) == (403, "ReadOnly")
         written = await stage.client.put(
             "/api/vehicles/1/parameters/RTL_ALT",
@@ -264,7 +260,7 @@ async def test_read_only() -> None:
         assert stage.app._orders.all() == []
 
 
-async def test_a_parameter_is_set_and_told() -> None:
+async def test_set_parameter_publishes_event() -> None:
     async with open_stage() as stage:
         path, headers = "/api/vehicles/1/parameters/WPNAV_SPEED", {**BEARER, "Idempotency-Key": "set-it-now"}
         written = await stage.client.put(path, json={"value": 800}, headers=headers)
@@ -274,10 +270,8 @@ async def test_a_parameter_is_set_and_told() -> None:
         assert missing.status_code == 404
 
 
-@pytest.mark.parametrize(
-    "token", ["short", "x" * 300, "with space in the middle", "ümlaut-in-the-token-here"]
-)
-async def test_tokens_that_cannot_be(token: str) -> None:
+@pytest.mark.parametrize("token", ["short", "x" * 300, "with space in the middle", "ümlaut-in-the-token-here"])
+async def test_invalid_token_raises(token: str) -> None:
     async with open_flight() as flight:
         with pytest.raises(InvalidArgument, match="token"):
             make_app(flight.vehicle, token=token)

@@ -1,4 +1,4 @@
-"""What is read: vehicles, missions, parameters, the OpenAPI document, the page, the stream."""
+"""Reading: vehicles, missions, parameters, the OpenAPI document, the page, the stream."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 import aerokit
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
-from aerokit.apps.serve.stream import MOST_SOCKETS, MOST_VIEWERS, MOST_WAITING
+from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.errors import InvalidArgument
 from aerokit.missions import Mission, return_to_launch, take_off
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
 
-async def test_what_is_known() -> None:
+async def test_read_operations_return_state() -> None:
     async with open_stage() as stage:
         await stage.flight.vehicle.mission.upload(Mission([take_off(altitude_relative_m=20)]))
         stage.flight.copter.send_text(4, "<b>hello</b>")
@@ -48,11 +48,11 @@ async def test_what_is_known() -> None:
         assert len((await read("/api/vehicles/1/parameters"))["parameters"]) > 1000  # type: ignore[arg-type]
         texts = (await read("/api/vehicles/1/texts"))["texts"]
         assert "<b>hello</b>" in [each["text"] for each in texts]  # type: ignore[attr-defined]
-        told = (await read("/api/events"))["events"]
-        assert any(each["event"] == "StatusTextReceived" for each in told)  # type: ignore[attr-defined]
+        events = (await read("/api/events"))["events"]
+        assert any(each["event"] == "StatusTextReceived" for each in events)  # type: ignore[attr-defined]
 
 
-async def test_a_mission_of_another_length_is_read_again() -> None:
+async def test_mission_with_changed_count_is_downloaded_again() -> None:
     async with open_stage() as stage:
         mission = stage.flight.vehicle.mission
 
@@ -68,12 +68,10 @@ async def test_a_mission_of_another_length_is_read_again() -> None:
 
 
 @pytest.mark.parametrize("is_open", [True, False])
-async def test_reading_wants_the_token_unless_it_is_open(is_open: bool) -> None:
+async def test_reading_needs_token_unless_open(is_open: bool) -> None:
     async with open_stage(open_reading=is_open) as stage:
         paths = [
-            route.path
-            for route in stage.app.routes
-            if isinstance(route, Route) and "GET" in (route.methods or ())
+            route.path for route in stage.app.routes if isinstance(route, Route) and "GET" in (route.methods or ())
         ]
         vehicles = [path for path in paths if path.startswith("/api/") and not path.endswith("openapi.json")]
         assert len(vehicles) == 9
@@ -86,7 +84,7 @@ async def test_reading_wants_the_token_unless_it_is_open(is_open: bool) -> None:
         assert (wrong.status_code, refresh.status_code) == (401, 401)
 
 
-async def test_the_document_has_every_route_and_no_other() -> None:
+async def test_openapi_document_matches_routes() -> None:
     async with open_stage() as stage:
         document = (await stage.client.get("/api/openapi.json")).json()
         assert document["openapi"] == "3.1.0"
@@ -103,17 +101,14 @@ async def test_the_document_has_every_route_and_no_other() -> None:
 
 
 def check_shape(document: dict[str, object]) -> None:
-    """As OpenAPI 3.1 has it: what is required is there, references lead somewhere, path parameters are declared."""
+    """Check the document against OpenAPI 3.1: required fields, references, path parameters."""
     names = []
     for path, item in document["paths"].items():  # type: ignore[attr-defined]
         for operation in item.values():
             names.append(operation["operationId"])
             declared = {each["name"] for each in operation["parameters"] if each["in"] == "path"}
             assert declared == set(re.findall(r"{(\w+)}", path))
-            assert all(
-                each["schema"] and each["in"] in ("path", "query", "header")
-                for each in operation["parameters"]
-            )
+            assert all(each["schema"] and each["in"] in ("path", "query", "header") for each in operation["parameters"])
             assert operation["responses"]
             assert all(each["description"] for each in operation["responses"].values())
             if "requestBody" in operation:
@@ -125,7 +120,7 @@ def check_shape(document: dict[str, object]) -> None:
     assert set(document) == {"openapi", "info", "servers", "paths", "components"}
 
 
-async def test_the_page_needs_nothing_from_elsewhere() -> None:
+async def test_page_loads_no_external_resources() -> None:
     async with open_stage() as stage:
         page = await stage.client.get("/")
         assert page.headers["content-type"].startswith("text/html")
@@ -136,16 +131,14 @@ async def test_the_page_needs_nothing_from_elsewhere() -> None:
             assert (await stage.client.get(path)).status_code == 404
 
 
-def test_no_script_makes_html_of_text() -> None:
+def test_scripts_never_set_html() -> None:
     scripts = [path.read_text() for path in sorted(Path(STATIC).glob("*.js"))]
     assert len(scripts) >= 8
     for script in scripts:
-        assert not re.search(
-            r"\.(innerHTML|outerHTML|insertAdjacentHTML)|document\.write|eval\(|https?://", script
-        )
+        assert not re.search(r"\.(innerHTML|outerHTML|insertAdjacentHTML)|document\.write|eval\(|https?://", script)
 
 
-async def test_tiles_are_let_in_by_their_origin_alone() -> None:
+async def test_content_policy_allows_tile_origin_only() -> None:
     async with open_stage(tiles="https://tiles.example:8443/a/{z}/{x}/{y}.png") as stage:
         policy = (await stage.client.get("/")).headers["content-security-policy"]
         assert "img-src 'self' https://tiles.example:8443;" in policy
@@ -159,7 +152,7 @@ async def test_tiles_are_let_in_by_their_origin_alone() -> None:
                 make_app(stage.flight.vehicle, token=TOKEN, tiles=wrong)
 
 
-async def test_all_vehicles_of_a_connection_and_mounted_elsewhere() -> None:
+async def test_mounted_app_serves_all_vehicles() -> None:
     copters = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (3, 7)]
     async with simulated_link(copters) as link, aerokit.open_connection(link) as connection:
         async with make_app(connection, token=TOKEN) as app:
@@ -178,19 +171,19 @@ async def test_all_vehicles_of_a_connection_and_mounted_elsewhere() -> None:
 # ------------------------------------------------------------------------------------------- stream
 
 
-async def test_the_stream_tells_state_events_and_orders() -> None:
+async def test_stream_sends_state_events_and_commands() -> None:
     async with open_stage() as stage, Socket(stage.app, query="rate_hz=2", origin=f"http://{HOST}") as socket:
         assert (await socket.next("websocket.accept"))["subprotocol"] == "aerokit.v1"
         assert (await socket.next("hello"))["read_only"] is False
         first, second = await socket.next("state"), await socket.next("state")
         assert second["at_s"] - first["at_s"] == pytest.approx(0.5, abs=0.05)
-        await stage.give("arm")
+        await stage.submit("arm")
         assert (await socket.next("order"))["state"] == "running"
         assert (await socket.next("order"))["state"] == "done"
         stage.flight.copter.send_text(4, "hello")
-        told = await socket.next("event")
-        while told["event"] != "StatusTextReceived" or told["text"] != "hello":
-            told = await socket.next("event")
+        events = await socket.next("event")
+        while events["event"] != "StatusTextReceived" or events["text"] != "hello":
+            events = await socket.next("event")
 
 
 @pytest.mark.parametrize(
@@ -204,7 +197,7 @@ async def test_the_stream_tells_state_events_and_orders() -> None:
         ({"host": "evil.example"}, None),
     ],
 )
-async def test_sockets_that_are_not_let_in(change: dict[str, str], status: int | None) -> None:
+async def test_websocket_without_access_is_refused(change: dict[str, str], status: int | None) -> None:
     async with open_stage() as stage, Socket(stage.app, **change) as socket:  # type: ignore[arg-type]
         if status is None:
             assert (await socket.next("websocket.close"))["code"] == 1008
@@ -212,9 +205,9 @@ async def test_sockets_that_are_not_let_in(change: dict[str, str], status: int |
             assert (await socket.next("websocket.http.response.start"))["status"] == status
 
 
-async def test_there_are_only_so_many_sockets() -> None:
+async def test_websocket_count_is_limited() -> None:
     async with open_stage() as stage:
-        sockets = [Socket(stage.app) for _ in range(MOST_SOCKETS)]
+        sockets = [Socket(stage.app) for _ in range(MAX_SOCKETS)]
         for each in sockets:
             await each.__aenter__()
             await each.next("websocket.accept")
@@ -226,9 +219,9 @@ async def test_there_are_only_so_many_sockets() -> None:
             await later.next("websocket.accept")
 
 
-async def test_viewers_without_the_token_leave_places_for_the_owner() -> None:
+async def test_anonymous_websockets_leave_room_for_token_holder() -> None:
     async with open_stage(open_reading=True) as stage, AsyncExitStack() as stack:
-        for _ in range(MOST_VIEWERS):
+        for _ in range(MAX_ANONYMOUS_SOCKETS):
             viewer = await stack.enter_async_context(Socket(stage.app, token=None))
             await viewer.next("websocket.accept")
         async with Socket(stage.app, token=None) as one_more:
@@ -237,22 +230,22 @@ async def test_viewers_without_the_token_leave_places_for_the_owner() -> None:
             await owner.next("websocket.accept")
 
 
-async def test_a_slow_client_gets_the_newest_state_and_one_that_stops_is_let_go() -> None:
+async def test_slow_client_gets_newest_state_and_stalled_is_closed() -> None:
     async with open_stage() as stage, Socket(stage.app) as socket:
         before = (await socket.next("state"))["at_s"]
         socket.flows.clear()
-        for number in range(MOST_WAITING + 50):
-            stage.app._watch.publish({"type": "event", "event": "Test", "index": number})
+        for number in range(MAX_QUEUED_MESSAGES + 50):
+            stage.app._served.publish({"type": "event", "event": "Test", "index": number})
         await anyio.sleep(8)
         socket.flows.set()
         states = [await socket.next("state") for _ in range(3)]
-        assert states[1]["at_s"] - before >= 8  # what was waiting, then the newest, not 40 in between
+        assert states[1]["at_s"] - before >= 8  # the queued state, then the newest one; the 40 between are skipped
         socket.flows.clear()
         await anyio.sleep(30)
         assert socket.task.done()
 
 
-async def test_a_client_that_speaks_is_let_go() -> None:
+async def test_client_that_sends_is_disconnected() -> None:
     async with open_stage() as stage, Socket(stage.app) as socket:
         await socket.next("state")
         socket.incoming.put_nowait({"type": "websocket.receive", "text": '{"order": "arm"}'})

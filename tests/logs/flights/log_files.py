@@ -16,30 +16,28 @@ UNIX_AT_0 = 315964800 + GPS_WEEK * 7 * 86400 + GPS_MS / 1000 - 18
 
 
 def height_m(at: float) -> float:
-    """Up to 30 m in ten seconds, and down from the failsafe on."""
+    """Climb to 30 m in ten seconds, and descend after the failsafe."""
     return max(0.0, min(30.0, 3 * (at - ARMED_S), 1.5 * (DISARMED_S - at)))
 
 
 def north_m(at: float) -> float:
-    """At 4 m/s while it is up, and back."""
+    """Fly north at 4 m/s, and back."""
     return max(0.0, min(4 * (at - 10), 2 * (DISARMED_S - at)))
 
 
 def voltage_v(at: float) -> float:
-    """Half a volt in ten seconds."""
+    """Drop half a volt in ten seconds."""
     return 16.4 - 0.05 * at
 
 
 def times(hz: float) -> list[float]:
-    """From one second after the start of the clock, at this rate."""
+    """Return times at this rate, starting one second after boot."""
     return [1 + i / hz for i in range(round((END_S - 1) * hz))]
 
 
 # ------------------------------------------------------------------------------------------------ .bin
 
-_SIZES = dict(
-    zip("QBfcLeIHnNZMb", ["Q", "B", "f", "h", "i", "i", "I", "H", "4s", "16s", "64s", "B", "b"], strict=True)
-)
+_SIZES = dict(zip("QBfcLeIHnNZMb", ["Q", "B", "f", "h", "i", "i", "I", "H", "4s", "16s", "64s", "B", "b"], strict=True))
 TABLES = {
     "GPS": (0x82, "QBBIHBcLLe", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt"),
     "POS": (0x83, "QLLff", "TimeUS,Lat,Lng,Alt,RelHomeAlt"),
@@ -64,9 +62,7 @@ TABLES = {
 def write_bin(path: Path) -> None:
     """The flight as ArduPilot logs it."""
     head = b"\xa3\x95"
-    data = bytearray(
-        head + b"\x80" + _format_row(0x80, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
-    )
+    data = bytearray(head + b"\x80" + _format_row(0x80, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,TimeSeries"))
     for name, (number, form, columns) in TABLES.items():
         size = 3 + struct.calcsize("<" + "".join(_SIZES[code] for code in form))
         data += head + b"\x80" + _format_row(number, size, name, form, columns)
@@ -177,7 +173,7 @@ def _keyed(key: str, value: bytes) -> bytes:
 
 
 def _told(fields: str) -> str:
-    """As the header of the log has it."""
+    """Encode a value for the header of the log."""
     made = ""
     for field in fields.split():
         code, name = field.split(":")

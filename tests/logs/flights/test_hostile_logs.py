@@ -1,4 +1,4 @@
-"""Logs with times, texts and values that cannot be, of other vehicles, and of two batteries."""
+"""Logs with impossible times, texts and values, of other vehicles, and with two batteries."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 from aerokit.errors import FileFormatError
 from aerokit.logs.convert import convert
 from aerokit.logs.flights import failsafes, read_flight
-from aerokit.logs.flights.columns import Columns
-from aerokit.logs.flights.flight_controllers import BinFile
+from aerokit.logs.flights.flight import TimeSeries
+from aerokit.logs.flights.flight_controllers import BinReader
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
@@ -26,11 +26,11 @@ BEGIN = 1_700_000_000
 HEARTBEAT = m.Heartbeat(2, 3, 81, 0, 3, 3)
 
 
-def write_tlog(path: Path, told: Iterable[tuple[int, Message]]) -> Path:
+def write_tlog(path: Path, messages: Iterable[tuple[int, Message]]) -> Path:
     """Heartbeats of vehicle 1, then messages of these systems, one a second."""
     encoders: dict[int, FrameEncoder] = {}
     with TlogWriter(path) as writer:
-        for second, (system, message) in enumerate([(1, HEARTBEAT), *told]):
+        for second, (system, message) in enumerate([(1, HEARTBEAT), *messages]):
             encoder = encoders.setdefault(system, FrameEncoder(system, 190 if system == 255 else 1))
             writer.write(encoder.encode(message), BEGIN + second)
     return path
@@ -45,16 +45,14 @@ def item(number: int, target: int, x: float = 47.0, z: float = 10.0) -> Message:
 
 
 def item_int(number: int, target: int, command: int = 16) -> Message:
-    return m.MissionItemInt(
-        target, 1, number, 6, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 470_000_000, 80_000_000, 10.0
-    )
+    return m.MissionItemInt(target, 1, number, 6, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 470_000_000, 80_000_000, 10.0)
 
 
 @pytest.mark.parametrize(
     ("suffix", "write"), [(".bin", log_files.write_bin), (".ulg", log_files.write_ulog)], ids=["bin", "ulg"]
 )
 @pytest.mark.parametrize("target", ["out.mcap", "out"])
-def test_a_row_of_a_damaged_time_is_left_out(
+def test_row_with_damaged_time_is_skipped(
     suffix: str, write: Callable[[Path], None], target: str, tmp_path: Path
 ) -> None:
     for package in ("pyulog", "mcap", "pymavlink"):
@@ -70,9 +68,7 @@ def test_a_row_of_a_damaged_time_is_left_out(
     assert any("1 damaged rows" in note for note in done.notes)
 
 
-def test_damaged_formats_are_refused_and_nothing_is_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_formats_raise_and_print_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pymavlink")
     path, seeded = tmp_path / "log.bin", random.Random(1)
     log_files.write_bin(path)
@@ -85,7 +81,7 @@ def test_damaged_formats_are_refused_and_nothing_is_printed(
     assert capsys.readouterr().out == ""
 
 
-def test_a_second_battery_is_not_told_for_the_first(tmp_path: Path) -> None:
+def test_second_battery_is_not_taken_for_first(tmp_path: Path) -> None:
     pytest.importorskip("pymavlink")
     path = tmp_path / "log.bin"
     log_files.write_bin(path)
@@ -97,17 +93,17 @@ def test_a_second_battery_is_not_told_for_the_first(tmp_path: Path) -> None:
     data[first:first] = head + struct.pack("<QBfffB", 1_000_000, 1, 3.3, 0.1, 0.0, 9)
     path.write_bytes(data)
     assert (form, size) == ("QBfffB", 22)
-    told = [
+    messages = [
         value[0]
-        for each in BinFile(path).entries(lambda _: None)
+        for each in BinReader(path).entries(lambda _: None)
         for name, value in each.states
         if name == "batteries"
     ]
-    assert len(told) > 50
-    assert all(battery.voltage_v > 14 for battery in told)
+    assert len(messages) > 50
+    assert all(battery.voltage_v > 14 for battery in messages)
 
 
-def test_a_text_begins_no_row(tmp_path: Path) -> None:
+def test_newline_in_text_starts_no_csv_row(tmp_path: Path) -> None:
     log = write_tlog(
         tmp_path / "log.tlog",
         [(1, m.Statustext(severity=4, text="well\rnot a row")), (1, m.Statustext(4, "fine"))],
@@ -120,35 +116,35 @@ def test_a_text_begins_no_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["well\rnot", "=1\r"])
-def test_a_carriage_return_is_put_into_quotes(text: str, tmp_path: Path) -> None:
+def test_carriage_return_in_csv_is_quoted(text: str, tmp_path: Path) -> None:
     log = write_tlog(tmp_path / "log.tlog", [(1, m.Statustext(severity=4, text=text))])
     convert(log, tmp_path / "out")
     assert f'"{text}"' in (tmp_path / "out" / "STATUSTEXT.csv").read_bytes().decode()
 
 
 @pytest.mark.parametrize("suffix", [".gpx", ".kml"])
-def test_items_that_are_nowhere_are_left_out(suffix: str, tmp_path: Path) -> None:
+def test_mission_items_without_position_are_skipped(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip({".gpx": "gpxpy", ".kml": "simplekml"}[suffix])
-    told = [(1, place()), *((1, item(i, 255, x)) for i, x in enumerate((math.nan, 95.0, 47.5)))]
-    log = write_tlog(tmp_path / "log.tlog", [*told, (1, item(3, 255, z=math.inf))])
+    messages = [(1, place()), *((1, item(i, 255, x)) for i, x in enumerate((math.nan, 95.0, 47.5)))]
+    log = write_tlog(tmp_path / "log.tlog", [*messages, (1, item(3, 255, z=math.inf))])
     convert(log, tmp_path / f"out{suffix}")
     text = (tmp_path / f"out{suffix}").read_text()
     assert "47.5" in text
     assert not any(each in text for each in ("nan", "inf", "95.0"))
 
 
-def test_an_attitude_that_is_none_ends_no_conversion(tmp_path: Path) -> None:
+def test_nan_attitude_does_not_end_conversion(tmp_path: Path) -> None:
     pytest.importorskip("mcap")
-    told = [(1, place()), (1, m.Attitude(1000, math.inf, math.nan, 0.0, 0.0, 0.0, 0.0)), (1, place())]
-    assert convert(write_tlog(tmp_path / "log.tlog", told), tmp_path / "out.mcap").entries == 4
+    messages = [(1, place()), (1, m.Attitude(1000, math.inf, math.nan, 0.0, 0.0, 0.0, 0.0)), (1, place())]
+    assert convert(write_tlog(tmp_path / "log.tlog", messages), tmp_path / "out.mcap").entries == 4
 
 
-def test_positions_that_are_not_on_earth_are_none(tmp_path: Path) -> None:
-    told = [(1, place()), (1, place(2**31 - 1, -(2**31))), (1, place())]
-    assert len(read_flight(write_tlog(tmp_path / "log.tlog", told)).track) == 2
+def test_invalid_positions_are_skipped(tmp_path: Path) -> None:
+    messages = [(1, place()), (1, place(2**31 - 1, -(2**31))), (1, place())]
+    assert len(read_flight(write_tlog(tmp_path / "log.tlog", messages)).track) == 2
 
 
-def test_the_mission_is_this_vehicles_and_the_last_one(tmp_path: Path) -> None:
+def test_mission_is_latest_of_this_vehicle(tmp_path: Path) -> None:
     before = [(255, m.MissionCount(1, 1, 3)), *((255, item_int(i, 1)) for i in range(3))]
     now = [(255, m.MissionCount(1, 1, 2)), *((255, item_int(i, 1, 17)) for i in range(2))]
     other = [
@@ -160,16 +156,16 @@ def test_the_mission_is_this_vehicles_and_the_last_one(tmp_path: Path) -> None:
     assert [(each.number, each.command) for each in flight.mission] == [(0, 17), (1, 17)]
 
 
-def test_a_mode_that_another_vehicle_was_ordered_is_not_this_ones(tmp_path: Path) -> None:
+def test_mode_command_to_other_vehicle_is_ignored(tmp_path: Path) -> None:
     def by_autopilot(target: int) -> bool | None:
-        told = [(255, m.SetMode(target, 1, 6)), (1, m.Heartbeat(2, 3, 81, 6, 3, 3))]
-        return read_flight(write_tlog(tmp_path / f"{target}.tlog", told)).modes[-1].by_autopilot
+        messages = [(255, m.SetMode(target, 1, 6)), (1, m.Heartbeat(2, 3, 81, 6, 3, 3))]
+        return read_flight(write_tlog(tmp_path / f"{target}.tlog", messages)).modes[-1].by_autopilot
 
     assert (by_autopilot(1), by_autopilot(7)) == (False, None)
 
 
-def test_what_was_before_a_span_is_not_of_it() -> None:
-    columns = Columns("a")
+def test_between_excludes_values_before_span() -> None:
+    columns = TimeSeries("a")
     for time_s, value in ((0.0, 9.0), (60.0, 1.0), (61.0, 2.0)):
         columns.add(time_s, value)
     assert list(columns.between("a", 51.0, 61.0)) == [1.0, 2.0]
@@ -177,25 +173,21 @@ def test_what_was_before_a_span_is_not_of_it() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "acted"), [(1, True), (7, False)])
-def test_a_pilot_who_returns_for_a_low_battery_is_no_failsafe(
-    seconds: int, acted: bool, tmp_path: Path
-) -> None:
-    """A log of a station does not tell who moved the switch of the mode; at once it is the autopilot."""
+def test_delayed_return_with_low_battery_is_no_failsafe(seconds: int, acted: bool, tmp_path: Path) -> None:
+    """The log of a ground station has no cause of a mode change; an immediate one is attributed to the autopilot."""
     flying, returning = m.Heartbeat(2, 3, 209, 5, 4, 3), m.Heartbeat(2, 3, 209, 6, 4, 3)
     low = m.Statustext(severity=4, text="Battery 1 is low 14.20V used 900 mAh")
-    told: list[tuple[int, Message]] = [*[(1, flying)] * 5, (1, low), *[(1, flying)] * (seconds - 1)]
-    flight = read_flight(write_tlog(tmp_path / "log.tlog", [*told, *[(1, returning)] * 20]))
+    messages: list[tuple[int, Message]] = [*[(1, flying)] * 5, (1, low), *[(1, flying)] * (seconds - 1)]
+    flight = read_flight(write_tlog(tmp_path / "log.tlog", [*messages, *[(1, returning)] * 20]))
     (found,) = failsafes(flight)
     assert found.acted is acted
     assert found.reaction.startswith("mode LOITER → RTL")
-    assert found.reaction.endswith("the log does not tell by whom") is not acted
+    assert found.reaction.endswith("cause not logged") is not acted
 
 
-def test_who_lands_with_a_low_battery_and_disarms_is_no_failsafe(tmp_path: Path) -> None:
+def test_landing_with_low_battery_is_no_failsafe(tmp_path: Path) -> None:
     flying, landed = m.Heartbeat(2, 3, 209, 5, 4, 3), m.Heartbeat(2, 3, 81, 5, 3, 3)
     low = m.Statustext(severity=4, text="Battery 1 is low 14.20V used 900 mAh")
-    flight = read_flight(
-        write_tlog(tmp_path / "log.tlog", [*[(1, flying)] * 5, (1, low), *[(1, landed)] * 5])
-    )
+    flight = read_flight(write_tlog(tmp_path / "log.tlog", [*[(1, flying)] * 5, (1, low), *[(1, landed)] * 5]))
     (found,) = failsafes(flight)
-    assert (found.acted, found.reaction) == (False, "disarmed 1.0 s later; the log does not tell by whom")
+    assert (found.acted, found.reaction) == (False, "disarmed 1.0 s later; cause not logged")

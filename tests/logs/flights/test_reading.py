@@ -1,4 +1,4 @@
-"""A flight is the same flight, whoever wrote the log: each reader against what is known to be in its file."""
+"""Log readers: each is checked against the known content of its file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pytest
 from aerokit import messages as m
 from aerokit.errors import FileFormatError
 from aerokit.logs.convert.topics import log_entry
-from aerokit.logs.flights import Flight, failsafes, read_flight
-from aerokit.logs.flights.codes import readable
-from aerokit.logs.flights.flight_controllers import BinFile, UlogFile
+from aerokit.logs.flights import FlightLog, failsafes, read_flight
+from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.flight_controllers import BinReader, UlogReader
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.tlog import TlogWriter, read_tlog
-from aerokit.protocols.exchange import Progress
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.vehicle.state.equipment import Battery
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
@@ -34,7 +34,7 @@ def own_log(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_controllers_own_log_tells_what_was_flown(own_log: Path) -> None:
+def test_flight_controller_log_matches_flight(own_log: Path) -> None:
     flight = read_flight(own_log)
     is_px4 = own_log.suffix == ".ulg"
     assert flight.vehicle == ("PX4 1.16.0" if is_px4 else "ArduCopter V4.6.1")
@@ -43,9 +43,7 @@ def test_a_controllers_own_log_tells_what_was_flown(own_log: Path) -> None:
     assert (flight.home.latitude_deg, flight.home.altitude_amsl_m) == pytest.approx((wanted.LATITUDE, 500.0))
     ((armed, disarmed),) = flight.armed
     assert (armed, disarmed) == pytest.approx((wanted.ARMED_S - 1, wanted.DISARMED_S - 1), abs=0.01)
-    assert [change.name for change in flight.modes][-2:] == (
-        ["MISSION", "RTL"] if is_px4 else ["AUTO", "RTL"]
-    )
+    assert [change.name for change in flight.modes][-2:] == (["MISSION", "RTL"] if is_px4 else ["AUTO", "RTL"])
     assert flight.modes[-1].by_autopilot is True
 
     for at in (8.0, 14.0, 30.0):  # of the log, whose clock was 1 s when it began
@@ -82,24 +80,24 @@ def test_a_controllers_own_log_tells_what_was_flown(own_log: Path) -> None:
         assert flight.attitude["yaw_deg"][0] == pytest.approx(-5.0)
 
 
-def test_the_failsafe_of_such_a_log_is_explained(own_log: Path) -> None:
+def test_failsafe_in_flight_controller_log_is_explained(own_log: Path) -> None:
     (failsafe,) = failsafes(read_flight(own_log))
     assert failsafe.kind == "battery"
     assert failsafe.acted
     assert failsafe.time_s == pytest.approx(wanted.FAILSAFE_S - 1, abs=0.1)
     assert "→ RTL" in failsafe.reaction
-    told = "\n".join(failsafe.led_to)
-    assert "15.40 V" in told
-    assert "30.0 m above home" in told
-    assert ("BAT_LOW_THR = 0.5" if own_log.suffix == ".ulg" else "BATT_LOW_VOLT = 15.4") in told
+    context = "\n".join(failsafe.context)
+    assert "15.40 V" in context
+    assert "30.0 m above home" in context
+    assert ("BAT_LOW_THR = 0.5" if own_log.suffix == ".ulg" else "BATT_LOW_VOLT = 15.4") in context
 
 
 @pytest.fixture(scope="module")
-def px4() -> Flight:
+def px4() -> FlightLog:
     return read_flight(RECORDINGS / "px4-quad.tlog")
 
 
-def test_a_tlog_of_a_real_controller(px4: Flight) -> None:
+def test_tlog_of_real_vehicle_is_read(px4: FlightLog) -> None:
     decoded = [
         message
         for _, raw in read_tlog(px4.path)
@@ -113,7 +111,7 @@ def test_a_tlog_of_a_real_controller(px4: Flight) -> None:
     assert px4.notes == [] or all("damaged" not in note for note in px4.notes)
 
 
-def test_gaps_in_the_numbers_of_messages_are_lost_messages(tmp_path: Path) -> None:
+def test_sequence_gaps_count_as_lost_messages(tmp_path: Path) -> None:
     path, encoder = tmp_path / "link.tlog", FrameEncoder(1, 1)
     with TlogWriter(path) as writer:
         for i in range(400):
@@ -127,7 +125,7 @@ def test_gaps_in_the_numbers_of_messages_are_lost_messages(tmp_path: Path) -> No
     assert by_second[6] == pytest.approx(25, abs=3)
 
 
-def test_whose_flight_is_said_and_can_be_chosen(tmp_path: Path) -> None:
+def test_system_id_selects_vehicle_of_tlog(tmp_path: Path) -> None:
     path, encoders = tmp_path / "two.tlog", (FrameEncoder(1, 1), FrameEncoder(7, 1))
     station = FrameEncoder(255, 190)
     with TlogWriter(path) as writer:
@@ -145,7 +143,7 @@ def test_whose_flight_is_said_and_can_be_chosen(tmp_path: Path) -> None:
         read_flight(path, system_id=9)
 
 
-def test_damage_is_counted_and_nothing_else_lost(tmp_path: Path, px4: Flight) -> None:
+def test_damaged_messages_are_counted(tmp_path: Path, px4: FlightLog) -> None:
     data = bytearray(px4.path.read_bytes())
     at = data.index(b"\x21\0\0", len(data) // 2)
     data[at + 6] ^= 0x55
@@ -157,7 +155,7 @@ def test_damage_is_counted_and_nothing_else_lost(tmp_path: Path, px4: Flight) ->
 
 
 @pytest.mark.parametrize("suffix", [".tlog", ".bin", ".ulg", ".txt"])
-def test_what_is_no_log_is_refused(tmp_path: Path, suffix: str) -> None:
+def test_invalid_log_raises(tmp_path: Path, suffix: str) -> None:
     if suffix == ".ulg":
         pytest.importorskip("pyulog")
     path = tmp_path / f"no{suffix}"
@@ -167,15 +165,15 @@ def test_what_is_no_log_is_refused(tmp_path: Path, suffix: str) -> None:
             read_flight(path)
 
 
-def test_progress_is_told_until_the_end(own_log: Path) -> None:
-    told: list[Progress] = []
-    read_flight(own_log, on_progress=told.append)
-    done = [each.done for each in told]
+def test_progress_reaches_total(own_log: Path) -> None:
+    reports: list[TransferProgress] = []
+    read_flight(own_log, on_progress=reports.append)
+    done = [each.done for each in reports]
     assert done == sorted(done)
-    assert done[-1] == told[-1].total == own_log.stat().st_size
+    assert done[-1] == reports[-1].total == own_log.stat().st_size
 
 
-def test_a_damaged_log_is_read_or_refused_and_nothing_else(own_log: Path) -> None:
+def test_damaged_log_is_read_or_raises_file_format_error(own_log: Path) -> None:
     data, seeded = own_log.read_bytes(), random.Random(4)
     for _ in range(12):
         damaged = bytearray(data[: seeded.choice([len(data), seeded.randrange(len(data))])])
@@ -186,7 +184,7 @@ def test_a_damaged_log_is_read_or_refused_and_nothing_else(own_log: Path) -> Non
             failsafes(read_flight(own_log))
 
 
-def test_a_heartbeat_that_is_cut_short_harms_nothing(tmp_path: Path) -> None:
+def test_truncated_heartbeat_is_ignored(tmp_path: Path) -> None:
     path, encoder = tmp_path / "short.tlog", FrameEncoder(1, 1)
     with TlogWriter(path) as writer:
         for i in range(10):
@@ -195,7 +193,7 @@ def test_a_heartbeat_that_is_cut_short_harms_nothing(tmp_path: Path) -> None:
     assert read_flight(path).modes[0].name == "STABILIZE"
 
 
-def test_how_severe_a_text_was_is_not_invented_and_terminals_are_not_told_colours(own_log: Path) -> None:
+def test_bin_texts_have_no_severity_and_no_colours(own_log: Path) -> None:
     texts = read_flight(own_log).texts
     if own_log.suffix == ".bin":
         assert {text.severity for text in texts} == {None}
@@ -213,11 +211,11 @@ def test_how_severe_a_text_was_is_not_invented_and_terminals_are_not_told_colour
         ("two\nlines [32m of å text", "two\nlines [32m of å text"),
     ],
 )
-def test_what_only_a_terminal_obeys_is_no_part_of_a_text(said: str, read: str) -> None:
-    assert readable(said) == read
+def test_control_characters_are_removed_from_texts(said: str, read: str) -> None:
+    assert clean_text(said) == read
 
 
-def test_what_a_battery_does_not_know_is_no_number(tmp_path: Path) -> None:
+def test_unknown_battery_values_of_ardupilot_are_nan(tmp_path: Path) -> None:
     path = tmp_path / "flight.bin"
     wanted.write_bin(path)
     battery = read_flight(path).batteries[1]
@@ -225,9 +223,7 @@ def test_what_a_battery_does_not_know_is_no_number(tmp_path: Path) -> None:
     assert not any(battery.has(name) for name in ("current_a", "used_mah", "remaining_percent"))
 
 
-def test_what_a_battery_of_px4_does_not_know_is_no_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unknown_battery_values_of_px4_are_nan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pyulog")
     path = tmp_path / "flight.ulg"
     rows = [row for row in wanted._ulog_rows() if row[1] != "battery_status"]
@@ -236,16 +232,14 @@ def test_what_a_battery_of_px4_does_not_know_is_no_number(
     wanted.write_ulog(path)
     battery = read_flight(path).batteries[0]
     assert not any(battery.has(name) for name in battery)
-    states = [dict(entry.states) for entry in UlogFile(path).entries(lambda _: None)]
-    assert {state["batteries"] for state in states if "batteries" in state} == {
-        (Battery(0, None, None, None),)
-    }
+    states = [dict(entry.states) for entry in UlogReader(path).entries(lambda _: None)]
+    assert {state["batteries"] for state in states if "batteries" in state} == {(Battery(0, None, None, None),)}
 
 
-def test_a_converter_is_told_the_same_of_a_bin(tmp_path: Path) -> None:
+def test_bin_entries_have_same_battery_states(tmp_path: Path) -> None:
     path = tmp_path / "flight.bin"
     wanted.write_bin(path)
-    states = [dict(entry.states) for entry in BinFile(path).entries(lambda _: None)]
+    states = [dict(entry.states) for entry in BinReader(path).entries(lambda _: None)]
     said = [state["status_text"] for state in states if "status_text" in state]
     assert [(text.severity, text.text[:10]) for text in said] == [(None, "ArduCopter"), (None, "Battery 1 ")]
     assert log_entry(0.0, 1, said[0])["level"] == 0

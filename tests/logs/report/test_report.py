@@ -1,4 +1,4 @@
-"""The report is read back: what is in it, what is not, and that a hostile log says nothing but text."""
+"""Reports are parsed: their content, missing data, and escaping of hostile logs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ import pytest
 import aerokit
 from aerokit import messages as m
 from aerokit.apps.cli import main
-from aerokit.logs.flights import Columns, Flight, failsafes, read_flight
-from aerokit.logs.flights.flight import Said, Waypoint
+from aerokit.logs.flights import FlightLog, TimeSeries, failsafes, read_flight
+from aerokit.logs.flights.flight import LoggedText, Waypoint
+from aerokit.logs.report import report_html
 from aerokit.logs.report.charts import points, rows_to_draw
-from aerokit.logs.report.figures import clock, length, span
-from aerokit.logs.report.writing import report_html
+from aerokit.logs.report.statistics import clock, length, span
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.tlog import TlogWriter
 from aerokit.position import Position
@@ -35,7 +35,7 @@ HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
 class Page(HTMLParser):
-    """What a browser would see: tags with what runs in them, and texts."""
+    """Parses a page into tags, scripts, addresses and text."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(convert_charrefs=True)
@@ -72,7 +72,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A simulated flight whose battery runs low on the way, recorded by the program, and what was truly flown."""
+    """Record a simulated flight with a low battery; return the recording and the true track."""
     path = tmp_path_factory.mktemp("flown") / "flight.tlog"
     parameters = {"BATT_FS_LOW_ACT": 2, "FENCE_ENABLE": 1, "FENCE_TYPE": 2, "FENCE_RADIUS": 150}
 
@@ -99,7 +99,7 @@ def page(flown: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Pag
     return Page(target)
 
 
-def test_the_flight_is_what_was_flown(flown: dict[str, Any]) -> None:
+def test_recorded_flight_matches_simulation(flown: dict[str, Any]) -> None:
     flight, track = read_flight(flown["path"]), flown["track"]
     assert [change.name for change in flight.modes] == track.modes
     ((begin, end),) = flight.armed
@@ -108,15 +108,15 @@ def test_the_flight_is_what_was_flown(flown: dict[str, Any]) -> None:
     (failsafe,) = failsafes(flight)
     assert (failsafe.kind, failsafe.acted) == ("battery", True)
     assert failsafe.reaction.startswith("mode GUIDED → RTL")
-    said = next(text for text in flown["journal"].texts if "is low" in text.text)
-    assert any(said.text in sign.text for sign in failsafe.signs)
-    assert any("67 m from home" in fact for fact in failsafe.led_to)
-    assert any("BATT_FS_LOW_ACT = 2" in fact for fact in failsafe.led_to)
+    status_text = next(text for text in flown["journal"].texts if "is low" in text.text)
+    assert any(status_text.text in evidence.text for evidence in failsafe.evidence)
+    assert any("67 m from home" in fact for fact in failsafe.context)
+    assert any("BATT_FS_LOW_ACT = 2" in fact for fact in failsafe.context)
 
 
-def test_the_page_says_it_in_words_and_draws_it(page: Page, flown: dict[str, Any]) -> None:
+def test_report_has_summary_and_charts(page: Page, flown: dict[str, Any]) -> None:
     track = flown["track"]
-    assert f"highest {track.max_altitude_m:.1f} m above home" in page.text
+    assert f"max height {track.max_altitude_m:.1f} m above home" in page.text
     assert "1 failsafe: Battery at" in page.text
     assert "GUIDED → RTL" in page.text
     traces = {trace["name"]: trace for trace in page.charts["map"]["traces"]}
@@ -131,7 +131,7 @@ def test_the_page_says_it_in_words_and_draws_it(page: Page, flown: dict[str, Any
     assert drawn == page.charts.keys()
 
 
-def test_nothing_is_loaded_and_only_our_two_scripts_may_run(page: Page) -> None:
+def test_report_loads_nothing_and_allows_two_scripts(page: Page) -> None:
     assert all(address.startswith("#") for address in page.addresses)
     assert not {"link", "iframe", "object", "embed", "img", "base", "form"} & set(page.tags)
     assert not page.handlers
@@ -161,7 +161,7 @@ def hostile_log(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_a_hostile_log_says_is_text(hostile_log: Path, tmp_path: Path) -> None:
+def test_hostile_log_text_is_escaped(hostile_log: Path, tmp_path: Path) -> None:
     target = tmp_path / "out.html"
     for arguments in ([str(hostile_log)], [str(hostile_log), str(hostile_log)]):
         assert main(["report", *arguments, "-o", str(target), "--force"]) == 0
@@ -175,35 +175,33 @@ def test_what_a_hostile_log_says_is_text(hostile_log: Path, tmp_path: Path) -> N
         assert "</" not in target.read_text().split('id="charts">')[1].split("</script>")[0]
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
+def test_missing_data_is_stated(tmp_path: Path) -> None:
     path, encoder, target = tmp_path / "bare.tlog", FrameEncoder(1, 1), tmp_path / "bare.html"
     with TlogWriter(path) as writer:
         for i in range(5):
             writer.write(encoder.encode(m.Heartbeat(2, 3, 81, 0, 3, 3)), 1_700_000_000 + i)
     assert main(["report", str(path), "-o", str(target)]) == 0
     page = Page(target)
-    assert "It was never armed" in page.text
+    assert "Never armed" in page.text
     for missing in (
         *(
-            "The log has no positions.",
-            "The log has nothing of a battery.",
-            "The log has no levels of vibration.",
+            "The log contains no positions.",
+            "The log contains no battery data.",
+            "The log contains no vibration levels.",
         ),
-        *("The log has no attitude.", "The log has no parameters.", "the log has no texts."),
-        *("The log has nothing of the estimator.", "The log has nothing of a satellite receiver."),
+        *("The log contains no attitude.", "The log contains no parameters.", "The log contains no texts."),
+        *("The log contains no estimator data.", "The log contains no GNSS data."),
     ):
         assert missing in page.text
     assert page.charts.keys() == {"lost", "received"}
 
 
-def test_two_flights_are_compared(
-    flown: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_flights_are_compared(flown: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target, other = tmp_path / "both.html", RECORDINGS / "px4-quad.tlog"
     assert main(["report", str(flown["path"]), str(other), "-o", str(target), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["type"] == "report"
-    highest = [figures["highest_m"] for figures in told["figures"]]
+    result = json.loads(capsys.readouterr().out)
+    assert result["type"] == "report"
+    highest = [statistics["max_height_m"] for statistics in result["statistics"]]
     page = Page(target)
     assert f"{highest[0]:.1f}\n{highest[1]:.1f}\n{highest[1] - highest[0]:+.1f}" in page.text
     assert [trace["name"] for trace in page.charts["both-height"]["traces"]] == ["A", "B"]
@@ -211,13 +209,11 @@ def test_two_flights_are_compared(
     least, greatest = page.charts["maps"]["layout"]["xaxis"]["autorangeoptions"]["include"]
     assert (least < min(east), greatest > max(east)) == (True, True)
     assert "COM_LOW_BAT_ACT" in page.text
-    assert "not there" in page.text
+    assert "missing" in page.text
     assert "Failsafes of A" in page.text
 
 
-def test_a_file_is_not_replaced_unasked(
-    flown: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_existing_report_needs_force(flown: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = Path(shutil.copy(flown["path"], tmp_path))
     target = log.with_suffix(".html")
     target.write_text("mine")
@@ -231,7 +227,7 @@ def test_a_file_is_not_replaced_unasked(
     assert sorted(each.name for each in tmp_path.iterdir()) == ["flight.html", "flight.tlog"]
 
 
-def test_it_is_opened_only_if_asked(
+def test_report_opens_browser_with_option_only(
     flown: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []
@@ -243,18 +239,12 @@ def test_it_is_opened_only_if_asked(
     assert opened == [target.as_uri()]
 
 
-def test_peaks_and_gaps_stay_in_what_is_drawn() -> None:
-    columns = Columns("value")
+def test_downsampling_keeps_peaks_and_gaps() -> None:
+    columns = TimeSeries("value")
     for i in range(100_000):
         columns.add(
             i / 10,
-            1000.0
-            if i == 54_321
-            else -7.0
-            if i == 77_777
-            else float("nan")
-            if 30_000 < i < 40_000
-            else i % 3,
+            1000.0 if i == 54_321 else -7.0 if i == 77_777 else float("nan") if 30_000 < i < 40_000 else i % 3,
         )
     times, values = points(columns, "value")
     assert len(times) <= 2100
@@ -266,7 +256,7 @@ def test_peaks_and_gaps_stay_in_what_is_drawn() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "expected"),
+    ("result", "expected"),
     [
         (clock(187.46), "3:07.5"),
         (clock(59.96), "1:00.0"),
@@ -277,8 +267,8 @@ def test_peaks_and_gaps_stay_in_what_is_drawn() -> None:
         (length(3440), "3.4 km"),
     ],
 )
-def test_numbers_as_people_read_them(told: str, expected: str) -> None:
-    assert told == expected
+def test_numbers_are_formatted_for_reading(result: str, expected: str) -> None:
+    assert result == expected
 
 
 @pytest.fixture
@@ -289,7 +279,7 @@ def chromium() -> str:
     return found
 
 
-def test_a_browser_without_network_draws_all_charts(page: Page, chromium: str, tmp_path: Path) -> None:
+def test_offline_browser_draws_all_charts(page: Page, chromium: str, tmp_path: Path) -> None:
     target = tmp_path / "page.html"
     target.write_text(page.html, encoding="utf-8")
     dumped = subprocess.run(
@@ -308,34 +298,32 @@ def test_a_browser_without_network_draws_all_charts(page: Page, chromium: str, t
     assert dumped.count('class="chart js-plotly-plot"') == len(page.charts)
 
 
-def test_what_is_no_log_by_its_name_is_said_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_log_suffix_raises_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "px4.html"
     page.write_text("mine")
     for more in ([], ["--force"]):
         assert main(["report", str(page), *more]) == 6
-        assert "px4.html is no flight log by its name: .tlog, .bin, .ulg" in capsys.readouterr().err
+        assert "px4.html is not a flight log; supported suffixes: .tlog, .bin, .ulg" in capsys.readouterr().err
     assert page.read_text() == "mine"
 
 
-def test_of_a_flight_that_was_none_nothing_is_called_flown(tmp_path: Path) -> None:
-    flight = Flight(
-        tmp_path / "ground.bin", ends_at=4.0, autopilot="ArduPilot", home=Position(47.0, 8.0, 500.0)
-    )
-    flight.note_mode(0.0, "STABILIZE")
+def test_summary_of_unarmed_log_mentions_no_flight(tmp_path: Path) -> None:
+    flight = FlightLog(tmp_path / "ground.bin", ends_at=4.0, autopilot="ArduPilot", home=Position(47.0, 8.0, 500.0))
+    flight.add_mode(0.0, "STABILIZE")
     flight.mission = [Waypoint(0, 16, 47.0, 8.0, 500.0, 0)]
     flight.receiver(0).add(0.0, 3, 10, 0.8, 1.0)
     flight.receiver(0).add(1.0, 6, 10, 0.8, 1.0)
     flight.receiver(0).add(2.0, 42, 10, 0.8, 1.0)
-    flight.texts = [Said(1.0, None, "hello"), Said(2.0, 3, "bad")]
+    flight.texts = [LoggedText(1.0, None, "hello"), LoggedText(2.0, 3, "bad")]
     for east in range(3):
         flight.track.add(float(east), 47.0, 8.0 + east * 1e-4, 500.0, 0.0)
     target = tmp_path / "ground.html"
     target.write_text(report_html(flight), encoding="utf-8")
     page = Page(target)
-    assert "It was never armed: 4 s on the ground." in page.text
+    assert "Never armed: 4 s on the ground." in page.text
     assert "\nIn STABILIZE (4 s)." in page.text
     assert "Flown in" not in page.text
-    assert "No mission: home only" in page.text
+    assert "No mission: the only item is home" in page.text
     assert "0:01.0\n—\nhello" in page.text
     assert "0:02.0\nerror\nbad" in page.text
     axis = page.charts["gps-fix_type"]["layout"]["yaxis"]
@@ -345,11 +333,11 @@ def test_of_a_flight_that_was_none_nothing_is_called_flown(tmp_path: Path) -> No
     assert 16.1 < greatest < 17  # 15.2 m of track, and 1 m
 
 
-def test_whose_lost_messages_they_are_is_said(tmp_path: Path, page: Page) -> None:
-    flight = Flight(tmp_path / "px4.ulg", ends_at=4.0, autopilot="PX4")
+def test_link_section_explains_lost_messages(tmp_path: Path, page: Page) -> None:
+    flight = FlightLog(tmp_path / "px4.ulg", ends_at=4.0, autopilot="PX4")
     flight.link.add(0.0, 1.0, float("nan"))
     target = tmp_path / "px4.html"
     target.write_text(report_html(flight), encoding="utf-8")
-    said = "What the autopilot counted of the messages that it did not get"
-    assert said in Page(target).text
-    assert said not in page.text
+    explanation = "Messages that the autopilot did not receive, by its own count"
+    assert explanation in Page(target).text
+    assert explanation not in page.text

@@ -1,4 +1,4 @@
-"""Pictures: one order takes one, none is missed, and a series ends with its block."""
+"""Photos: one order takes one picture, captures are not missed, and a series ends with its block."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ START, STOP = int(MavCmd.IMAGE_START_CAPTURE), int(MavCmd.IMAGE_STOP_CAPTURE)
 STATUS = int(m.CameraCaptureStatus.ID)
 
 
-async def test_a_picture_is_told_with_time_place_and_attitude() -> None:
+async def test_take_photo_returns_time_position_and_attitude() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         with vehicle.subscribe(ImageCaptured, capacity=10) as events:
@@ -50,7 +50,7 @@ async def test_a_picture_is_told_with_time_place_and_attitude() -> None:
         assert camera.image_count == 2
 
 
-async def test_cameras_are_found_by_what_they_say() -> None:
+async def test_cameras_are_discovered_by_their_messages() -> None:
     async with on_board(SimulatedCamera(101), SimulatedCamera(model="Second")) as vehicle:
         assert vehicle.cameras.value == (100, 101)
         assert vehicle.camera.number in (100, 101)
@@ -70,7 +70,7 @@ async def test_cameras_are_found_by_what_they_say() -> None:
                 vehicle.camera_at(wrong)
 
 
-async def test_a_call_waits_for_the_camera_to_be_heard() -> None:
+async def test_call_waits_for_camera_discovery() -> None:
     camera = SimulatedCamera()
     camera.faults.silent = True
     async with on_board(camera, settle_s=0.2) as vehicle:
@@ -80,58 +80,58 @@ async def test_a_call_waits_for_the_camera_to_be_heard() -> None:
         assert (await vehicle.camera.take_photo()).camera == 100
 
 
-async def test_what_it_cannot_do_is_refused_before_anything_is_sent() -> None:
+async def test_unsupported_calls_are_refused_before_sending() -> None:
     camera = SimulatedCamera(capabilities=CameraCapFlags.CAPTURE_VIDEO)
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
-        heard = commands_to(camera)
-        with pytest.raises(NotSupported, match="has no CAPTURE_IMAGE; nothing was sent"):
+        commands = commands_to(camera)
+        with pytest.raises(NotSupported, match="does not have CAPTURE_IMAGE; nothing was sent"):
             await vehicle.camera.take_photo()
         with pytest.raises(NotSupported, match="photo_interval: camera 100"):
             async with vehicle.camera.photo_interval(1.0):
                 pass
-        assert heard == []
+        assert commands == []
         for seconds, count in ((0.0, 1), (3601.0, 1), (1.0, -1), (1.0, 32768)):
             with pytest.raises(InvalidArgument):
                 vehicle.camera.photo_interval(seconds, count)
 
 
 @pytest.mark.parametrize("lost", [1, 2])
-async def test_an_order_that_was_lost_is_given_again_on_evidence(lost: int) -> None:
+async def test_lost_photo_order_is_resent_on_evidence(lost: int) -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
-        heard = commands_to(camera, START)
+        commands = commands_to(camera, START)
         camera.faults.ignore(START, times=lost)
         capture = await vehicle.camera.take_photo()
         assert (capture.index, camera.image_count) == (0, 1)
-        assert len(heard) == lost + 1
-        assert len({each[4] for each in heard}) == 1, "the number of the order stays"
+        assert len(commands) == lost + 1
+        assert len({each[4] for each in commands}) == 1, "the number of the order stays"
 
 
-async def test_nothing_is_given_again_when_only_the_answer_was_lost() -> None:
+async def test_photo_order_with_lost_ack_is_not_resent() -> None:
     camera = SimulatedCamera(shutter_s=3.0)
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
-        heard = commands_to(camera, START)
+        commands = commands_to(camera, START)
         camera.faults.lose_ack(START)
         assert (await vehicle.camera.take_photo()).index == 0
-        assert len(heard) == camera.image_count == 1
+        assert len(commands) == camera.image_count == 1
 
 
-async def test_without_evidence_nothing_is_given_again() -> None:
+async def test_photo_order_without_evidence_is_not_resent() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
-        heard = commands_to(camera, START)
+        commands = commands_to(camera, START)
         camera.faults.ignore(START, times=10)
         camera.faults.ignore(int(MavCmd.REQUEST_MESSAGE), times=1000)
         with pytest.raises(CommandTimeout, match="IMAGE_START_CAPTURE"):
             await vehicle.camera.take_photo(timeout=8.0)
-        assert len(heard) == 1
+        assert len(commands) == 1
 
 
-async def test_a_picture_of_which_the_message_was_lost_is_asked_for() -> None:
+async def test_lost_capture_message_is_requested() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.take_photo()
@@ -141,7 +141,7 @@ async def test_a_picture_of_which_the_message_was_lost_is_asked_for() -> None:
         assert camera.image_count == 2
 
 
-async def test_a_picture_that_cannot_be_taken_is_an_error() -> None:
+async def test_failed_photo_raises_operation_rejected() -> None:
     camera = SimulatedCamera(capacity_mib=12.0)
     async with on_board(camera) as vehicle:
         for _ in range(2):
@@ -159,7 +159,7 @@ async def test_a_picture_that_cannot_be_taken_is_an_error() -> None:
             await vehicle.camera.take_photo()
 
 
-async def test_two_calls_at_once_take_two_pictures() -> None:
+async def test_concurrent_take_photo_takes_two_pictures() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         found = []
@@ -174,23 +174,23 @@ async def test_two_calls_at_once_take_two_pictures() -> None:
         assert camera.image_count == 2
 
 
-# ------------------------------------------------------------------------------------------ one after the other
+# ------------------------------------------------------------------------------------------ series
 
 
-async def test_a_series_gives_pictures_in_order_and_ends() -> None:
+async def test_series_yields_captures_in_order_and_ends() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
-        heard = commands_to(camera, START, STOP)
+        commands = commands_to(camera, START, STOP)
         async with vehicle.camera.photo_interval(1.0, count=4) as captures:
             found = [each.index async for each in captures]
         assert found == [0, 1, 2, 3]
         assert captures.missed == 0
-        assert heard == [(START, 0.0, 1.0, 4.0, 0.0)]
+        assert commands == [(START, 0.0, 1.0, 4.0, 0.0)]
         assert [each.index for each in vehicle.camera.captures()] == found
 
 
-async def test_holes_are_filled() -> None:
+async def test_series_requests_missing_captures() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
@@ -204,7 +204,7 @@ async def test_holes_are_filled() -> None:
         assert captures.missed == 0
 
 
-async def test_the_end_of_the_block_ends_the_series() -> None:
+async def test_series_block_end_stops_the_series() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         async with vehicle.camera.photo_interval(0.5) as captures:
@@ -217,7 +217,7 @@ async def test_the_end_of_the_block_ends_the_series() -> None:
         assert not camera.captures.is_busy
 
 
-async def test_it_ends_under_cancellation_also_when_the_first_order_to_end_is_lost() -> None:
+async def test_series_cancelled_with_lost_stop_still_ends() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
@@ -229,7 +229,7 @@ async def test_it_ends_under_cancellation_also_when_the_first_order_to_end_is_lo
 
         task = asyncio.create_task(survey())
         await anyio.sleep(2.0)
-        heard = commands_to(camera, STOP)
+        commands = commands_to(camera, STOP)
         camera.faults.ignore(STOP, times=1)
         task.cancel()
         began = vehicle.connection.now()
@@ -237,31 +237,31 @@ async def test_it_ends_under_cancellation_also_when_the_first_order_to_end_is_lo
             await task
         assert vehicle.connection.now() - began < 0.1
         await anyio.sleep(4.0)
-        assert len(heard) == 2
+        assert len(commands) == 2
         assert not camera.captures.is_busy
 
 
-async def test_a_series_that_the_camera_ends_is_an_error() -> None:
+async def test_series_ended_by_camera_is_rejected() -> None:
     camera = SimulatedCamera(capacity_mib=12.0)
     async with on_board(camera) as vehicle:
         found = []
-        with pytest.raises(OperationRejected, match="has ended the series after 3 pictures"):
+        with pytest.raises(OperationRejected, match="ended the series after 3 pictures"):
             async with vehicle.camera.photo_interval(0.5, count=6) as captures:
                 async for each in captures:
                     found.append(each.success)
         assert found == [True, True, False]
 
 
-async def test_a_camera_that_falls_silent_ends_the_wait() -> None:
+async def test_silent_camera_ends_the_series_wait() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
-        with pytest.raises(OperationTimeout, match="takes pictures, and tells of none any more"):
+        with pytest.raises(OperationTimeout, match="takes pictures, but reports no more of them"):
             async with vehicle.camera.photo_interval(0.5) as captures:
                 async for each in captures:
                     camera.faults.silent = each.index == 2
 
 
-async def test_an_order_of_a_series_that_was_lost_is_given_again() -> None:
+async def test_lost_series_order_is_resent() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         await vehicle.camera.wait_found()
@@ -269,13 +269,13 @@ async def test_an_order_of_a_series_that_was_lost_is_given_again() -> None:
         async with vehicle.camera.photo_interval(1.0, count=2) as captures:
             assert [each.index async for each in captures] == [0, 1]
         camera.faults.lose_ack(START)
-        heard = commands_to(camera, START)
+        commands = commands_to(camera, START)
         async with vehicle.camera.photo_interval(2.0, count=2) as captures:
             assert [each.index async for each in captures] == [2, 3]
-        assert len(heard) == 1
+        assert len(commands) == 1
 
 
-async def test_pictures_of_before_are_loaded() -> None:
+async def test_load_captures_requests_earlier_pictures() -> None:
     camera = SimulatedCamera()
     async with on_board(camera, settle_s=0.5) as vehicle:
         for _ in range(3):
@@ -286,10 +286,10 @@ async def test_pictures_of_before_are_loaded() -> None:
         assert [each.index for each in await vehicle.camera.load_captures()] == [0, 1, 2]
 
 
-# --------------------------------------------------------------------------------------- behind the autopilot
+# ---------------------------------------------------------------------- cameras attached to the autopilot
 
 
-async def test_ardupilots_own_camera_tells_by_camera_feedback() -> None:
+async def test_ardupilot_camera_reports_by_camera_feedback() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.parameters["CAM1_TYPE"] = 1.0
     async with on_board(vehicle=copter) as vehicle:
@@ -311,7 +311,7 @@ async def test_ardupilots_own_camera_tells_by_camera_feedback() -> None:
         assert copter.camera.image_count == taken
 
 
-async def test_what_ardupilot_does_not_remember_is_counted() -> None:
+async def test_ardupilot_missed_captures_are_counted() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.parameters["CAM1_TYPE"] = 1.0
     async with on_board(vehicle=copter) as vehicle:
@@ -325,30 +325,30 @@ async def test_what_ardupilot_does_not_remember_is_counted() -> None:
         assert found == sorted(found)
 
 
-async def test_px4s_trigger_takes_pictures_too() -> None:
+async def test_px4_trigger_takes_photos() -> None:
     simulated = px4()
     assert isinstance(simulated, SimulatedPx4)
     simulated.parameters["TRIG_MODE"] = 1.0
     async with on_board(vehicle=simulated) as vehicle:
-        heard = commands_to(simulated, START, int(MavCmd.DO_DIGICAM_CONTROL))
+        commands = commands_to(simulated, START, int(MavCmd.DO_DIGICAM_CONTROL))
         capture = await vehicle.camera.take_photo()
         assert (capture.camera, capture.index, capture.success) == (1, 0, True)
         assert capture.place is not None
-        assert [each[0] for each in heard] == [MavCmd.DO_DIGICAM_CONTROL]
+        assert [each[0] for each in commands] == [MavCmd.DO_DIGICAM_CONTROL]
         async with vehicle.camera.photo_interval(1.0, count=3) as captures:
             found = [each.index async for each in captures]
         assert found == [capture.index + 1, capture.index + 2, capture.index + 3]
-        with pytest.raises(NotSupported, match="is a trigger, which takes pictures; nothing was sent"):
+        with pytest.raises(NotSupported, match="is a trigger output, which only takes pictures; nothing was sent"):
             await vehicle.camera.zoom_to(10)
-        with pytest.raises(OperationTimeout, match="says nothing of itself"):
+        with pytest.raises(OperationTimeout, match="did not identify itself within"):
             await vehicle.camera.wait_found(timeout=4.0)
         assert not simulated.camera_trigger.is_running
 
 
-async def test_a_trigger_alone_tells_the_vehicles_own_place() -> None:
+async def test_camera_trigger_uses_the_vehicle_position() -> None:
     simulated = px4()
     simulated.parameters["TRIG_MODE"] = 1.0
-    simulated.camera_trigger.tells_places = False
+    simulated.camera_trigger.sends_image_captured = False
     async with on_board(vehicle=simulated, settle_s=6.0) as vehicle:
         capture = await vehicle.camera.take_photo()
         assert (capture.index, capture.success, capture.taken_at) == (0, None, None)
@@ -357,7 +357,7 @@ async def test_a_trigger_alone_tells_the_vehicles_own_place() -> None:
         assert capture.yaw_deg == pytest.approx(vehicle.attitude.value.yaw_deg % 360, abs=1)
 
 
-async def test_a_vehicle_without_a_camera_refuses() -> None:
+async def test_vehicle_without_camera_rejects_take_photo() -> None:
     async with on_board() as vehicle:
         with pytest.raises(CommandRejected):
             await vehicle.camera.take_photo()
@@ -366,24 +366,24 @@ async def test_a_vehicle_without_a_camera_refuses() -> None:
             await vehicle.camera.take_photo(timeout=3.0)
 
 
-# ------------------------------------------------------------------------------------------ events without asking
+# ------------------------------------------------------------------------------------------ events
 
 
-async def test_pictures_are_told_of_though_nobody_has_asked_for_a_camera() -> None:
+async def test_captures_are_published_without_using_a_camera() -> None:
     camera, other = SimulatedCamera(), SimulatedCamera(101)
     async with on_board(camera, other) as vehicle:
         with vehicle.subscribe(ImageCaptured, capacity=20) as events:
             for each in (camera, other, camera):
                 each.captures.take()
                 await anyio.sleep(1.0)
-            told = []
+            reported = []
             while (event := events.get_nowait()) is not None:
-                told.append((event.camera, event.index, event.component_id))
-        assert told == [(100, 0, 100), (101, 0, 101), (100, 1, 100)]
+                reported.append((event.camera, event.index, event.component_id))
+        assert reported == [(100, 0, 100), (101, 0, 101), (100, 1, 100)]
         assert [each.index for each in vehicle.camera_at(101).captures()] == [0]
 
 
-async def test_pictures_of_the_autopilots_camera_too_and_none_is_told_twice() -> None:
+async def test_autopilot_camera_captures_are_published_once() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.parameters["CAM1_TYPE"] = 1.0
     async with on_board(vehicle=copter) as vehicle:
@@ -395,13 +395,13 @@ async def test_pictures_of_the_autopilots_camera_too_and_none_is_told_twice() ->
             assert vehicle.camera.number == 1
             copter.camera.take()
             await anyio.sleep(1.0)
-            told = []
+            reported = []
             while (event := events.get_nowait()) is not None:
-                told.append((event.camera, event.index))
-        assert told == [(1, 0), (1, 1), (1, 2), (1, 3)]
+                reported.append((event.camera, event.index))
+        assert reported == [(1, 0), (1, 1), (1, 2), (1, 3)]
 
 
-async def test_a_camera_that_was_named_before_it_was_heard_tells_once() -> None:
+async def test_camera_named_before_discovery_publishes_once() -> None:
     camera = SimulatedCamera()
     camera.faults.silent = True
     async with on_board(camera, settle_s=0.2) as vehicle:
@@ -421,7 +421,7 @@ async def test_a_camera_that_was_named_before_it_was_heard_tells_once() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-async def test_on_a_bad_radio_no_picture_is_taken_twice_and_none_is_missed(seed: int) -> None:
+async def test_bad_radio_neither_repeats_nor_misses_photos(seed: int) -> None:
     camera = SimulatedCamera()
     copter = SimulatedCopter(boot_time_s=0.0, components=[camera], seed=seed)
     async with on_board(vehicle=copter) as vehicle:

@@ -1,4 +1,4 @@
-"""Places in a list and in JPEG files, as other programs read them."""
+"""Positions in CSV and JPEG files, as other programs read them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def degrees(parts: tuple[float, float, float]) -> float:
     return float(parts[0]) + float(parts[1]) / 60 + float(parts[2]) / 3600
 
 
-def test_a_picture_knows_where_it_was_taken() -> None:
+def test_geotag_writes_position_time_and_direction() -> None:
     tagged = geotagged(GREY_JPEG, CAPTURE)
     with Image.open(io.BytesIO(tagged)) as image:
         exif = image.getexif()
@@ -53,14 +53,14 @@ def test_a_picture_knows_where_it_was_taken() -> None:
     assert float(more[0x9405]) == -90.0
 
 
-def test_the_picture_itself_stays() -> None:
+def test_geotag_keeps_image_data() -> None:
     tagged = geotagged(GREY_JPEG, CAPTURE)
     assert tagged.endswith(GREY_JPEG[GREY_JPEG.index(b"\xff\xdb") :])
     with Image.open(io.BytesIO(GREY_JPEG)) as before, Image.open(io.BytesIO(tagged)) as after:
         assert before.tobytes() == after.tobytes()
 
 
-def test_what_else_is_in_there_stays_and_a_place_is_replaced() -> None:
+def test_geotag_keeps_other_tags_and_replaces_position() -> None:
     text = io.BytesIO()
     exif = Image.Exif()
     exif[0x010F] = "Maker"
@@ -81,7 +81,7 @@ def test_what_else_is_in_there_stays_and_a_place_is_replaced() -> None:
     assert second.count(b"Exif\0\0") == 1
 
 
-def test_what_is_not_known_is_left_out() -> None:
+def test_geotag_omits_unknown_values() -> None:
     bare = CAPTURE.replace(
         place=Position(0.5, -1.0), taken_at=None, roll_deg=None, pitch_deg=None, yaw_deg=None, quaternion=None
     )
@@ -90,31 +90,29 @@ def test_what_is_not_known_is_left_out() -> None:
         assert set(exif.get_ifd(0x8825)) == {0, 1, 2, 3, 4, 18}
         assert exif.get_ifd(0x8825)[3] == "W"
         assert 0x9003 not in exif.get_ifd(0x8769)
-    with pytest.raises(InvalidArgument, match="capture 7 of camera 100 has no place"):
+    with pytest.raises(InvalidArgument, match="capture 7 of camera 100 has no position"):
         geotagged(GREY_JPEG, CAPTURE.replace(place=None))
 
 
-@pytest.mark.parametrize(
-    "wrong", [b"", b"\xff\xd8", b"PNG" * 20, GREY_JPEG[:30], b"\xff\xd8\xff\xe1\0\1" + bytes(9)]
-)
-def test_what_is_no_jpeg_is_told(wrong: bytes) -> None:
-    with pytest.raises(FileFormatError, match=r"no JPEG|no whole JPEG"):
+@pytest.mark.parametrize("wrong", [b"", b"\xff\xd8", b"PNG" * 20, GREY_JPEG[:30], b"\xff\xd8\xff\xe1\0\1" + bytes(9)])
+def test_geotag_non_jpeg_is_file_format_error(wrong: bytes) -> None:
+    with pytest.raises(FileFormatError, match=r"not a JPEG|incomplete JPEG"):
         geotagged(wrong, CAPTURE)
 
 
 @pytest.mark.parametrize("begin", [b"II*\0", b"XX*\0", b""])
-def test_exif_that_cannot_be_read_is_not_thrown_away(begin: bytes) -> None:
+def test_geotag_unreadable_exif_is_an_error(begin: bytes) -> None:
     body = b"Exif\0\0" + begin + b"\xff" * 40
     wrong = GREY_JPEG[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + GREY_JPEG[2:]
     with (
         warnings.catch_warnings(),
-        pytest.raises(FileFormatError, match="EXIF of this picture cannot be read"),
+        pytest.raises(FileFormatError, match="cannot read the EXIF of this picture"),
     ):
         warnings.simplefilter("ignore")
         geotagged(wrong, CAPTURE)
 
 
-def test_files_are_written_whole(tmp_path: Path) -> None:
+def test_geotag_file_is_written_atomically(tmp_path: Path) -> None:
     picture, copy = tmp_path / "a.jpg", tmp_path / "b.jpg"
     picture.write_bytes(GREY_JPEG)
     geotag_file(picture, CAPTURE, to=copy)
@@ -126,7 +124,7 @@ def test_files_are_written_whole(tmp_path: Path) -> None:
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.jpg", "b.jpg"]
 
 
-def test_a_list_of_pictures(tmp_path: Path) -> None:
+def test_captures_csv_lists_captures(tmp_path: Path) -> None:
     lost = CAPTURE.replace(
         index=8,
         success=None,
@@ -150,7 +148,7 @@ def test_a_list_of_pictures(tmp_path: Path) -> None:
     assert {name for name, value in second.items() if value} == {"camera", "index"}
 
 
-def test_without_pillow_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_geotag_without_pillow_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(_: str) -> None:
         raise ImportError
 

@@ -1,4 +1,4 @@
-"""Who steers: every rule by which an order, or one sending of it, ends; without a vehicle, a loop or a clock."""
+"""CommandArbiter: every rule by which an order, or one of its commands, ends; without a vehicle, a loop or a clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavCmd, MavState
 from aerokit.mavlink.messages import Heartbeat
-from aerokit.vehicle.commanding.arbiter import KNOWN_S, MODE_GRACE_S, CommandArbiter
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, CommandArbiter
 from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, QUESTIONS, Order, SentCommand
 from aerokit.vehicle.state.telemetry import Telemetry
 
@@ -42,9 +42,7 @@ class Stage:
         if mode is not None and armed is not None:
             self.tell(mode, armed)
 
-    def tell(
-        self, mode: Mode, armed: bool = True, *, after: float = 1.0, state: int = MavState.ACTIVE
-    ) -> None:
+    def tell(self, mode: Mode, armed: bool = True, *, after: float = 1.0, state: int = MavState.ACTIVE) -> None:
         self.now += after
         self.mode.set(mode, HEARTBEAT)
         self.state.set(state, HEARTBEAT)
@@ -54,35 +52,35 @@ class Stage:
 # -------------------------------------------------------------------------------- the newest
 
 
-def test_a_newer_order_ends_the_one_before_and_is_announced_first() -> None:
+def test_newer_order_supersedes_and_notifies_first() -> None:
     stage, ends = Stage(), list[str]()
     first = stage.arbiter.order(GUIDED)
     stage.arbiter.on_steering(lambda: ends.append(first.end))
     second = stage.arbiter.order(RTL)
     assert ends == [""]  # called before
     assert first.end == "another order was given"
-    assert (first.taken_by, second.end) == ("", "")
+    assert (first.takeover_reason, second.end) == ("", "")
     assert stage.arbiter.newest is second
 
 
-def test_what_does_not_steer_ends_with_the_order_that_steers_and_ends_none() -> None:
+def test_auxiliary_order_ends_with_steering_order() -> None:
     stage = Stage()
     steering = stage.arbiter.order(GUIDED)
-    with stage.arbiter.aside() as aside:
+    with stage.arbiter.auxiliary_order() as aside:
         assert (steering.end, aside.end) == ("", "")
         assert aside.modes == steering.modes
         stage.arbiter.order(RTL)
         assert aside.end == "another order was given"
 
 
-def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
+def test_auxiliary_order_ignores_reports_after_block() -> None:
     stage = Stage()
-    with stage.arbiter.aside() as aside:
+    with stage.arbiter.auxiliary_order() as aside:
         assert aside.modes == ()
         stage.tell(LOITER)
     stage.tell(RTL)
     assert aside.end == ""
-    with pytest.raises(KeyError), stage.arbiter.aside() as aside:
+    with pytest.raises(KeyError), stage.arbiter.auxiliary_order() as aside:
         raise KeyError
     stage.tell(BRAKE)
     assert aside.end == ""
@@ -92,7 +90,7 @@ def test_what_does_not_steer_hears_nothing_after_its_block() -> None:
 
 
 @pytest.mark.parametrize("told", [[LOITER], [GUIDED], [LOITER, LOITER, GUIDED, GUIDED]])
-def test_the_mode_before_and_the_orders_own_are_nobody_elses(told: list[Mode]) -> None:
+def test_mode_before_and_own_modes_are_no_takeover(told: list[Mode]) -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     for mode in told:
@@ -101,29 +99,27 @@ def test_the_mode_before_and_the_orders_own_are_nobody_elses(told: list[Mode]) -
 
 
 @pytest.mark.parametrize("told", [[RTL], [GUIDED, LOITER], [GUIDED, RTL, GUIDED], [LOITER, RTL, LOITER]])
-def test_another_mode_ends_it_for_good(told: list[Mode]) -> None:
+def test_other_mode_ends_order_permanently(told: list[Mode]) -> None:
     """The mode before, too, once the vehicle was in the one that was ordered."""
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     for mode in told:
         stage.tell(mode)
     assert (
-        order.end
-        == order.taken_by
-        == f"the mode changed to {next(m for m in told[1:] or told if m != GUIDED)}"
+        order.end == order.takeover_reason == f"the mode changed to {next(m for m in told[1:] or told if m != GUIDED)}"
     )
 
 
-def test_the_first_who_took_it_is_named() -> None:
+def test_first_takeover_is_reported() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     stage.tell(RTL)
     stage.tell(BRAKE, armed=False)
-    stage.arbiter.note_reboot()
+    stage.arbiter.on_reboot()
     assert order.end == "the mode changed to RTL"
 
 
-def test_disarming_and_rebooting_end_it() -> None:
+def test_disarming_or_reboot_ends_order() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     stage.tell(LOITER, armed=False)
@@ -131,11 +127,11 @@ def test_disarming_and_rebooting_end_it() -> None:
     order = stage.arbiter.order(GUIDED)
     stage.tell(LOITER, armed=False)
     assert order.end == ""  # it was so before
-    stage.arbiter.note_reboot()
+    stage.arbiter.on_reboot()
     assert order.end == "the vehicle rebooted"
 
 
-def test_disarming_counts_from_when_it_was_armed() -> None:
+def test_disarming_counts_only_after_arming() -> None:
     stage = Stage(armed=False)
     order = stage.arbiter.order(GUIDED)
     stage.tell(LOITER, armed=True)
@@ -144,7 +140,7 @@ def test_disarming_counts_from_when_it_was_armed() -> None:
     assert order.end == "the vehicle disarmed"
 
 
-def test_a_mode_that_was_not_known_before_is_the_one_before() -> None:
+def test_first_reported_mode_becomes_mode_before() -> None:
     stage = Stage(mode=None)
     order = stage.arbiter.order(GUIDED)
     stage.tell(RTL)
@@ -156,7 +152,7 @@ def test_a_mode_that_was_not_known_before_is_the_one_before() -> None:
 # --------------------------------------------------------------------------------- doubts
 
 
-def test_the_mode_of_the_order_before_may_still_come_while_that_is_under_way() -> None:
+def test_previous_orders_mode_while_active_is_no_takeover() -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
     stage.tell(GUIDED)
@@ -169,7 +165,7 @@ def test_the_mode_of_the_order_before_may_still_come_while_that_is_under_way() -
 
 
 @pytest.mark.parametrize(("in_doubt", "end"), [(True, ""), (False, "the mode changed to GUIDED")])
-def test_a_mode_that_was_ordered_and_not_told_may_come_while_it_is_in_doubt(in_doubt: bool, end: str) -> None:
+def test_unreported_ordered_mode_in_doubt_is_no_takeover(in_doubt: bool, end: str) -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
     stage.arbiter.mode_is_in_doubt = in_doubt
@@ -178,10 +174,8 @@ def test_a_mode_that_was_ordered_and_not_told_may_come_while_it_is_in_doubt(in_d
     assert order.end == end
 
 
-@pytest.mark.parametrize(
-    ("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")]
-)
-def test_a_mode_that_was_given_up_may_come_for_three_seconds(after_s: float, end: str) -> None:
+@pytest.mark.parametrize(("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")])
+def test_abandoned_mode_within_three_seconds_is_no_takeover(after_s: float, end: str) -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
     stage.arbiter.doubt_mode()
@@ -193,29 +187,27 @@ def test_a_mode_that_was_given_up_may_come_for_three_seconds(after_s: float, end
 
 
 @pytest.mark.parametrize(("after_s", "end"), [(2.9, ""), (3.0, "the mode changed to RTL")])
-def test_after_an_order_of_the_programs_own_any_mode_may_come_for_three_seconds(
-    after_s: float, end: str
-) -> None:
+def test_raw_order_accepts_any_mode_for_three_seconds(after_s: float, end: str) -> None:
     stage = Stage()
-    own = stage.arbiter.order_of_the_programs_own()
+    own = stage.arbiter.raw_order()
     order = stage.arbiter.order(GUIDED)
     assert own.end == "another order was given"
     stage.tell(RTL, after=after_s)
     assert order.end == end
 
 
-def test_the_mode_that_an_order_of_the_programs_own_names_is_not_a_pilots_doing() -> None:
+def test_raw_order_named_mode_is_no_takeover() -> None:
     stage = Stage()
-    own = stage.arbiter.order_of_the_programs_own(modes=[GUIDED])
+    own = stage.arbiter.raw_order(modes=[GUIDED])
     stage.tell(GUIDED)
-    assert (own.end, stage.arbiter.is_obeyed) == ("", True)
+    assert (own.end, stage.arbiter.may_be_executing) == ("", True)
     stage.tell(RTL)  # within three seconds: nothing is sent again after a pilot's mode
-    assert (own.end, stage.arbiter.is_obeyed) == ("the mode changed to RTL", False)
+    assert (own.end, stage.arbiter.may_be_executing) == ("the mode changed to RTL", False)
 
 
-def test_an_order_of_the_programs_own_ends_at_any_mode_so_that_it_is_not_sent_again_over_a_pilot() -> None:
+def test_raw_order_ends_with_any_mode_change() -> None:
     stage = Stage()
-    own = stage.arbiter.order_of_the_programs_own()
+    own = stage.arbiter.raw_order()
     with stage.arbiter.sending(own) as sending:
         stage.tell(RTL, after=0.5)
         assert sending.end == "the mode changed to RTL"
@@ -229,9 +221,7 @@ def test_an_order_of_the_programs_own_ends_at_any_mode_so_that_it_is_not_sent_ag
         (CommandTimeout("no answer"), True, 1.0 + MODE_GRACE_S),
     ],
 )
-def test_a_mode_is_in_doubt_until_the_answer_is_known(
-    error: Exception | None, in_doubt: bool, settles_at: float
-) -> None:
+def test_mode_is_in_doubt_until_result_is_known(error: Exception | None, in_doubt: bool, settles_at: float) -> None:
     helm, seen = Stage().arbiter, list[bool]()
     with nullcontext() if error is None else pytest.raises(type(error)), helm.changing_mode():
         seen.append(helm.mode_is_in_doubt)
@@ -241,7 +231,7 @@ def test_a_mode_is_in_doubt_until_the_answer_is_known(
     assert helm.mode_settles_at == settles_at
 
 
-def test_refused_mode_leaves_the_doubt_about_the_one_before() -> None:
+def test_refused_mode_keeps_previous_doubt() -> None:
     arbiter = Stage().arbiter
     arbiter.doubt_mode()
     with pytest.raises(CommandRejected), arbiter.changing_mode():
@@ -249,9 +239,9 @@ def test_refused_mode_leaves_the_doubt_about_the_one_before() -> None:
     assert arbiter.mode_is_in_doubt
 
 
-def test_what_it_does_is_known_for_two_and_a_half_seconds() -> None:
+def test_state_is_known_for_two_and_a_half_seconds() -> None:
     stage = Stage()
-    for later, known in ((KNOWN_S, True), (0.1, False)):
+    for later, known in ((MODE_MAX_AGE_S, True), (0.1, False)):
         stage.now += later
         assert stage.arbiter.is_known is known
     assert not Stage(mode=None).arbiter.is_known
@@ -265,58 +255,58 @@ def sending(stage: Stage, **options: Any) -> SentCommand:
     return stage.open.enter_context(stage.arbiter.sending(order, **options))
 
 
-def test_a_sending_ends_when_its_mode_is_told_whatever_comes_then() -> None:
+def test_sent_command_mode_reported_ends_permanently() -> None:
     stage = Stage()
     each = sending(stage, modes=(GUIDED,))
     stage.tell(LOITER)
-    assert (each.end, each.has_worked) == ("", False)
+    assert (each.end, each.is_confirmed) == ("", False)
     stage.tell(GUIDED)
-    assert (each.end, each.has_worked) == ("its effect was told", True)
+    assert (each.end, each.is_confirmed) == ("its effect was reported", True)
     stage.tell(RTL)
-    assert each.end == "its effect was told"
+    assert each.end == "its effect was reported"
 
 
-def test_a_sending_ends_when_it_is_armed_as_ordered() -> None:
+def test_sent_command_armed_as_ordered_ends() -> None:
     for armed in (True, False):
         stage = Stage(armed=not armed)
         each = sending(stage, armed=armed)
         stage.tell(LOITER, armed=not armed)
         assert each.end == ""
         stage.tell(LOITER, armed=armed)
-        assert each.has_worked
+        assert each.is_confirmed
 
 
-def test_what_is_so_already_tells_nothing_of_an_effect() -> None:
+def test_unchanged_state_is_no_effect() -> None:
     stage = Stage(GUIDED)
     each = sending(stage, modes=(GUIDED, LOITER), armed=True)
     stage.tell(GUIDED)
-    assert not each.has_worked
+    assert not each.is_confirmed
     stage.tell(LOITER)
-    assert each.has_worked
+    assert each.is_confirmed
 
 
-def test_a_sending_ends_with_its_order_and_by_its_own_sign() -> None:
+def test_sent_command_ends_with_order_or_effect() -> None:
     stage, done = Stage(), list[int]()
     each = sending(stage, is_done=lambda: bool(done))
     stage.tell(RTL)
     assert each.end == "the mode changed to RTL"
     done.append(1)
-    assert each.end == "its effect was told"
+    assert each.end == "its effect was reported"
     done.clear()
-    assert each.end == "its effect was told"
+    assert each.end == "its effect was reported"
 
 
-def test_a_sending_knows_when_the_vehicle_told_last_until_its_block_ends() -> None:
+def test_sent_command_records_heartbeats_within_its_block() -> None:
     stage = Stage()
     with stage.arbiter.sending(stage.arbiter.order(GUIDED)) as each:
-        assert each.told_at == -math.inf
+        assert each.heartbeat_at == -math.inf
         stage.tell(LOITER)
-        assert each.told_at == 2.0
+        assert each.heartbeat_at == 2.0
     stage.tell(LOITER)
-    assert each.told_at == 2.0
+    assert each.heartbeat_at == 2.0
 
 
-def test_orders_know_what_moves_and_what_only_asks() -> None:
+def test_commands_are_classified_as_orders_or_questions() -> None:
     assert {MavCmd(each).name for each in CHANGED_BY_COMMAND} == {
         *("NAV_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS", "NAV_LOITER_TIME", "NAV_RETURN_TO_LAUNCH"),
         *("NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF", "NAV_VTOL_LAND", "DO_SET_MODE", "DO_REPOSITION"),
@@ -328,7 +318,7 @@ def test_orders_know_what_moves_and_what_only_asks() -> None:
     assert len(QUESTIONS) == 11
 
 
-def test_an_order_of_nothing_in_no_mode_stands() -> None:
+def test_order_without_modes_stays_valid() -> None:
     order = Order(0.0, 1, lambda _: True)
     assert order.end == ""
 
@@ -337,19 +327,19 @@ def test_an_order_of_nothing_in_no_mode_stands() -> None:
 
 
 @pytest.mark.parametrize("state", [MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION])
-def test_order_failsafe_becomes_active_ends_it_for_good(state: int) -> None:
+def test_order_failsafe_ends_it_permanently(state: int) -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
-    with stage.arbiter.sending(order) as sending, stage.arbiter.aside() as aside:
+    with stage.arbiter.sending(order) as sending, stage.arbiter.auxiliary_order() as aside:
         stage.tell(GUIDED, state=state)
         assert "failsafe" in order.end
         assert sending.end == aside.end == order.end
         stage.tell(GUIDED)
         assert "failsafe" in order.end
-    assert not stage.arbiter.order(GUIDED).is_given
+    assert not stage.arbiter.order(GUIDED).may_move
 
 
-def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
+def test_order_during_failsafe_is_valid_until_next_failsafe() -> None:
     stage = Stage()
     stage.tell(LOITER, state=MavState.CRITICAL)
     order = stage.arbiter.order(GUIDED)
@@ -361,7 +351,7 @@ def test_order_given_during_a_failsafe_stands_until_the_next_one() -> None:
     assert "failsafe" in order.end
 
 
-def test_order_worse_failsafe_than_the_known_one_ends_it() -> None:
+def test_order_worse_failsafe_ends_it() -> None:
     stage = Stage()
     stage.tell(LOITER, state=MavState.CRITICAL)
     order = stage.arbiter.order(GUIDED)
@@ -370,12 +360,12 @@ def test_order_worse_failsafe_than_the_known_one_ends_it() -> None:
 
 
 @pytest.mark.parametrize("mode", [RTL, Mode("LAND", 9)])
-def test_order_to_land_or_return_stands_under_a_failsafe(mode: Mode) -> None:
+def test_land_and_return_orders_survive_failsafe(mode: Mode) -> None:
     stage = Stage()
     order = stage.arbiter.order(mode)
     with (
         stage.arbiter.sending(order, modes=[mode]) as sending,
-        stage.arbiter.aside(ends_flight=True) as disarm,
+        stage.arbiter.auxiliary_order(ends_flight=True) as disarm,
     ):
         stage.tell(LOITER, state=MavState.CRITICAL)
         assert (order.end, sending.end, disarm.end) == ("", "", "")
@@ -390,14 +380,14 @@ def arm(stage: Stage, *, is_refused: bool = False) -> None:
     error = CommandRejected("no", command=400, result=4)
     with (
         pytest.raises(CommandRejected) if is_refused else nullcontext(),
-        stage.arbiter.aside() as order,
+        stage.arbiter.auxiliary_order() as order,
         stage.arbiter.sending(order, armed=True),
     ):
         if is_refused:
             raise error
 
 
-def test_vehicle_that_the_program_armed_is_flown_by_it_until_a_pilot_takes_it() -> None:
+def test_vehicle_armed_by_program_is_flown_until_takeover() -> None:
     stage = Stage(armed=False)
     arm(stage)
     stage.tell(LOITER, True, after=0.8)
@@ -406,14 +396,14 @@ def test_vehicle_that_the_program_armed_is_flown_by_it_until_a_pilot_takes_it() 
     assert not stage.arbiter.is_flown_by_program
 
 
-def test_vehicle_told_armed_long_after_the_answer_is_the_programs_if_nothing_was_told_between() -> None:
+def test_late_armed_report_is_programs_without_other_report() -> None:
     stage = Stage(armed=False)
     arm(stage)
     stage.tell(LOITER, True, after=6.0)  # HEARTBEATs were lost
     assert stage.arbiter.is_flown_by_program
 
 
-def test_vehicle_that_a_pilot_armed_after_a_refusal_or_a_disarming_is_his() -> None:
+def test_vehicle_armed_by_pilot_is_not_flown_by_program() -> None:
     stage = Stage(armed=False)
     arm(stage, is_refused=True)
     stage.tell(LOITER, True, after=1.0)
@@ -430,7 +420,7 @@ def flies(stage: Stage) -> bool:
     return stage.arbiter.is_flown_by_program
 
 
-def test_refused_order_changes_nothing_about_who_flies() -> None:
+def test_refused_order_does_not_change_flown_by_program() -> None:
     stage = Stage()
     refused = stage.arbiter.order(GUIDED)
     refused.was_refused = True
@@ -442,18 +432,18 @@ def test_refused_order_changes_nothing_about_who_flies() -> None:
     assert flies(stage)
 
 
-def test_failsafe_is_forgiven_when_the_program_takes_the_vehicle_back() -> None:
+def test_failsafe_is_cleared_by_new_order() -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
     stage.tell(GUIDED)
     stage.tell(GUIDED, state=MavState.CRITICAL)
     stage.tell(GUIDED)
     assert not flies(stage)
-    stage.arbiter.forgive_failsafe()
+    stage.arbiter.clear_failsafe()
     assert flies(stage)
 
 
-def test_posted_mode_after_an_order_is_the_programs_own() -> None:
+def test_posted_mode_after_order_is_no_takeover() -> None:
     stage = Stage()
     order = stage.arbiter.order(GUIDED)
     stage.tell(GUIDED)

@@ -1,4 +1,4 @@
-"""arm() that has to change the mode first, or was given up: what the program orders between its steps."""
+"""arm() that changes the mode first, or was abandoned: orders that the program gives between its steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aerokit.errors import CommandTimeout, HeartbeatTimeout, OperationRejected
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import CommandLong
 from aerokit.sim.px4.modes import RTL
-from aerokit.sim.track import true_point
+from aerokit.testing.track import true_point
 
 pytestmark = pytest.mark.anyio
 
@@ -47,25 +47,25 @@ async def test_disarm_while_the_mode_changes_ends_arm() -> None:
             tasks.start_soon(arm)
             await anyio.sleep(0.02)
             await flight.vehicle.disarm()
-        assert "another order to arm or disarm was given" in str(ended[0])
+        assert "superseded by another arm or disarm command" in str(ended[0])
         assert not _told_to_arm(flight)
         assert not true_point(flight.px4).armed
 
 
-async def test_a_vehicle_that_falls_silent_in_its_new_mode_is_not_told_to_arm() -> None:
+async def test_arm_vehicle_silent_after_mode_change_sends_no_arm() -> None:
     async with _in_rtl() as flight:
 
         def cut(_: object, mode: object) -> None:
             flight.px4.faults.silent = True
 
         end = flight.vehicle.mode.observe(cut)
-        with pytest.raises(HeartbeatTimeout, match="it was not told to arm"):
+        with pytest.raises(HeartbeatTimeout, match="the arm command was not sent"):
             await flight.vehicle.arm()
         end()
         assert not _told_to_arm(flight)
 
 
-async def test_who_is_armed_by_a_command_after_arm_was_given_up_stays_armed() -> None:
+async def test_raw_arm_after_abandoned_arm_stays_armed() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         flight.px4.faults.ignore(MavCmd.COMPONENT_ARM_DISARM)

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.anyio
 ARM = MavCmd.COMPONENT_ARM_DISARM
 
 
-async def test_the_same_program_runs_twice() -> None:
+async def test_program_runs_twice_in_one_process() -> None:
     """After the first flight a copter stands there in RTL."""
     async with open_flight() as flight:
         for _ in range(2):
@@ -29,7 +29,7 @@ async def test_the_same_program_runs_twice() -> None:
             assert flight.vehicle.mode_name == "RTL"
 
 
-async def test_a_mode_that_is_asked_for_is_set_before_arming() -> None:
+async def test_arm_with_mode_changes_mode_first() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm(mode="LOITER")
@@ -37,13 +37,11 @@ async def test_a_mode_that_is_asked_for_is_set_before_arming() -> None:
         assert flight.vehicle.is_armed
 
 
-async def test_a_mode_in_which_it_does_not_arm_is_refused_before_anything_is_sent() -> None:
+async def test_arm_in_unarmable_mode_raises_before_sending() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.wire.forget()
-        with pytest.raises(
-            InvalidArgument, match=r"mode = 'LAND' .*does not arm in LAND, but in ACRO, .*GUIDED"
-        ):
+        with pytest.raises(InvalidArgument, match=r"mode = 'LAND' .*cannot arm in LAND, only in ACRO, .*GUIDED"):
             await flight.vehicle.arm(mode="LAND")
         with pytest.raises(InvalidArgument, match="NOWHERE"):
             await flight.vehicle.arm(mode="NOWHERE")
@@ -51,42 +49,40 @@ async def test_a_mode_in_which_it_does_not_arm_is_refused_before_anything_is_sen
         assert not flight.wire.mode_orders()
 
 
-async def test_what_flies_is_not_put_into_another_mode() -> None:
+async def test_arm_in_flight_keeps_mode() -> None:
     async with in_the_air() as flight:
         await flight.vehicle.set_mode("LAND")
         flight.wire.forget()
         await flight.vehicle.arm()
-        with pytest.raises(
-            OperationRejected, match="arm: the vehicle is armed already, in LAND; nothing was sent"
-        ):
+        with pytest.raises(OperationRejected, match="arm: the vehicle is armed already, in LAND; nothing was sent"):
             await flight.vehicle.arm(mode="GUIDED")
         assert not flight.wire.mode_orders()
         assert flight.copter.mode.number == CopterMode.LAND
 
 
-async def test_why_not_armable_names_the_mode_and_those_in_which_it_arms() -> None:
+async def test_why_not_armable_names_mode_and_alternatives() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("RTL")
         (reason,) = await flight.vehicle.why_not_armable()
-        assert reason.startswith("ArduCopter does not arm in RTL, but in ACRO")
-        assert reason.endswith("arm() goes to GUIDED first")
+        assert reason.startswith("ArduCopter cannot arm in RTL, only in ACRO")
+        assert reason.endswith("arm() changes to GUIDED first")
 
 
-async def test_a_px4_that_was_left_in_offboard_is_ready_and_arms() -> None:
+async def test_px4_left_in_offboard_arms() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         flight.px4.switch_to(OFFBOARD)
         await flight.vehicle.mode.wait_until(lambda mode: mode.name == "OFFBOARD")
         await anyio.sleep(1.0)
         (reason,) = await flight.vehicle.why_not_armable()
-        assert "PX4 does not arm in OFFBOARD" in reason
+        assert "PX4 cannot arm in OFFBOARD" in reason
         await flight.vehicle.wait_ready(timeout=5.0)
         await flight.vehicle.arm()
         assert flight.vehicle.mode_name == "LOITER"
 
 
-async def test_a_plane_in_autoland_arms_in_a_mode_that_moves_nothing() -> None:
+async def test_plane_in_autoland_arms_in_passive_mode() -> None:
     plane = SimulatedPlane(boot_time_s=1.0)
     async with simulated_link(plane) as link, connect(link) as vehicle:
         await vehicle.wait_ready()
@@ -97,8 +93,8 @@ async def test_a_plane_in_autoland_arms_in_a_mode_that_moves_nothing() -> None:
         assert vehicle.is_armed
 
 
-async def test_a_dead_link_is_a_reason() -> None:
-    """What rests on old values says so."""
+async def test_missing_for_flight_names_lost_link() -> None:
+    """Results based on old values say so."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.silent = True
@@ -108,7 +104,7 @@ async def test_a_dead_link_is_a_reason() -> None:
         assert any("position (no GLOBAL_POSITION_INT" in each for each in reasons)
 
 
-async def test_while_the_link_is_lost_nothing_is_ready() -> None:
+async def test_missing_for_flight_without_link_lists_all() -> None:
     """At once, with values that are still young; and only a heartbeat of after it brings it back."""
     async with open_flight() as flight:
         vehicle, connection = flight.vehicle, flight.vehicle.connection
@@ -127,7 +123,7 @@ async def test_while_the_link_is_lost_nothing_is_ready() -> None:
         assert await vehicle.why_not_armable() == []
 
 
-async def test_arming_what_is_armed_already_and_giving_up_does_not_disarm_it() -> None:
+async def test_abandoned_arm_of_armed_vehicle_does_not_disarm() -> None:
     """On the ground, armed by its pilot; the program asks again and is cancelled at once."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()

@@ -1,4 +1,4 @@
-"""Places that no such vehicle flies to: refused before anything is sent, unless the call says that they are meant."""
+"""Places out of reach are rejected before anything is sent, unless the caller allows them."""
 
 from __future__ import annotations
 
@@ -20,22 +20,20 @@ def exchanged(flight: Flight) -> Position:
     return Position(-here.latitude_deg, here.longitude_deg - 90.0, altitude_relative_m=20.0)
 
 
-async def test_go_to_a_place_too_far_away_sends_nothing(flying: Flight) -> None:
+async def test_go_to_far_target_sends_nothing(flying: Flight) -> None:
     target = exchanged(flying)
     with pytest.raises(InvalidArgument, match=r"target = .* km away, more than max_distance_m = 100,000"):
         await flying.vehicle.go_to(target)
     assert flying.wire.sent == [] or all(m.NAME == "HEARTBEAT" for _, m in flying.wire.sent)
 
 
-async def test_go_to_a_place_too_far_away_is_flown_if_that_is_meant(flying: Flight) -> None:
+async def test_go_to_far_target_with_raised_limit_flies(flying: Flight) -> None:
     with anyio.move_on_after(3.0):
         await flying.vehicle.go_to(exchanged(flying), max_distance_m=2.1e7)
     assert flying.wire.commands(192)
 
 
-@pytest.mark.parametrize(
-    ("metres", "is_allowed"), [(MAX_DISTANCE_M - 500, True), (MAX_DISTANCE_M + 500, False)]
-)
+@pytest.mark.parametrize(("metres", "is_allowed"), [(MAX_DISTANCE_M - 500, True), (MAX_DISTANCE_M + 500, False)])
 async def test_distance_is_compared_exactly(flying: Flight, metres: float, is_allowed: bool) -> None:
     target = flying.vehicle.position.value.offset(north_m=0.6 * metres, east_m=0.8 * metres)
     with anyio.move_on_after(1.0):
@@ -48,7 +46,7 @@ async def test_distance_is_compared_exactly(flying: Flight, metres: float, is_al
 
 
 @pytest.mark.parametrize("kind", ["mission", "rally"])
-async def test_plan_with_a_place_too_far_away_is_not_uploaded(grounded: Flight, kind: str) -> None:
+async def test_plan_with_far_item_is_not_uploaded(grounded: Flight, kind: str) -> None:
     here, far = grounded.vehicle.position.value, exchanged(grounded)
     if kind == "mission":
         places = [here.offset(north_m=50.0), far]

@@ -42,7 +42,7 @@ def north_of_home(flight: Flight, north_m: float, altitude_m: float = 10.0) -> P
 
 
 async def cancelled_after(seconds: float, action: object) -> None:
-    """Run a coroutine and cancel it half-way; it must have been under way still."""
+    """Run a coroutine and cancel it while it is in progress."""
     with anyio.move_on_after(seconds) as scope:
         await action  # type: ignore[misc]
     assert scope.cancelled_caught
@@ -57,8 +57,8 @@ async def test_wait_ready_says_what_is_missing() -> None:
             await flight.vehicle.wait_ready(timeout=6.3)
     text = str(caught.value)
     assert "not ready within 6.3 s" in text
-    assert "home (HOME_POSITION has not come)" in text
-    assert "position (GLOBAL_POSITION_INT with a fix has not come)" in text
+    assert "home (HOME_POSITION not received)" in text
+    assert "position (GLOBAL_POSITION_INT with a fix not received)" in text
     assert "absolute horizontal position" in text
     assert "last heartbeat 0." in text
 
@@ -72,7 +72,7 @@ async def test_wait_ready_returns_when_the_vehicle_can_be_armed() -> None:
         await flight.vehicle.arm()
 
 
-async def test_wait_ready_asks_for_the_streams_it_needs() -> None:
+async def test_wait_ready_requests_needed_streams() -> None:
     async with open_flight(rates={}) as flight:
         await flight.vehicle.wait_ready(timeout=10.0)
 
@@ -91,18 +91,18 @@ async def test_wait_ready_names_a_failing_check_and_a_silent_vehicle(grounded: F
 
 
 async def test_take_off_in_the_air_sends_nothing(flying: Flight) -> None:
-    with pytest.raises(OperationRejected, match="flies already"):
+    with pytest.raises(OperationRejected, match="is already"):
         await flying.vehicle.take_off(20.0)
     assert not flying.wire.commands(MavCmd.NAV_TAKEOFF)
 
 
-async def test_a_landing_is_not_ended_by_a_take_off(flying: Flight) -> None:
+async def test_take_off_while_landing_is_rejected(flying: Flight) -> None:
     """The take-off would be refused in the air; the mode before it would not, and the vehicle would hover."""
     vehicle = flying.vehicle
     await vehicle.set_mode("LAND")
     await vehicle.landed_state.wait_until(lambda state: state == MavLandedState.LANDING, timeout=10)
     flying.wire.forget()
-    with pytest.raises(OperationRejected, match=r"flies already \(landing\)"):
+    with pytest.raises(OperationRejected, match=r"is already landing"):
         await vehicle.take_off(20.0)
     assert not flying.wire.mode_orders()
     assert not flying.wire.commands(MavCmd.NAV_TAKEOFF)
@@ -119,7 +119,7 @@ async def test_take_off_disarmed_sends_nothing(grounded: Flight) -> None:
 
 
 @pytest.mark.parametrize("altitude_m", [0.0, -3.0, 10_001.0, math.nan, math.inf])
-async def test_take_off_to_nonsense_sends_nothing(grounded: Flight, altitude_m: float) -> None:
+async def test_take_off_invalid_altitude_sends_nothing(grounded: Flight, altitude_m: float) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
     with pytest.raises(InvalidArgument, match="altitude_m"):
@@ -158,8 +158,8 @@ async def test_take_off_refused_says_why(grounded: Flight) -> None:
     assert "Takeoff: not today" in str(caught.value)
 
 
-async def test_a_state_of_the_last_flight_is_no_effect_of_a_take_off(grounded: Flight) -> None:
-    """TAKING_OFF was the last that it told before nobody asked for it any more."""
+async def test_take_off_state_of_last_flight_is_no_effect(grounded: Flight) -> None:
+    """TAKING_OFF was its last report before the stream ended."""
     await grounded.vehicle.wait_ready()
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
@@ -169,8 +169,8 @@ async def test_a_state_of_the_last_flight_is_no_effect_of_a_take_off(grounded: F
         await grounded.vehicle.take_off(10.0)
 
 
-async def test_rising_is_the_effect_of_a_take_off(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a vehicle that tells no landed state: sent again while it stands, no time-out once it has risen."""
+async def test_take_off_climb_is_effect(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a landed state: repeated while it is on the ground, confirmed once it has climbed."""
     vehicle = grounded.vehicle
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
@@ -182,8 +182,8 @@ async def test_rising_is_the_effect_of_a_take_off(grounded: Flight, monkeypatch:
     assert len(grounded.wire.commands(MavCmd.NAV_TAKEOFF)) == 4
 
 
-async def test_a_flight_of_long_ago_does_not_forbid_a_take_off(grounded: Flight) -> None:
-    """Its landing was not heard, and nothing of its state since."""
+async def test_take_off_stale_landed_state_is_ignored(grounded: Flight) -> None:
+    """Its landing was not received, nor any state since."""
     vehicle = grounded.vehicle
     await vehicle.wait_ready()
     await vehicle.set_mode("GUIDED")
@@ -196,7 +196,7 @@ async def test_a_flight_of_long_ago_does_not_forbid_a_take_off(grounded: Flight)
     await vehicle.take_off(8.0)
 
 
-async def test_take_off_cancelled_half_way_holds(grounded: Flight) -> None:
+async def test_take_off_cancelled_holds(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
     await cancelled_after(7.0, grounded.vehicle.take_off(30.0))
@@ -222,7 +222,7 @@ async def test_take_off_ends_when_a_pilot_takes_over(grounded: Flight) -> None:
     assert grounded.copter.mode.number == LOITER  # it is the pilot's now
 
 
-async def test_take_off_that_does_not_come_off_times_out(grounded: Flight) -> None:
+async def test_take_off_not_executed_times_out(grounded: Flight) -> None:
     grounded.copter.faults.motor_failed = True
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
@@ -247,8 +247,8 @@ async def test_take_off_ends_when_it_is_disarmed(grounded: Flight) -> None:
             await grounded.vehicle.take_off(10.0)
 
 
-async def test_take_off_after_a_cancelled_one_goes_on(grounded: Flight) -> None:
-    """The hold that the first one left behind must not come after the second one's order."""
+async def test_take_off_after_cancelled_one_continues(grounded: Flight) -> None:
+    """The hold of the first one must not be sent after the second one's order."""
     vehicle = grounded.vehicle
     await vehicle.set_mode("GUIDED")
     await vehicle.arm()
@@ -323,7 +323,7 @@ async def test_go_to_with_a_heading(flying: Flight) -> None:
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.001, 1.0, 3.0])
-async def test_go_to_cancelled_half_way_holds(after_s: float) -> None:
+async def test_go_to_cancelled_holds(after_s: float) -> None:
     async with in_the_air(latency_s=0.05) as flying:
         await cancelled_after(after_s, flying.vehicle.go_to(north_of_home(flying, 200.0)))
         await anyio.sleep(6.0)
@@ -334,7 +334,7 @@ async def test_go_to_cancelled_half_way_holds(after_s: float) -> None:
         assert flying.copter.mode.number == BRAKE
 
 
-async def test_an_order_after_a_cancelled_go_to_stays_in_force(flying: Flight) -> None:
+async def test_order_after_cancelled_go_to_stays_valid(flying: Flight) -> None:
     await cancelled_after(2.0, flying.vehicle.go_to(north_of_home(flying, 200.0)))
     await flying.vehicle.go_to(north_of_home(flying, 0.0))
     await anyio.sleep(3.0)
@@ -342,7 +342,7 @@ async def test_an_order_after_a_cancelled_go_to_stays_in_force(flying: Flight) -
     assert flying.copter.motion.north == pytest.approx(0.0, abs=2.5)
 
 
-async def test_a_stream_after_a_cancelled_go_to_is_not_stopped() -> None:
+async def test_setpoint_stream_after_cancelled_go_to_continues() -> None:
     async with in_the_air(latency_s=0.2) as flying:
         await cancelled_after(2.0, flying.vehicle.go_to(north_of_home(flying, 200.0)))
         async with flying.vehicle.guided.velocity() as stream:
@@ -351,7 +351,7 @@ async def test_a_stream_after_a_cancelled_go_to_is_not_stopped() -> None:
         assert flying.copter.mode.number == BRAKE
 
 
-async def test_landing_after_a_cancelled_go_to_is_not_stopped() -> None:
+async def test_land_after_cancelled_go_to_continues() -> None:
     async with in_the_air(latency_s=0.2) as flying:
         await cancelled_after(2.0, flying.vehicle.go_to(north_of_home(flying, 200.0)))
         await flying.vehicle.land()
@@ -359,8 +359,8 @@ async def test_landing_after_a_cancelled_go_to_is_not_stopped() -> None:
 
 
 @pytest.mark.parametrize("order", ["hold", "land", "set_mode", "stream"])
-async def test_a_refused_hold_of_a_cancelled_call_is_not_taken_for_the_next_answer(order: str) -> None:
-    """COMMAND_ACK carries no request id: the answer to what was left behind must not fail what comes after."""
+async def test_refused_background_hold_is_not_next_ack(order: str) -> None:
+    """COMMAND_ACK carries no request id: the ack of a cancelled call must not fail the next one."""
     async with in_the_air(latency_s=0.2) as flying:
         vehicle = flying.vehicle
         await cancelled_after(2.0, vehicle.go_to(north_of_home(flying, 200.0)))
@@ -390,9 +390,7 @@ async def test_go_to_without_do_reposition_sends_the_older_message() -> None:
         await flight.vehicle.go_to(target)
         assert flight.copter.motion.north == pytest.approx(40.0, abs=2.5)
         sent = flight.wire.all(m.SetPositionTargetGlobalInt)
-        assert {each.type_mask for each in sent} == {
-            0x0DF8
-        }  # velocity, acceleration, yaw and yaw rate ignored
+        assert {each.type_mask for each in sent} == {0x0DF8}  # velocity, acceleration, yaw and yaw rate ignored
         assert {each.coordinate_frame for each in sent} == {6}
         assert sent[0].lat_int == round(target.latitude_deg * 1e7)
         flight.wire.forget()
@@ -400,7 +398,7 @@ async def test_go_to_without_do_reposition_sends_the_older_message() -> None:
         assert not flight.wire.setpoints()  # nothing is resent once the call has ended
 
 
-async def test_the_older_message_is_not_resent_after_cancellation() -> None:
+async def test_go_to_legacy_message_stops_after_cancellation() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
     async with in_the_air(copter=copter) as flight:
         await cancelled_after(3.0, flight.vehicle.go_to(north_of_home(flight, 200.0)))
@@ -433,7 +431,7 @@ async def test_go_to_with_nonsense_sends_nothing(flying: Flight, name: str, valu
     assert not flying.wire.mode_orders()
 
 
-async def test_go_to_without_an_altitude_from_a_place_without_one_sends_nothing(flying: Flight) -> None:
+async def test_go_to_without_any_altitude_sends_nothing(flying: Flight) -> None:
     here = flying.vehicle.position.value
     low = Position(here.latitude_deg, here.longitude_deg, altitude_amsl_m=594.0)
     flying.vehicle.telemetry.position.set(low, Source(1, 1, "GLOBAL_POSITION_INT"))
@@ -472,7 +470,7 @@ async def test_go_to_ends_when_a_pilot_takes_over(flying: Flight) -> None:
     assert not flying.wire.mode_orders()
 
 
-async def test_go_to_notices_that_the_vehicle_has_fallen_silent(flying: Flight) -> None:
+async def test_go_to_silent_vehicle_raises(flying: Flight) -> None:
     flying.copter.faults.silent = False
     async with anyio.create_task_group() as tasks:
 
@@ -600,7 +598,7 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
     assert (right.param2, right.param3, right.param4) == (20.0, 1.0, 0.0)
 
 
-async def test_set_heading_that_does_not_come_off_times_out(flying: Flight) -> None:
+async def test_set_heading_not_reached_times_out(flying: Flight) -> None:
     flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
     flying.copter.yaw.fixed = lambda *_, **__: None  # type: ignore[method-assign]
     with pytest.raises(OperationTimeout, match=r"set_heading\(90°\): not done within 3 s; it is \d+° off"):
@@ -626,7 +624,7 @@ async def test_look_at_and_stop_looking(flying: Flight) -> None:
     assert len(flying.wire.commands(MavCmd.DO_SET_ROI_NONE)) == 1
 
 
-async def test_home_is_set_where_it_is_and_somewhere_else(flying: Flight) -> None:
+async def test_set_home_at_position_and_elsewhere(flying: Flight) -> None:
     await flying.vehicle.go_to(north_of_home(flying, 30.0))
     before = flying.vehicle.home.value
     await flying.vehicle.set_home()
@@ -642,33 +640,31 @@ async def test_look_at_refused(flying: Flight) -> None:
         await flying.vehicle.look_at(north_of_home(flying, 50.0))
 
 
-async def test_a_take_off_that_is_refused_in_the_air_says_so(flying: Flight) -> None:
-    """The vehicle says nothing but FAILED; the landed state had not been heard when the order was given."""
+async def test_take_off_refused_in_air_says_so(flying: Flight) -> None:
+    """The vehicle answers only FAILED; the landed state was unknown when the order was given."""
     flying.vehicle.telemetry.landed_state.forget()
     with pytest.raises(
-        CommandRejected, match=r"it is in the air, 10\.\d m above home: it takes off from the ground only"
+        CommandRejected, match=r"it is in the air, 10\.\d m above home and takes off from the ground only"
     ):
         await flying.vehicle.take_off(20)
 
 
-async def test_also_when_only_its_height_tells(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_take_off_refused_height_shows_flight(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flight, "IN_THE_AIR", {})
     flying.vehicle.telemetry.landed_state.forget()
-    with pytest.raises(
-        CommandRejected, match=r"it is in the air, it seems, 10\.\d m above home: it takes off"
-    ):
+    with pytest.raises(CommandRejected, match=r"it is probably in the air, 10\.\d m above home and takes off"):
         await flying.vehicle.take_off(20)
 
 
 @pytest.mark.parametrize(("altitude_m", "is_said"), [(1.5, False), (2.5, True)])
-async def test_more_than_two_metres_up_it_seems_to_fly(
+async def test_take_off_height_above_two_metres_counts_as_flying(
     grounded: Flight, monkeypatch: pytest.MonkeyPatch, altitude_m: float, is_said: bool
 ) -> None:
-    """Of a vehicle that tells no landed state."""
+    """The vehicle sends no landed state."""
     await grounded.take_off(altitude_m)
     cell = StateCell[int]("landed_state", now, "nothing")
     monkeypatch.setattr(grounded.vehicle.telemetry, "landed_state", cell)
     grounded.copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.FAILED)
     with pytest.raises(CommandRejected) as refusal:
         await grounded.vehicle.take_off(20)
-    assert (f"in the air, it seems, {altitude_m} m above home" in str(refusal.value)) is is_said
+    assert (f"probably in the air, {altitude_m} m above home" in str(refusal.value)) is is_said

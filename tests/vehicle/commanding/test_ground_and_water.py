@@ -1,4 +1,4 @@
-"""What differs for vehicles that do not fly: a rover's altitude means nothing, a submarine lands at the surface."""
+"""Rovers and submarines: a rover's altitude has no meaning, a submarine lands at the surface."""
 
 from __future__ import annotations
 
@@ -46,48 +46,42 @@ async def guided(simulated: SimulatedVehicle) -> AsyncIterator[Vehicle]:
         yield vehicle
 
 
-async def test_a_rover_arrives_although_its_home_is_at_sea_level() -> None:
-    """As a real one's: its home was set before it knew its altitude."""
+async def test_rover_go_to_with_home_at_sea_level_arrives() -> None:
+    """As with real rovers, home was set before the altitude was known."""
     async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
         x, y = round(here.latitude_deg * 1e7), round(here.longitude_deg * 1e7)
         await vehicle.command_int(DO_SET_HOME, frame=0, x=x, y=y, z=0.0)
         there = here.offset(north_m=15)
         await vehicle.position.wait_until(lambda p: (p.altitude_relative_m or 0.0) > 100, timeout=5)
-        await vehicle.go_to(
-            Position(there.latitude_deg, there.longitude_deg, altitude_relative_m=0), timeout=60
-        )
+        await vehicle.go_to(Position(there.latitude_deg, there.longitude_deg, altitude_relative_m=0), timeout=60)
         assert here.distance_to(vehicle.position.value) > 10
 
 
-async def test_a_submarine_has_landed_when_it_is_at_the_surface() -> None:
+async def test_sub_land_ends_at_surface() -> None:
     async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
-        await vehicle.go_to(
-            Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-5), timeout=120
-        )
+        await vehicle.go_to(Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-5), timeout=120)
         await vehicle.land(timeout=120)
         assert vehicle.mode_name == "ALT_HOLD"
         assert abs(vehicle.position.value.altitude_relative_m or 9.0) < 1.5
         assert vehicle.is_armed
 
 
-async def test_a_submarine_at_the_surface_has_landed_at_once() -> None:
-    """SURFACE is over before a heartbeat tells it."""
+async def test_sub_land_at_surface_returns_immediately() -> None:
+    """SURFACE is over before a heartbeat reports it."""
     async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
         await vehicle.set_mode("MANUAL")
         await vehicle.land(timeout=5)
         assert vehicle.mode_name == "ALT_HOLD"
 
 
-async def test_a_submarine_that_is_taken_over_in_the_deep_has_not_landed() -> None:
+async def test_sub_land_takeover_at_depth_raises() -> None:
     """SURFACE ends in the mode that a pilot may also choose on the way."""
     sub = SimulatedSub(boot_time_s=1.0)
     async with guided(sub) as vehicle, anyio.create_task_group() as tasks:
         here = vehicle.position.value
-        await vehicle.go_to(
-            Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-20), timeout=120
-        )
+        await vehicle.go_to(Position(here.latitude_deg, here.longitude_deg, altitude_relative_m=-20), timeout=120)
 
         async def take_over() -> None:
             await anyio.sleep(4)
@@ -98,7 +92,7 @@ async def test_a_submarine_that_is_taken_over_in_the_deep_has_not_landed() -> No
             await vehicle.land(timeout=120)
 
 
-async def test_a_submarine_that_accepts_to_land_and_does_not_is_told_after_three_seconds() -> None:
+async def test_sub_land_accepted_not_executed_raises_after_three_seconds() -> None:
     sub = SimulatedSub(boot_time_s=1.0)
     async with guided(sub) as vehicle:
         sub.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
@@ -109,8 +103,8 @@ async def test_a_submarine_that_accepts_to_land_and_does_not_is_told_after_three
 
 
 @pytest.mark.parametrize("kind", ["local", "global"])
-async def test_a_submarine_gets_to_a_place_that_is_streamed(kind: str) -> None:
-    """Each of these set-points makes it begin anew: the same one is not sent ten times a second."""
+async def test_sub_position_stream_arrives(kind: str) -> None:
+    """Each such set-point restarts the path, so the same one is not sent ten times a second."""
     async with guided(SimulatedSub(boot_time_s=1.0)) as vehicle:
         here = vehicle.position.value
         await vehicle.local_position.wait_until(lambda _: True)
@@ -127,7 +121,7 @@ async def test_a_submarine_gets_to_a_place_that_is_streamed(kind: str) -> None:
         assert here.distance_to(vehicle.position.value) == pytest.approx(8.0, abs=1.0)
 
 
-async def test_a_submarine_is_told_the_same_place_three_times_and_then_every_five_seconds() -> None:
+async def test_sub_position_is_sent_three_times_then_every_five_seconds() -> None:
     async with simulated_link(SimulatedSub(boot_time_s=1.0)) as link:
         wire = Wire(link)
         async with connect(wire) as vehicle:
@@ -143,20 +137,20 @@ async def test_a_submarine_is_told_the_same_place_three_times_and_then_every_fiv
     assert gaps == pytest.approx([0.1, 0.1, 5.0, 5.0], abs=0.11)
 
 
-async def test_a_vehicle_that_does_not_move_although_it_should_is_told() -> None:
-    """Its thrusters do nothing: neither an order nor a stream waits for ever."""
+async def test_go_to_vehicle_does_not_move_times_out() -> None:
+    """Its thrusters do nothing: neither an order nor a stream waits without limit."""
     sub = SimulatedSub(boot_time_s=1.0)
     async with guided(sub) as vehicle:
         there = vehicle.position.value.offset(north_m=30)
         sub.guided.update = lambda dt: None  # type: ignore[method-assign]
-        with pytest.raises(OperationTimeout, match=r"has accepted the order and not moved for 1[23] s"):
+        with pytest.raises(OperationTimeout, match=r"accepted the order and has not moved for 1[23] s"):
             await vehicle.go_to(Position(there.latitude_deg, there.longitude_deg, altitude_relative_m=-1))
         with pytest.raises(SetpointStreamStopped, match=r"not moved for 1[23] s"):
             async with vehicle.guided.velocity() as stream:
                 await stream.fly(VelocitySetpoint(north_m_s=1.0), 30.0)
 
 
-async def test_a_rover_has_returned_when_it_is_at_home() -> None:
+async def test_rover_return_to_launch_ends_at_home() -> None:
     """It does not land there, and stays armed."""
     rover = SimulatedRover(boot_time_s=1.0)
     async with guided(rover) as vehicle:
@@ -171,7 +165,7 @@ async def test_a_rover_has_returned_when_it_is_at_home() -> None:
             await vehicle.return_to_launch(timeout=2)
 
 
-async def test_a_mission_of_a_rover_that_ends_in_a_return_ends_at_home() -> None:
+async def test_rover_mission_with_return_ends_at_home() -> None:
     async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
         home = vehicle.home.value.position
         far = home.offset(north_m=25)
@@ -182,7 +176,7 @@ async def test_a_mission_of_a_rover_that_ends_in_a_return_ends_at_home() -> None
         assert home.distance_to(vehicle.position.value) <= vehicle.autopilot.arrival_radius_m
 
 
-async def test_a_mission_of_a_px4_plane_that_ends_in_a_return_ends_above_home() -> None:
+async def test_px4_plane_mission_with_return_ends_above_home() -> None:
     await anyio.sleep(1000.0)  # a loop's clock begins anywhere
     async with simulated_link(SimulatedPx4Plane()) as link, connect(link) as vehicle:
         await vehicle.wait_ready()
@@ -201,7 +195,7 @@ async def test_a_mission_of_a_px4_plane_that_ends_in_a_return_ends_above_home() 
         assert vehicle.is_armed
 
 
-async def test_a_mission_of_an_arduplane_that_ends_in_a_return_ends_above_home() -> None:
+async def test_arduplane_mission_with_return_ends_above_home() -> None:
     """Its mission does not complete: it changes to RTL, and the mission has stopped."""
     async with simulated_link(SimulatedPlane(boot_time_s=1.0)) as link, connect(link) as vehicle:
         await vehicle.wait_ready()

@@ -1,4 +1,4 @@
-"""Set-point streams: what goes over the wire, and that nothing goes over it once nobody feeds them."""
+"""Set-point streams: their messages, and that nothing is sent once the program stops supplying set-points."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ NORTH = VelocitySetpoint(north_m_s=3.0)
 
 
 async def stays_quiet(flight: Flight, seconds: float = 6.0) -> None:
-    """Nothing is sent any more, and the vehicle stands still in the mode for it."""
+    """Assert that nothing more is sent and the vehicle stands still in its hold mode."""
     flight.wire.forget()
     await anyio.sleep(seconds)
     assert flight.wire.setpoints() == []
@@ -67,9 +67,7 @@ async def first_sent(flight: Flight, stream: SetpointStream[Any], setpoint: obje
         (VelocitySetpoint(1.0, -2.0, 0.5, yaw_rate_deg_s=18.0), 0x5C7, 0.0, math.pi / 10),
     ],
 )
-async def test_velocity(
-    flying: Flight, setpoint: VelocitySetpoint, mask: int, yaw: float, yaw_rate: float
-) -> None:
+async def test_velocity(flying: Flight, setpoint: VelocitySetpoint, mask: int, yaw: float, yaw_rate: float) -> None:
     sent = await first_sent(flying, flying.vehicle.guided.velocity(), setpoint)
     assert isinstance(sent, m.SetPositionTargetLocalNed)
     assert (sent.target_system, sent.target_component, sent.coordinate_frame) == (1, 1, 1)
@@ -80,18 +78,14 @@ async def test_velocity(
 
 
 async def test_body_velocity(flying: Flight) -> None:
-    sent = await first_sent(
-        flying, flying.vehicle.guided.body_velocity(), BodyVelocitySetpoint(2.0, 1.0, -0.5)
-    )
+    sent = await first_sent(flying, flying.vehicle.guided.body_velocity(), BodyVelocitySetpoint(2.0, 1.0, -0.5))
     assert isinstance(sent, m.SetPositionTargetLocalNed)
     assert (sent.coordinate_frame, sent.type_mask) == (8, 0xDC7)
     assert (sent.vx, sent.vy, sent.vz) == (2.0, 1.0, -0.5)
 
 
 async def test_acceleration(flying: Flight) -> None:
-    sent = await first_sent(
-        flying, flying.vehicle.guided.acceleration(), AccelerationSetpoint(0.5, 0.25, -0.125)
-    )
+    sent = await first_sent(flying, flying.vehicle.guided.acceleration(), AccelerationSetpoint(0.5, 0.25, -0.125))
     assert isinstance(sent, m.SetPositionTargetLocalNed)
     assert (sent.coordinate_frame, sent.type_mask) == (1, 0xC3F)
     assert (sent.afx, sent.afy, sent.afz) == (0.5, 0.25, -0.125)
@@ -99,9 +93,7 @@ async def test_acceleration(flying: Flight) -> None:
 
 
 async def test_local_position(flying: Flight) -> None:
-    sent = await first_sent(
-        flying, flying.vehicle.guided.local_position(LocalPositionSetpoint(5.0, 6.0, -12.0))
-    )
+    sent = await first_sent(flying, flying.vehicle.guided.local_position(LocalPositionSetpoint(5.0, 6.0, -12.0)))
     assert isinstance(sent, m.SetPositionTargetLocalNed)
     assert (sent.coordinate_frame, sent.type_mask) == (1, 0xDF8)
     assert (sent.x, sent.y, sent.z) == (5.0, 6.0, -12.0)
@@ -128,7 +120,7 @@ async def test_attitude(flying: Flight) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [2.0, 10.0, 40.0])
-async def test_the_rate_is_kept(flying: Flight, rate_hz: float) -> None:
+async def test_setpoint_stream_rate_is_kept(flying: Flight, rate_hz: float) -> None:
     async with flying.vehicle.guided.velocity(rate_hz=rate_hz) as stream:
         flying.wire.forget()
         await stream.fly(NORTH, 5.0)
@@ -141,7 +133,7 @@ async def test_the_rate_is_kept(flying: Flight, rate_hz: float) -> None:
 # ------------------------------------------------------------------------------- what it does
 
 
-async def test_the_vehicle_flies_it(flying: Flight) -> None:
+async def test_setpoint_stream_is_flown(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity() as stream:
         await stream.fly(NORTH, 6.0)
         assert flying.copter.motion.velocity_north == pytest.approx(3.0, abs=0.1)
@@ -150,14 +142,14 @@ async def test_the_vehicle_flies_it(flying: Flight) -> None:
     assert flying.vehicle.mode_name == "BRAKE"
 
 
-async def test_body_velocity_is_seen_from_the_nose(flying: Flight) -> None:
+async def test_body_velocity_is_in_body_frame(flying: Flight) -> None:
     await flying.vehicle.set_heading(90.0, tolerance_deg=0.5)
     async with flying.vehicle.guided.body_velocity() as stream:
         await stream.fly(BodyVelocitySetpoint(forward_m_s=2.0), 6.0)
         assert flying.copter.motion.velocity_east == pytest.approx(2.0, abs=0.2)
 
 
-async def test_a_heading_with_a_body_velocity_is_a_heading(flying: Flight) -> None:
+async def test_body_velocity_with_heading_keeps_heading(flying: Flight) -> None:
     """In MAV_FRAME_BODY_NED ArduPilot counts yaw from where the nose points; users give degrees from north."""
     await flying.vehicle.set_heading(40.0)
     async with flying.vehicle.guided.body_velocity() as stream:
@@ -166,7 +158,7 @@ async def test_a_heading_with_a_body_velocity_is_a_heading(flying: Flight) -> No
         assert flying.copter.motion.velocity_north == pytest.approx(-2.0, abs=0.2)
 
 
-async def test_entering_changes_to_guided(flying: Flight) -> None:
+async def test_setpoint_stream_entry_changes_to_guided(flying: Flight) -> None:
     flying.pilot_takes_over()
     await anyio.sleep(1.0)
     async with flying.vehicle.guided.local_position(LocalPositionSetpoint(10.0, 0.0, -10.0)) as stream:
@@ -178,7 +170,7 @@ async def test_entering_changes_to_guided(flying: Flight) -> None:
 # ------------------------------------------------------------------------------ how it ends
 
 
-async def test_left_in_peace_the_vehicle_holds(flying: Flight) -> None:
+async def test_block_left_normally_vehicle_holds(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity() as stream:
         await stream.fly(NORTH, 3.0)
     assert not stream.is_running
@@ -187,18 +179,18 @@ async def test_left_in_peace_the_vehicle_holds(flying: Flight) -> None:
     assert speed_of(flying.copter) < 0.1
 
 
-async def test_the_body_raises(flying: Flight) -> None:
+async def test_setpoint_stream_body_raises_holds(flying: Flight) -> None:
     with pytest.raises(ZeroDivisionError):
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 3.0)
             _ = 1 / 0
-    assert flying.wire.mode_orders()[-1] == BRAKE  # it went out before the error left the block
+    assert flying.wire.mode_orders()[-1] == BRAKE  # It was sent before the exception left the block.
     await stays_quiet(flying)
     assert flying.copter.mode.number == BRAKE
     assert speed_of(flying.copter) < 0.1
 
 
-async def test_cancelled(flying: Flight) -> None:
+async def test_setpoint_stream_cancelled_holds(flying: Flight) -> None:
     async def fly_on() -> None:
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, math.inf)
@@ -210,7 +202,7 @@ async def test_cancelled(flying: Flight) -> None:
     assert flying.copter.mode.number == BRAKE
 
 
-async def test_cancelled_while_entering() -> None:
+async def test_setpoint_stream_cancelled_while_entering_holds() -> None:
     async with in_the_air(latency_s=0.5) as flying:
         flying.pilot_takes_over()
         await anyio.sleep(2.0)
@@ -223,7 +215,7 @@ async def test_cancelled_while_entering() -> None:
         await stays_quiet(flying)
 
 
-async def test_the_whole_program_is_cancelled() -> None:
+async def test_program_cancelled_leaves_nothing() -> None:
     """The order to hold goes out although connection and loop are about to end."""
     flight: Flight | None = None
     with anyio.move_on_after(30.0):
@@ -233,8 +225,8 @@ async def test_the_whole_program_is_cancelled() -> None:
     assert flight.wire.mode_orders() == [GUIDED, BRAKE] or flight.wire.mode_orders() == [BRAKE]
 
 
-async def test_no_new_setpoint_for_too_long(flying: Flight) -> None:
-    with pytest.raises(SetpointStreamStopped, match=r"no new set-point came for 1\.\d s \(valid_for_s = 1\)"):
+async def test_setpoint_stream_not_fed_stops(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match=r"no new set-point was supplied for 1\.\d s \(valid_for_s = 1\)"):
         async with flying.vehicle.guided.velocity(valid_for_s=1.0) as stream:
             stream.set(NORTH)
             fed_at = now()
@@ -246,7 +238,7 @@ async def test_no_new_setpoint_for_too_long(flying: Flight) -> None:
     await stays_quiet(flying)
 
 
-async def test_set_after_the_stop_raises_and_leaving_does_not_again(flying: Flight) -> None:
+async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(valid_for_s=0.5) as stream:
         await anyio.sleep(2.0)
         with pytest.raises(SetpointStreamStopped, match="told to hold"):
@@ -254,14 +246,14 @@ async def test_set_after_the_stop_raises_and_leaving_does_not_again(flying: Flig
     await stays_quiet(flying)
 
 
-async def test_leaving_by_an_error_of_ones_own_keeps_that_error(flying: Flight) -> None:
+async def test_setpoint_stream_exit_by_exception_keeps_it(flying: Flight) -> None:
     with pytest.raises(ZeroDivisionError):
         async with flying.vehicle.guided.velocity(valid_for_s=0.5):
             await anyio.sleep(2.0)
             _ = 1 / 0
 
 
-async def test_fly_tells_that_it_stopped(flying: Flight) -> None:
+async def test_setpoint_stream_fly_raises_when_stopped(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity() as stream, anyio.create_task_group() as tasks:
 
         async def pilot() -> None:
@@ -273,7 +265,7 @@ async def test_fly_tells_that_it_stopped(flying: Flight) -> None:
             await stream.fly(NORTH, 60.0)
 
 
-async def test_the_event_loop_is_blocked(flying: Flight) -> None:
+async def test_setpoint_stream_loop_blocked_stops(flying: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* told to hold"):
         async with flying.vehicle.guided.velocity(valid_for_s=60.0, max_lag_s=0.5) as stream:
             stream.set(NORTH)
@@ -288,17 +280,17 @@ async def test_the_event_loop_is_blocked(flying: Flight) -> None:
     assert flying.copter.mode.number == BRAKE
 
 
-async def test_a_short_hiccup_of_the_loop_is_put_up_with(flying: Flight) -> None:
+async def test_setpoint_stream_short_loop_delay_continues(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(max_lag_s=0.5) as stream:
         await stream.fly(NORTH, 1.0)
         flying.wire.forget()
         block_loop(0.4)
         await stream.fly(NORTH, 1.0)
         assert stream.is_running
-        assert len(flying.wire.setpoints()) <= 12  # what was missed is not sent in a burst
+        assert len(flying.wire.setpoints()) <= 12  # Missed set-points are not sent in a burst.
 
 
-async def test_a_pilot_takes_over(flying: Flight) -> None:
+async def test_setpoint_stream_pilot_takes_over_stops(flying: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER") as caught:
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 3.0)
@@ -310,7 +302,7 @@ async def test_a_pilot_takes_over(flying: Flight) -> None:
     assert flying.copter.mode.number == LOITER
 
 
-async def test_a_pilot_takes_over_right_before_the_block_is_left() -> None:
+async def test_setpoint_stream_takeover_before_exit_sends_no_hold() -> None:
     """The stream has not noticed yet; the vehicle is the pilot's all the same."""
     async with in_the_air() as flying:
         with pytest.raises(SetpointStreamStopped, match="left GUIDED for LOITER"):
@@ -324,7 +316,7 @@ async def test_a_pilot_takes_over_right_before_the_block_is_left() -> None:
         assert flying.copter.mode.number == LOITER
 
 
-async def test_the_vehicle_lands_and_disarms(flying: Flight) -> None:
+async def test_land_ends_with_disarming(flying: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match="disarmed"):
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 1.0)
@@ -333,7 +325,7 @@ async def test_the_vehicle_lands_and_disarms(flying: Flight) -> None:
     await stays_quiet(flying)
 
 
-async def test_armed_and_disarmed_while_it_is_open(grounded: Flight) -> None:
+async def test_setpoint_stream_survives_disarm_and_arm(grounded: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match="disarmed"):
         async with grounded.vehicle.guided.velocity(valid_for_s=60.0) as stream:
             await grounded.vehicle.arm()
@@ -344,7 +336,7 @@ async def test_armed_and_disarmed_while_it_is_open(grounded: Flight) -> None:
     await stays_quiet(grounded)
 
 
-async def test_the_connection_is_lost(flying: Flight) -> None:
+async def test_setpoint_stream_connection_lost_raises(flying: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match="cable was pulled out") as caught:
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 1.0)
@@ -354,7 +346,7 @@ async def test_the_connection_is_lost(flying: Flight) -> None:
     assert "told to hold" not in str(caught.value)
 
 
-async def test_the_vehicle_falls_silent(flying: Flight) -> None:
+async def test_setpoint_stream_vehicle_silent_stops(flying: Flight) -> None:
     with pytest.raises(SetpointStreamStopped, match=r"silent for \d"):
         async with flying.vehicle.guided.velocity() as stream:
             await stream.fly(NORTH, 1.0)
@@ -365,7 +357,7 @@ async def test_the_vehicle_falls_silent(flying: Flight) -> None:
 # --------------------------------------------------------------------------------- entering
 
 
-async def test_a_refused_mode_is_told_and_the_vehicle_is_left_alone(flying: Flight) -> None:
+async def test_setpoint_stream_mode_refused_raises_without_hold(flying: Flight) -> None:
     flying.pilot_takes_over()
     await anyio.sleep(1.0)
     flying.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.FAILED, "Mode change to GUIDED failed: no")
@@ -377,7 +369,7 @@ async def test_a_refused_mode_is_told_and_the_vehicle_is_left_alone(flying: Flig
     assert flying.wire.setpoints() == []
 
 
-async def test_a_silent_vehicle_is_a_timeout(flying: Flight) -> None:
+async def test_set_mode_silent_vehicle_times_out(flying: Flight) -> None:
     flying.pilot_takes_over()
     await anyio.sleep(1.0)
     flying.copter.faults.silent = True
@@ -386,7 +378,7 @@ async def test_a_silent_vehicle_is_a_timeout(flying: Flight) -> None:
             raise AssertionError("entered")
 
 
-async def test_a_stream_is_used_inside_its_block_and_once(flying: Flight) -> None:
+async def test_setpoint_stream_outside_block_or_reused_raises(flying: Flight) -> None:
     stream = flying.vehicle.guided.velocity()
     with pytest.raises(SetpointStreamStopped, match="not running"):
         stream.set(NORTH)
@@ -416,7 +408,7 @@ async def test_wrong_arguments(grounded: Flight, make: Callable[[Any], object]) 
         make(grounded.vehicle.guided)
 
 
-async def test_there_is_one_stream_at_a_time(flying: Flight) -> None:
+async def test_second_setpoint_stream_raises_busy(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity() as stream:
         with pytest.raises(BusyError, match="another set-point stream is open"):
             async with flying.vehicle.guided.body_velocity():
@@ -424,8 +416,8 @@ async def test_there_is_one_stream_at_a_time(flying: Flight) -> None:
         assert stream.is_running
 
 
-async def test_left_after_a_silence_it_says_that_nothing_was_sent(flying: Flight) -> None:
-    """Too short a silence to stop it, and too long a one to know who steers."""
+async def test_block_left_after_silence_warns_nothing_was_sent(flying: Flight) -> None:
+    """The silence is too short to stop the stream, and too long to exclude a takeover."""
     with pytest.raises(SetpointStreamStopped, match=r"silent for (2\.[5-9]|3\.\d) s"):
         async with flying.vehicle.guided.velocity() as stream:
             flying.copter.faults.silent = True
@@ -435,7 +427,7 @@ async def test_left_after_a_silence_it_says_that_nothing_was_sent(flying: Flight
     assert not flying.wire.mode_orders()
 
 
-async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Flight) -> None:
+async def test_invalid_setpoints_raise_before_sending(flying: Flight) -> None:
     guided = flying.vehicle.guided
     for stream in (
         guided.velocity(VelocitySetpoint(math.nan)),
@@ -454,7 +446,7 @@ async def test_wrong_setpoints_are_refused_before_anything_is_sent(flying: Fligh
     assert not flying.wire.setpoints()
 
 
-async def test_a_wrong_setpoint_leaves_the_one_before_in_force(flying: Flight) -> None:
+async def test_invalid_setpoint_keeps_previous(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(valid_for_s=5.0) as stream:
         stream.set(NORTH)
         for wrong in (math.nan, 1e39):
@@ -465,12 +457,12 @@ async def test_a_wrong_setpoint_leaves_the_one_before_in_force(flying: Flight) -
         assert {each.vx for each in flying.wire.all(m.SetPositionTargetLocalNed)} == {3.0}
 
 
-async def test_kinds_that_the_autopilot_ignores_are_not_offered() -> None:
-    """ArduPlane obeys attitudes only; a velocity would be sent to nobody."""
+async def test_unsupported_setpoint_kinds_raise() -> None:
+    """ArduPlane obeys attitudes only; a velocity would be ignored."""
     from aerokit.autopilots import ArduPlane
 
     async with open_flight() as flight:
-        flight.vehicle._talk.autopilot = ArduPlane(1)
+        flight.vehicle._session.autopilot = ArduPlane(1)
         with pytest.raises(NotSupported, match=r"velocity.*attitude"):
             async with flight.vehicle.guided.velocity():
                 raise AssertionError("entered")
@@ -484,7 +476,7 @@ async def px4_in_the_air(flight: Px4Flight) -> None:
     await flight.take_off()
 
 
-async def test_px4_sees_the_stream_before_it_is_asked_for_offboard() -> None:
+async def test_px4_stream_starts_before_offboard_request() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         async with flight.vehicle.guided.velocity(rate_hz=20.0) as stream:
@@ -516,18 +508,16 @@ async def test_px4_refuses_offboard() -> None:
         assert flight.vehicle.mode_name == "LOITER"
 
 
-async def test_px4_stream_that_stopped_while_offboard_was_asked_for_is_not_entered() -> None:
+async def test_px4_stream_stopped_during_offboard_request_raises() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         asyncio.get_running_loop().call_later(1.005, block_loop, 1.5)
-        with pytest.raises(
-            SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* told to hold"
-        ):
+        with pytest.raises(SetpointStreamStopped, match=r"event loop was blocked for 1\.\d s; .* told to hold"):
             async with flight.vehicle.guided.velocity(NORTH, valid_for_s=5):
                 raise AssertionError("entered")
 
 
-async def test_px4_block_left_by_an_error() -> None:
+async def test_px4_setpoint_stream_exit_by_exception_holds() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         with pytest.raises(ZeroDivisionError):
@@ -542,7 +532,7 @@ async def test_px4_block_left_by_an_error() -> None:
         assert math.hypot(flight.px4.motion.velocity_north, flight.px4.motion.velocity_east) < 0.2
 
 
-async def test_px4_cancelled_while_entering() -> None:
+async def test_px4_setpoint_stream_cancelled_while_entering_holds() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         for seconds in (0.5, 1.01, 1.3):
@@ -556,9 +546,7 @@ async def test_px4_cancelled_while_entering() -> None:
             assert not flight.wire.setpoints()
 
 
-async def test_px4_of_a_pilot_is_left_to_him_when_the_entry_is_cancelled_before_offboard_was_asked_for() -> (
-    None
-):
+async def test_px4_entry_cancelled_before_offboard_request_keeps_pilot() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         flight.px4.switch_to(POSITION)
@@ -571,7 +559,7 @@ async def test_px4_of_a_pilot_is_left_to_him_when_the_entry_is_cancelled_before_
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.6, 0.9])
-async def test_no_setpoint_is_sent_to_a_vehicle_that_is_silent_for_three_and_a_half_seconds(
+async def test_setpoint_stream_stops_after_silence(
     phase: float,
 ) -> None:
     """Whenever the second begins in which silence is looked for."""
@@ -588,9 +576,7 @@ async def test_no_setpoint_is_sent_to_a_vehicle_that_is_silent_for_three_and_a_h
         assert flight.vehicle.is_silent
 
 
-async def test_px4_of_a_pilot_is_left_to_him_when_a_mission_is_cancelled_before_its_mode_was_asked_for() -> (
-    None
-):
+async def test_px4_mission_cancelled_before_mode_request_keeps_pilot() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         here = flight.vehicle.position.value

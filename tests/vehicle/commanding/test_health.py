@@ -1,4 +1,4 @@
-"""Arming and disarming, and why it is refused: what the vehicle says, what its sensors and its estimator say."""
+"""Arming and disarming, and the reasons for a refusal: status texts, sensors, estimator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.anyio
 ARM = MavCmd.COMPONENT_ARM_DISARM
 
 
-async def test_arm_and_disarm_end_when_heartbeat_says_so(grounded: Flight) -> None:
+async def test_arm_and_disarm_wait_for_heartbeat(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     await vehicle.arm()
     assert (vehicle.is_armed, vehicle.armed.value, grounded.copter.is_armed) == (True, True, True)
@@ -28,19 +28,19 @@ async def test_arm_and_disarm_end_when_heartbeat_says_so(grounded: Flight) -> No
     assert (disarm.param1, disarm.param2) == (0.0, 0.0)
 
 
-async def test_arming_an_armed_vehicle_is_no_error(grounded: Flight) -> None:
+async def test_arm_already_armed_succeeds(grounded: Flight) -> None:
     await grounded.vehicle.arm()
     await grounded.vehicle.arm()
     assert grounded.vehicle.is_armed
 
 
-async def test_a_lost_answer_is_made_up_for_by_what_is_told(grounded: Flight) -> None:
+async def test_command_ack_lost_effect_reported_succeeds(grounded: Flight) -> None:
     grounded.copter.faults.lose_ack(ARM)
     await grounded.vehicle.arm()
-    assert len(grounded.wire.commands(ARM)) == 1  # HEARTBEAT has told that it was heard
+    assert len(grounded.wire.commands(ARM)) == 1  # HEARTBEAT has confirmed the command.
 
 
-async def test_arm_order_is_lost_ends_and_is_not_repeated(grounded: Flight) -> None:
+async def test_arm_command_lost_is_not_repeated(grounded: Flight) -> None:
     grounded.copter.faults.ignore(ARM, times=1)
     with pytest.raises(CommandTimeout, match=r"never sent again: a second one arms a vehicle that a pilot"):
         await grounded.vehicle.arm()
@@ -57,7 +57,7 @@ async def test_disarm_order_is_lost_is_repeated(grounded: Flight) -> None:
     assert (first.confirmation, second.confirmation) == (0, 1)  # type: ignore[union-attr]
 
 
-async def test_refused_with_the_vehicles_own_words(grounded: Flight) -> None:
+async def test_arm_refused_has_status_texts(grounded: Flight) -> None:
     grounded.copter.faults.prearm_failures += ["Compass not healthy", "Gyros inconsistent"]
     with pytest.raises(CommandRejected) as caught:
         await grounded.vehicle.arm()
@@ -65,10 +65,10 @@ async def test_refused_with_the_vehicles_own_words(grounded: Flight) -> None:
     assert "Arm: Compass not healthy" in caught.value.reasons
     assert "Arm: Gyros inconsistent" in caught.value.reasons
     assert "\n  - Arm: Compass not healthy" in str(caught.value)
-    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # it has spoken already
+    assert not grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)  # It has sent a status text already.
 
 
-async def test_refused_in_silence_asks_the_vehicle_to_run_its_checks(grounded: Flight) -> None:
+async def test_arm_refused_without_text_requests_checks(grounded: Flight) -> None:
     grounded.copter.faults.refuse(ARM, MavResult.FAILED)
     grounded.copter.faults.prearm_failures.append("Compass not healthy")
     with pytest.raises(CommandRejected) as caught:
@@ -77,14 +77,14 @@ async def test_refused_in_silence_asks_the_vehicle_to_run_its_checks(grounded: F
     assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 1
 
 
-async def test_each_reason_is_told_once(grounded: Flight) -> None:
+async def test_duplicate_reasons_are_removed(grounded: Flight) -> None:
     grounded.copter.faults.prearm_failures.append("Compass not healthy")
     with pytest.raises(CommandRejected) as caught:
         await grounded.vehicle.arm()
     assert len(set(caught.value.reasons)) == len(caught.value.reasons)
 
 
-async def test_what_is_said_meanwhile_and_is_no_reason_is_left_out(grounded: Flight) -> None:
+async def test_informational_texts_are_no_reason(grounded: Flight) -> None:
     copter, refuse = grounded.copter, grounded.copter.faults.prearm_failures
     refuse.append("Compass not healthy")
     say_more = copter.send_text
@@ -106,7 +106,7 @@ async def test_what_is_said_meanwhile_and_is_no_reason_is_left_out(grounded: Fli
     assert "Barometer" not in str(caught.value)
 
 
-async def test_too_early_names_the_estimator_and_the_failing_bits() -> None:
+async def test_arm_too_early_names_estimator_and_failing_sensors() -> None:
     async with open_flight(SimulatedCopter(boot_time_s=60.0)) as flight:
         await anyio.sleep(12.0)
         await flight.vehicle.set_mode("GUIDED")
@@ -125,17 +125,17 @@ async def test_force_skips_the_checks(grounded: Flight) -> None:
     assert grounded.wire.commands(ARM)[0].param2 == 21196.0
 
 
-async def test_accepted_but_not_armed_is_a_timeout(grounded: Flight) -> None:
+async def test_arm_accepted_not_executed_times_out(grounded: Flight) -> None:
     grounded.copter.arming.arm = lambda **_: True  # type: ignore[method-assign]
     started = now()
     with pytest.raises(
-        OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle said nothing about it"
+        OperationTimeout, match=r"arm\(\): not done within 3 s; the vehicle sent no status text about it"
     ):
         await grounded.vehicle.arm(timeout=3.0)
     assert 3.0 <= now() - started < 4.0
 
 
-async def test_a_silent_vehicle_is_a_timeout(grounded: Flight) -> None:
+async def test_set_mode_silent_vehicle_times_out(grounded: Flight) -> None:
     grounded.copter.faults.silent = True
     with pytest.raises(
         CommandTimeout,
@@ -153,8 +153,8 @@ async def test_disarm_in_the_air_is_refused_and_forced(flying: Flight) -> None:
     assert [each.param2 for each in flying.wire.commands(ARM)] == [0.0, 21196.0]
 
 
-async def test_an_answer_that_was_left_behind_is_not_the_next_ones() -> None:
-    """arm() is cancelled while its refusal is under way; disarm() must not take that for its own answer."""
+async def test_late_ack_of_cancelled_command_is_ignored() -> None:
+    """arm() is cancelled before its refusal arrives; disarm() must not take that for its own ack."""
     async with open_flight(latency_s=0.2) as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.refuse(ARM, MavResult.FAILED, times=1)
@@ -166,7 +166,7 @@ async def test_an_answer_that_was_left_behind_is_not_the_next_ones() -> None:
 # ---------------------------------------------------------------------------- beforehand
 
 
-async def test_nothing_keeps_it_from_arming(grounded: Flight) -> None:
+async def test_why_not_armable_ready_vehicle_returns_nothing(grounded: Flight) -> None:
     assert await grounded.vehicle.why_not_armable() == []
     await grounded.vehicle.arm()
     assert await grounded.vehicle.why_not_armable() == []
@@ -181,27 +181,25 @@ async def test_why_not_armable_names_failing_checks_without_arming(grounded: Fli
     assert not grounded.copter.is_armed
 
 
-async def test_why_not_armable_names_a_mode_that_cannot_be_armed_in(grounded: Flight) -> None:
+async def test_why_not_armable_names_unarmable_mode(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("LAND")
-    assert any("does not arm in LAND" in reason for reason in await grounded.vehicle.why_not_armable())
+    assert any("cannot arm in LAND" in reason for reason in await grounded.vehicle.why_not_armable())
 
 
-async def test_why_not_armable_works_when_the_vehicle_cannot_run_its_checks(grounded: Flight) -> None:
+async def test_why_not_armable_without_check_command_works(grounded: Flight) -> None:
     grounded.copter.faults.refuse(MavCmd.RUN_PREARM_CHECKS, MavResult.UNSUPPORTED)
     grounded.copter.faults.prearm_failures.append("Compass not healthy")
     await anyio.sleep(3.0)
-    assert await grounded.vehicle.why_not_armable() == [
-        "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
-    ]
+    assert await grounded.vehicle.why_not_armable() == ["the vehicle's pre-arm checks do not pass (SYS_STATUS)"]
 
 
-async def test_why_not_armable_asks_a_vehicle_that_does_not_answer_twice(grounded: Flight) -> None:
+async def test_why_not_armable_unanswered_request_is_repeated(grounded: Flight) -> None:
     grounded.copter.faults.ignore(MavCmd.RUN_PREARM_CHECKS)
     assert await grounded.vehicle.why_not_armable() == []
     assert len(grounded.wire.commands(MavCmd.RUN_PREARM_CHECKS)) == 2
 
 
-async def test_why_not_armable_gives_the_vehicle_a_second_for_its_texts(grounded: Flight) -> None:
+async def test_why_not_armable_waits_for_status_texts(grounded: Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
         async def say_it_late() -> None:
@@ -218,12 +216,10 @@ async def test_why_not_armable_works_without_default_streams() -> None:
     copter.faults.prearm_failures.append("Compass not healthy")
     async with open_flight(copter, rates={}) as flight:
         await anyio.sleep(3.0)
-        assert await flight.vehicle.why_not_armable() == [
-            "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
-        ]
+        assert await flight.vehicle.why_not_armable() == ["the vehicle's pre-arm checks do not pass (SYS_STATUS)"]
 
 
-async def test_what_was_said_long_ago_is_no_reason(grounded: Flight) -> None:
+async def test_old_status_text_is_no_reason(grounded: Flight) -> None:
     grounded.copter.faults.prearm_failures.append("Compass not healthy")
     assert await grounded.vehicle.why_not_armable()
     grounded.copter.faults.prearm_failures.clear()
@@ -234,7 +230,7 @@ async def test_what_was_said_long_ago_is_no_reason(grounded: Flight) -> None:
 # ------------------------------------------------------------------------------------------ PX4
 
 
-async def test_px4_says_why_not() -> None:
+async def test_px4_arm_refused_says_why() -> None:
     async with open_px4(SimulatedPx4(boot_time_s=30.0)) as flight:
         await anyio.sleep(3.0)
         reasons = await flight.vehicle.why_not_armable()
@@ -262,7 +258,7 @@ async def test_px4_disarm_in_the_air_says_why_not() -> None:
         assert flight.px4.is_armed
 
 
-async def test_values_from_before_the_link_was_restored_count_no_more(grounded: Flight) -> None:
+async def test_values_before_link_restored_are_discarded(grounded: Flight) -> None:
     """The vehicle may have rebooted while the link was away for a moment."""
     vehicle, connection = grounded.vehicle, grounded.vehicle.connection
     assert vehicle.missing_for_flight() == []

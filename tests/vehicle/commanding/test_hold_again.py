@@ -1,4 +1,4 @@
-"""An order to hold that is left of a flight that was given up: at once, and until it is obeyed."""
+"""Hold after an abandoned flight: sent at once, and repeated until it is obeyed."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ async def give_up(flight: Flight) -> None:
     assert scope.cancelled_caught
 
 
-async def test_it_goes_out_in_the_same_instant() -> None:
+async def test_hold_is_sent_in_same_iteration() -> None:
     async with in_the_air() as flight:
         await give_up(flight)
         assert flight.wire.sent[-1][0] == now()
         assert flight.wire.mode_orders() == [BRAKE]
 
 
-async def test_it_is_over_when_the_vehicle_has_confirmed_it() -> None:
+async def test_hold_pending_ends_with_confirmation() -> None:
     async with in_the_air() as flight:
-        holding, told = flight.vehicle._bridge.holding, list[bool]()
-        told.append(holding.is_told_to_hold)
+        holding, told = flight.vehicle._context.flight_cleanup, list[bool]()
+        told.append(holding.is_hold_pending)
         await give_up(flight)
-        told.append(holding.is_told_to_hold)
+        told.append(holding.is_hold_pending)
         await anyio.sleep(3.0)
-        told.append(holding.is_told_to_hold)
+        told.append(holding.is_hold_pending)
         assert flight.copter.mode.number == BRAKE
         assert told == [False, True, False]
 
 
-async def test_px4_too_is_told_in_the_same_instant() -> None:
+async def test_px4_hold_is_sent_in_same_iteration() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         with anyio.move_on_after(2.0):
@@ -54,7 +54,7 @@ async def test_px4_too_is_told_in_the_same_instant() -> None:
 
 
 @pytest.mark.parametrize("silent_s", [3.0, 60.0])
-async def test_lost_in_a_silence_it_is_given_again_however_long_that_was(silent_s: float) -> None:
+async def test_hold_lost_in_silence_is_repeated_after_it(silent_s: float) -> None:
     async with in_the_air() as flight:
         await give_up(flight)
         flight.copter.faults.silent = True
@@ -66,41 +66,41 @@ async def test_lost_in_a_silence_it_is_given_again_however_long_that_was(silent_
         assert flight.vehicle.mode_name == "BRAKE"
 
 
-async def test_to_a_vehicle_that_does_not_obey_it_is_told_in_three_rounds(
+async def test_hold_ignored_is_repeated_three_times(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with in_the_air() as flight:
         flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
         await give_up(flight)
         await anyio.sleep(60.0)
-        told = [each for each in caplog.messages if "has not confirmed it yet" in each]
+        told = [each for each in caplog.messages if "is not confirmed yet" in each]
         assert len(told) == 3
         flight.wire.forget()
         await anyio.sleep(60.0)
         assert not flight.wire.mode_orders()
 
 
-async def test_a_refused_hold_is_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_refused_hold_warns_once(caplog: pytest.LogCaptureFixture) -> None:
     async with in_the_air() as flight:
         flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
         await give_up(flight)
         await anyio.sleep(10.0)
-        (record,) = [each for each in caplog.records if "told to hold" in each.message]
-        assert record.message.startswith("the vehicle was told to hold and does not: ")
+        (record,) = [each for each in caplog.records if "does not hold" in each.message]
+        assert record.message.startswith("the vehicle does not hold after an abandoned flight: ")
         assert flight.wire.mode_orders() == [BRAKE]
 
 
-async def test_hold_left_to_be_given_is_not_once_a_pilot_has_the_vehicle() -> None:
-    """Given up in a silence; when the vehicle is heard again, its mode is a pilot's."""
+async def test_pending_hold_is_dropped_after_takeover() -> None:
+    """Abandoned in a silence; when the vehicle is received again, its mode is a pilot's."""
     async with in_the_air() as flight:
         asyncio.get_running_loop().call_later(1.5, setattr, flight.copter.faults, "silent", True)
         with anyio.move_on_after(6.0):
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=200))
-        assert flight.vehicle.is_told_to_hold
+        assert flight.vehicle.is_hold_pending
         flight.wire.forget()
         flight.pilot_takes_over()
         flight.copter.faults.silent = False
         await anyio.sleep(5.0)
         assert flight.wire.mode_orders() == []
         assert flight.copter.mode.name == "LOITER"
-        assert not flight.vehicle.is_told_to_hold
+        assert not flight.vehicle.is_hold_pending

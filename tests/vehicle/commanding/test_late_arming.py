@@ -1,4 +1,4 @@
-"""An order to arm that was given up: what is watched afterwards, and what is left alone."""
+"""Abandoned arm commands: monitoring afterwards, and armings that are left alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
-LATE_S = 15.0
+ARM_WATCH_S = 15.0
 
 pytestmark = pytest.mark.anyio
 
@@ -26,7 +26,7 @@ def ordered(flight: Flight) -> list[float]:
     return [each.param1 for each in flight.wire.commands(ARM)]
 
 
-async def test_who_arms_after_it_was_given_up_is_disarmed(grounded: Flight) -> None:
+async def test_arming_after_abandoned_order_is_undone(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     with anyio.move_on_after(0.0):
         await grounded.vehicle.arm()
@@ -35,7 +35,7 @@ async def test_who_arms_after_it_was_given_up_is_disarmed(grounded: Flight) -> N
     assert not grounded.copter.is_armed
 
 
-async def test_only_what_is_told_after_it_was_given_up_counts(grounded: Flight) -> None:
+async def test_late_arming_counts_only_later_reports(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.lose_ack(ARM)
     scope = anyio.CancelScope()
@@ -45,13 +45,13 @@ async def test_only_what_is_told_after_it_was_given_up_counts(grounded: Flight) 
     assert scope.cancelled_caught
     detach()
     assert grounded.vehicle.is_armed
-    grounded.copter.arming.disarm()  # somebody else, before another heartbeat
+    grounded.copter.arming.disarm()  # By another party, before the next heartbeat.
     await anyio.sleep(5.0)
     assert ordered(grounded) == [1]
 
 
 @pytest.mark.parametrize("ends", ["cancelled", "unanswered"])
-async def test_who_was_armed_before_is_left_alone(flying: Flight, ends: str) -> None:
+async def test_vehicle_armed_before_order_stays_armed(flying: Flight, ends: str) -> None:
     """It flies: that it is armed is nothing that this order has done."""
     if ends == "cancelled":
         with anyio.move_on_after(0.0):
@@ -64,7 +64,7 @@ async def test_who_was_armed_before_is_left_alone(flying: Flight, ends: str) -> 
     assert ordered(flying).count(0) == 0
 
 
-async def test_disarming_goes_on_when_the_time_to_watch_ends(grounded: Flight) -> None:
+async def test_late_disarm_continues_after_watch_time(grounded: Flight) -> None:
     """It armed in the last moment, and the first order to disarm is lost."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
@@ -74,7 +74,7 @@ async def test_disarming_goes_on_when_the_time_to_watch_ends(grounded: Flight) -
     with anyio.move_on_after(0.0):
         await grounded.vehicle.arm()
     (order,) = grounded.wire.commands(ARM)
-    await anyio.sleep(LATE_S - 1.0)
+    await anyio.sleep(ARM_WATCH_S - 1.0)
     grounded.copter.faults.commands.clear()
     grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
     await anyio.sleep(0.1)
@@ -88,9 +88,7 @@ async def test_disarming_goes_on_when_the_time_to_watch_ends(grounded: Flight) -
     assert not grounded.copter.is_armed
 
 
-async def test_who_cannot_be_disarmed_again_is_told_of(
-    grounded: Flight, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_failed_late_disarm_logs_error(grounded: Flight, caplog: pytest.LogCaptureFixture) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     with anyio.move_on_after(0.0):
         await grounded.vehicle.arm()
@@ -98,13 +96,11 @@ async def test_who_cannot_be_disarmed_again_is_told_of(
     grounded.copter.faults.refuse(ARM, MavResult.FAILED)
     await anyio.sleep(5.0)
     (record,) = [each for each in caplog.records if each.levelname == "ERROR"]
-    assert "the vehicle armed after the order was given up, and could not be disarmed" in record.message
+    assert "an abandoned arm command has armed the vehicle, and it could not be disarmed" in record.message
     assert grounded.copter.is_armed
 
 
-async def test_pilot_who_arms_after_his_mode_change_stays_armed(
-    grounded: Flight, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_pilot_arming_after_mode_change_stays_armed(grounded: Flight, caplog: pytest.LogCaptureFixture) -> None:
     """His mode change has ended the call, whose order was lost."""
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
     await grounded.vehicle.set_mode("GUIDED")
@@ -114,13 +110,13 @@ async def test_pilot_who_arms_after_his_mode_change_stays_armed(
         await grounded.vehicle.arm()
     await anyio.sleep(0.3)
     assert grounded.copter.arming.arm()
-    await anyio.sleep(LATE_S)
+    await anyio.sleep(ARM_WATCH_S)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
-    assert "nothing shows that this order did it: it is left armed" in caplog.text
+    assert "not certain that this command armed it: it stays armed" in caplog.text
 
 
-async def test_pilot_who_arms_later_by_his_sticks_stays_armed(grounded: Flight) -> None:
+async def test_pilot_arming_later_by_sticks_stays_armed(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("STABILIZE")
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
     grounded.copter.faults.ignore(ARM)
@@ -128,13 +124,13 @@ async def test_pilot_who_arms_later_by_his_sticks_stays_armed(grounded: Flight) 
         await grounded.vehicle.arm()
     await anyio.sleep(3.0)
     assert grounded.copter.arming.arm()
-    await anyio.sleep(LATE_S)
+    await anyio.sleep(ARM_WATCH_S)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
 
 
-async def test_order_that_arrives_late_and_is_accepted_is_undone(grounded: Flight) -> None:
-    """The answer tells whose order it was, though it comes seconds later."""
+async def test_late_accepted_arm_is_undone(grounded: Flight) -> None:
+    """The ack shows whose order it was, although it arrives seconds later."""
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     with anyio.move_on_after(0.1):
@@ -149,8 +145,8 @@ async def test_order_that_arrives_late_and_is_accepted_is_undone(grounded: Fligh
 
 
 @pytest.mark.parametrize("kind", ["copter", "px4"])
-async def test_arming_is_never_ordered_again_after_a_pilot_disarmed(kind: str) -> None:
-    """He disarms between two HEARTBEATs, which both say disarmed; the answer was lost."""
+async def test_arm_is_not_repeated_after_pilot_disarmed(kind: str) -> None:
+    """The pilot disarms between two HEARTBEATs, which both report disarmed; the ack was lost."""
     async with open_flight() if kind == "copter" else open_px4() as flight:
         await flight.vehicle.wait_ready()
         simulated = flight.copter if isinstance(flight, Flight) else flight.px4
@@ -160,7 +156,7 @@ async def test_arming_is_never_ordered_again_after_a_pilot_disarmed(kind: str) -
         asyncio.get_running_loop().call_later(0.4, disarm, simulated)
         with pytest.raises(AerokitError):
             await flight.vehicle.arm()
-        await anyio.sleep(LATE_S)
+        await anyio.sleep(ARM_WATCH_S)
         assert [each.param1 for each in flight.wire.commands(ARM)] == [1]
         assert not simulated.is_armed
 
@@ -172,8 +168,8 @@ def disarm(simulated: SimulatedCopter | SimulatedPx4) -> None:
         simulated.arming.disarm("the pilot")
 
 
-async def test_pilot_who_disarms_at_once_and_arms_later_stays_armed(grounded: Flight) -> None:
-    """Our order was accepted and armed it; no HEARTBEAT told that before he disarmed."""
+async def test_pilot_disarming_and_arming_later_stays_armed(grounded: Flight) -> None:
+    """Our command was accepted and armed it; no HEARTBEAT reported that before the pilot disarmed."""
     await grounded.vehicle.set_mode("STABILIZE")
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
     told_at = grounded.vehicle.armed.updated_at
@@ -183,13 +179,13 @@ async def test_pilot_who_disarms_at_once_and_arms_later_stays_armed(grounded: Fl
         await grounded.vehicle.arm()
     await anyio.sleep(6.0)
     assert grounded.copter.arming.arm()
-    await anyio.sleep(LATE_S)
+    await anyio.sleep(ARM_WATCH_S)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
 
 
-async def test_answer_that_names_another_station_proves_nothing(grounded: Flight) -> None:
-    """In MAVLink 1 an answer names nobody: it may be to another station's order."""
+async def test_ack_naming_other_station_proves_nothing(grounded: Flight) -> None:
+    """A MAVLink 1 ack names no station: it may answer another station's command."""
     await grounded.vehicle.set_mode("STABILIZE")
     grounded.copter.parameters["DISARM_DELAY"] = 0.0
     grounded.copter.faults.ignore(ARM)
@@ -198,20 +194,38 @@ async def test_answer_that_names_another_station_proves_nothing(grounded: Flight
     await anyio.sleep(6.0)
     assert grounded.copter.arming.arm()
     grounded.wire.deliver(FrameEncoder(1, 1).encode(CommandAck(ARM, 0, 0, 0, 0, 0)))
-    await anyio.sleep(LATE_S)
+    await anyio.sleep(ARM_WATCH_S)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
 
 
-async def test_order_that_arms_after_the_time_to_watch_is_left_to_the_pilot(grounded: Flight) -> None:
+async def test_arming_after_watch_time_is_left_alone(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     grounded.copter.faults.ignore(ARM)
     with anyio.move_on_after(0.0):
         await grounded.vehicle.arm()
     (order,) = grounded.wire.commands(ARM)
-    await anyio.sleep(LATE_S + 2.0)
+    await anyio.sleep(ARM_WATCH_S + 2.0)
     grounded.copter.faults.commands.clear()
     grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
     await anyio.sleep(6.0)
     assert grounded.copter.is_armed
     assert ordered(grounded) == [1]
+
+
+@pytest.mark.parametrize(("ack_delay_s", "is_undone"), [(2.5, True), (4.5, False)])
+async def test_late_arming_is_undone_only_with_timely_ack(
+    grounded: Flight, ack_delay_s: float, is_undone: bool
+) -> None:
+    """Without its ack, an arming seconds after the order may be a pilot's."""
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    (order,) = grounded.wire.commands(ARM)
+    await anyio.sleep(5.0)
+    grounded.copter.faults.delay_ack(ARM, ack_delay_s)
+    grounded.wire._link.write(FrameEncoder(255, 190).encode(order))
+    await anyio.sleep(8.0)
+    assert ordered(grounded) == ([1, 0] if is_undone else [1])
+    assert grounded.copter.is_armed is not is_undone

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 
 import anyio
 import pytest
-from order_air import Air, Weather
+from order_air import Air, Disturbances
 
 import aerokit
 from aerokit.errors import AerokitError
@@ -21,7 +21,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
 )
 from aerokit.sim import SimulatedCopter, simulated_link
-from aerokit.sim.track import true_point
+from aerokit.testing.track import true_point
 
 pytestmark = pytest.mark.anyio
 
@@ -48,13 +48,13 @@ async def _ended(order: Awaitable[object]) -> None:
         await order
 
 
-def _begin(air: Air, weather: Weather) -> None:
-    air.weather = weather
+def _prepare(air: Air, disturbances: Disturbances) -> None:
+    air.disturbances = disturbances
     air.begin()
 
 
 def _commands(air: Air, command: int) -> list[tuple[float, float]]:
-    """When it was sent since the beginning, and with which param1 (176: param2)."""
+    """Return when the command was sent, and its param1 (176: param2)."""
     return [
         (
             each.at - air.began_at,
@@ -65,10 +65,10 @@ def _commands(air: Air, command: int) -> list[tuple[float, float]]:
     ]
 
 
-async def test_an_order_that_was_overruled_while_it_waited_is_never_sent() -> None:
+async def test_order_superseded_while_waiting_is_not_sent() -> None:
     async with _copter(flies=True) as (copter, vehicle, air):
         there = vehicle.position.value.offset(north_m=8)
-        _begin(air, Weather(command=MavCmd.DO_SET_MODE, lost_acks=9, lost_commands=9))
+        _prepare(air, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=9, lost_commands=9))
         async with anyio.create_task_group() as tasks:
             for order in (vehicle.set_mode("LOITER"), vehicle.land()):
                 tasks.start_soon(_ended, order)
@@ -78,9 +78,9 @@ async def test_an_order_that_was_overruled_while_it_waited_is_never_sent() -> No
         assert CopterMode.LAND not in [mode for at, mode in _commands(air, MavCmd.DO_SET_MODE) if at >= 0.1]
 
 
-async def test_an_order_waits_for_none_that_it_has_overruled() -> None:
+async def test_order_does_not_wait_for_superseded_one() -> None:
     async with _copter(flies=True) as (_, vehicle, air):
-        _begin(air, Weather(command=MavCmd.DO_SET_MODE, lost_acks=1, lost_commands=1))
+        _prepare(air, Disturbances(command=MavCmd.DO_SET_MODE, lost_acks=1, lost_commands=1))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.set_mode("LOITER"))
             await anyio.sleep(0.1)
@@ -91,10 +91,10 @@ async def test_an_order_waits_for_none_that_it_has_overruled() -> None:
         ]
 
 
-async def test_a_pilot_keeps_what_he_took_while_the_order_waited() -> None:
+async def test_takeover_while_order_waits_keeps_vehicle() -> None:
     """Both commands are the program's own, so that the second waits for the answer to the first."""
     async with _copter(flies=True) as (copter, vehicle, air):
-        _begin(air, Weather(command=MavCmd.DO_CHANGE_SPEED, lost_acks=9))
+        _prepare(air, Disturbances(command=MavCmd.DO_CHANGE_SPEED, lost_acks=9))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.command(MavCmd.DO_CHANGE_SPEED, 1, 3, -1, attempt_timeout=3))
             await anyio.sleep(0.1)
@@ -104,9 +104,9 @@ async def test_a_pilot_keeps_what_he_took_while_the_order_waited() -> None:
         assert len(_commands(air, MavCmd.DO_CHANGE_SPEED)) == 1
 
 
-async def test_disarm_does_not_wait_for_arm_and_ends_it() -> None:
+async def test_disarm_supersedes_arm_immediately() -> None:
     async with _copter(flies=False) as (copter, vehicle, air):
-        _begin(air, Weather(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=1))
+        _prepare(air, Disturbances(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=1))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.arm())
             await anyio.sleep(0.1)
@@ -117,9 +117,9 @@ async def test_disarm_does_not_wait_for_arm_and_ends_it() -> None:
         assert not true_point(copter).armed
 
 
-async def test_a_command_to_disarm_ends_arm_as_well_and_arm_ends_it() -> None:
+async def test_arm_and_disarm_commands_supersede_each_other() -> None:
     async with _copter(flies=False) as (copter, vehicle, air):
-        _begin(air, Weather(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=2))
+        _prepare(air, Disturbances(command=MavCmd.COMPONENT_ARM_DISARM, lost_acks=9, lost_commands=2))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.arm())
             await asyncio.sleep(0.1)
@@ -132,14 +132,14 @@ async def test_a_command_to_disarm_ends_arm_as_well_and_arm_ends_it() -> None:
 
 
 @pytest.mark.parametrize("legacy", [MavCmd.DO_SET_MODE, MavCmd.DO_REPOSITION])
-async def test_what_old_firmware_wants_instead_is_not_sent_for_an_order_that_ended_meanwhile(
+async def test_legacy_set_mode_is_not_sent_for_ended_order(
     legacy: MavCmd,
 ) -> None:
     """It would be sent 0.3 s after the refusal, whose reasons are waited for."""
     async with _copter(flies=True) as (copter, vehicle, air):
         copter.faults.refuse(legacy, MavResult.UNSUPPORTED)
         there = vehicle.position.value.offset(north_m=8)
-        _begin(air, Weather())
+        _prepare(air, Disturbances())
         async with anyio.create_task_group() as tasks:
             order = vehicle.set_mode("LAND") if legacy == MavCmd.DO_SET_MODE else vehicle.go_to(there)
             tasks.start_soon(_ended, order)
@@ -156,10 +156,10 @@ async def test_what_old_firmware_wants_instead_is_not_sent_for_an_order_that_end
         assert true_point(copter).mode == "GUIDED"
 
 
-async def test_a_command_that_the_program_sends_by_itself_ends_the_action_before_it() -> None:
+async def test_raw_command_supersedes_action() -> None:
     async with _copter(flies=True) as (_, vehicle, air):
         there = vehicle.position.value.offset(north_m=100)
-        _begin(air, Weather(command=MavCmd.DO_REPOSITION, lost_acks=9))
+        _prepare(air, Disturbances(command=MavCmd.DO_REPOSITION, lost_acks=9))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_ended, vehicle.go_to(there, timeout=8))
             await anyio.sleep(0.3)

@@ -26,20 +26,18 @@ from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavState
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, CommandArbiter
 from aerokit.vehicle.commanding.order import Order, Subject, subjects_of
-from aerokit.vehicle.commanding.posted import MODE_ATTEMPTS
+from aerokit.vehicle.commanding.posted import MAX_MODE_ATTEMPTS
 from aerokit.vehicle.state.telemetry import Telemetry
 
-OWN_MODES_S = 10.0
+OWN_MODES_MAX_AGE_S = 10.0
 
 HEARTBEAT = Source(1, 1, "HEARTBEAT")
-STABILIZE, GUIDED, LOITER = (
-    Mode(name, number) for number, name in ((0, "STABILIZE"), (4, "GUIDED"), (5, "LOITER"))
-)
+STABILIZE, GUIDED, LOITER = (Mode(name, number) for number, name in ((0, "STABILIZE"), (4, "GUIDED"), (5, "LOITER")))
 ARM, TAKEOFF, SET_MODE = MavCmd.COMPONENT_ARM_DISARM, MavCmd.NAV_TAKEOFF, MavCmd.DO_SET_MODE
 TAKEN, NEWER, TOLD = (
     "the mode changed to ",
     "another order was given",
-    "its effect was told",
+    "its effect was reported",
 )
 
 
@@ -74,15 +72,15 @@ class Stage:
 
 def end_of(order: Order) -> str:
     """Why nothing of it is sent again."""
-    if order.has_worked:
+    if order.is_confirmed:
         return TOLD
-    return TAKEN if order.taken_by.startswith(TAKEN) else order.end
+    return TAKEN if order.takeover_reason.startswith(TAKEN) else order.end
 
 
 # ------------------------------------------------------------------------------------------ the rules
 
 
-def test_posted_order_failsafe_becomes_active_ends_it() -> None:
+def test_posted_order_failsafe_ends_it() -> None:
     stage = Stage(armed=True)
     mode, arm = stage.post("mode", mode=GUIDED), stage.post("arm", armed=True)
     stage.tell(STABILIZE, armed=True, state=MavState.CRITICAL)
@@ -94,7 +92,7 @@ def test_posted_order_failsafe_becomes_active_ends_it() -> None:
     assert not end_of(disarm)
 
 
-def test_an_effect_is_a_change_to_it() -> None:
+def test_effect_requires_change() -> None:
     stage = Stage()
     order = stage.post("mode", "motion", mode=GUIDED)
     stage.tell(STABILIZE)
@@ -112,8 +110,8 @@ def test_an_effect_is_a_change_to_it() -> None:
     assert (end_of(arm), end_of(again)) == (TOLD, "")
 
 
-def test_posted_mode_told_already_leaves_the_late_one_of_the_order_before() -> None:
-    """In GUIDED, LOITER and GUIDED are posted: LOITER is told late, and GUIDED is still to be sent again."""
+def test_posted_mode_reported_keeps_late_mode_of_previous_order() -> None:
+    """In GUIDED, LOITER and GUIDED are posted: LOITER is reported late, and GUIDED is still to be repeated."""
     stage = Stage(GUIDED, True)
     stage.post("mode", "motion", mode=LOITER)
     again = stage.post("mode", "motion", mode=GUIDED)
@@ -124,7 +122,7 @@ def test_posted_mode_told_already_leaves_the_late_one_of_the_order_before() -> N
     assert end_of(again) == TOLD
 
 
-def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
+def test_unordered_mode_is_takeover() -> None:
     stage = Stage(GUIDED, True)
     motion, disarm = stage.post("motion"), stage.post("arm", armed=False)
     stage.tell(LOITER, True)
@@ -132,13 +130,13 @@ def test_a_mode_that_nobody_here_ordered_is_somebody_elses() -> None:
     assert (end_of(motion), end_of(disarm)) == (TAKEN, "")
 
 
-def test_a_mode_that_was_ordered_lately_is_the_programs() -> None:
+def test_recently_ordered_mode_is_no_takeover() -> None:
     stage = Stage()
     mode, motion = stage.post("mode", "motion", mode=GUIDED), stage.post("motion")
     assert (end_of(mode), end_of(motion)) == ("", "")
     stage.tell(GUIDED)
     assert end_of(motion) == ""
-    stage.now += OWN_MODES_S
+    stage.now += OWN_MODES_MAX_AGE_S
     late = stage.post("motion")
     stage.tell(STABILIZE)
     stage.tell(GUIDED)
@@ -150,7 +148,7 @@ def test_a_mode_that_was_ordered_lately_is_the_programs() -> None:
     assert end_of(of_an_action) == ""
 
 
-def test_disarming_ends_what_was_posted_about_motion() -> None:
+def test_disarming_ends_posted_motion() -> None:
     stage = Stage(GUIDED, True)
     motion, mode, arm = stage.post("motion"), stage.post("mode"), stage.post("arm", armed=True)
     stage.tell(GUIDED, False)
@@ -158,7 +156,7 @@ def test_disarming_ends_what_was_posted_about_motion() -> None:
     assert (end_of(motion), end_of(mode), end_of(arm)) == ("the vehicle disarmed", "", TOLD)
 
 
-def test_a_newer_order_ends_those_of_its_subjects() -> None:
+def test_newer_order_supersedes_its_subjects() -> None:
     stage = Stage()
     going, mode = stage.post("motion"), stage.post("mode", "motion")
     assert (end_of(going), end_of(mode)) == (NEWER, "")
@@ -182,20 +180,20 @@ def test_actions_and_posted_orders_end_each_other() -> None:
     assert (end_of(motion), end_of(mode)) == (NEWER, NEWER)
 
 
-def test_arming_ends_what_was_posted_of_it_and_the_other_way_round() -> None:
+def test_arming_and_posted_arming_supersede_each_other() -> None:
     stage = Stage()
     posted = stage.post("arm", armed=True)
-    with stage.arbiter.aside() as order, stage.arbiter.sending(order, armed=True) as sending:
+    with stage.arbiter.auxiliary_order() as order, stage.arbiter.sending(order, armed=True) as sending:
         assert end_of(posted) == NEWER
         stage.post("arm", armed=False)
         assert sending.end == NEWER
     assert stage.arbiter.arming_orders == 3
 
 
-def test_a_reboot_ends_them() -> None:
+def test_reboot_ends_all_orders() -> None:
     stage = Stage()
     order = stage.post("arm", armed=True)
-    stage.arbiter.note_reboot()
+    stage.arbiter.on_reboot()
     assert end_of(order) == "the vehicle rebooted"
 
 
@@ -219,7 +217,7 @@ def long(command: int) -> m.CommandLong:
         (m.Heartbeat(2, 3, 0, 0, 3, 3), set()),
     ],
 )
-def test_what_the_program_sends_by_itself_is_about_something(message: Any, subjects: set[str]) -> None:
+def test_raw_messages_have_subjects(message: Any, subjects: set[str]) -> None:
     assert set(subjects_of(message)) == subjects
 
 
@@ -227,7 +225,7 @@ def test_what_the_program_sends_by_itself_is_about_something(message: Any, subje
 
 
 @pytest.mark.anyio
-async def test_mode_arming_and_take_off_without_waiting(grounded: Flight) -> None:
+async def test_posted_mode_arm_take_off_without_waiting(grounded: Flight) -> None:
     """Each goes out at once, while the one before is not answered; lost answers are made good."""
     vehicle, wire = grounded.vehicle, grounded.wire
     for each in (SET_MODE, ARM):
@@ -237,12 +235,12 @@ async def test_mode_arming_and_take_off_without_waiting(grounded: Flight) -> Non
     async def mode() -> None:
         with vehicle.posted("mode", "motion", modes=(guided,)) as order:
             await order.command(SET_MODE, *vehicle.autopilot.mode_order(guided).params)
-            await order.until_told(5)
+            await order.wait_confirmed(5)
 
     async def arm() -> None:
         with vehicle.posted("arm", armed=True) as order:
             await order.command(ARM, 1)
-            await order.until_told(5)
+            await order.wait_confirmed(5)
 
     async def take_off() -> None:
         with vehicle.posted("motion") as order:
@@ -252,15 +250,13 @@ async def test_mode_arming_and_take_off_without_waiting(grounded: Flight) -> Non
     async with anyio.create_task_group() as tasks:
         for each_of in (mode, arm, take_off):
             tasks.start_soon(each_of)
-    sent = [
-        at for each in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(each)
-    ]
-    assert sent == [started] * 3  # once each: HEARTBEAT told what was not answered
+    sent = [at for each in (SET_MODE, ARM, TAKEOFF) for at, message in wire.sent if message in wire.commands(each)]
+    assert sent == [started] * 3  # Once each: HEARTBEAT reported the effects of the unacknowledged commands.
     await vehicle.position.wait_until(lambda here: (here.altitude_relative_m or 0) > 4.5, timeout=20)
 
 
 @pytest.mark.anyio
-async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
+async def test_posted_order_ends_by_pilot_or_newer_order(flying: Flight) -> None:
     vehicle, faults = flying.vehicle, flying.copter.faults
     faults.ignore(MavCmd.DO_REPOSITION)
     with vehicle.posted("motion") as order:
@@ -277,7 +273,7 @@ async def test_a_pilot_ends_it_and_a_newer_one_too(flying: Flight) -> None:
 
 
 @pytest.mark.anyio
-async def test_what_is_sent_to_another_system_is_no_order_to_this_one(flying: Flight) -> None:
+async def test_message_to_other_system_is_no_order(flying: Flight) -> None:
     vehicle = flying.vehicle
     others = (
         m.CommandLong(vehicle.system_id + 1, 1, MavCmd.NAV_LAND, 0, *(0,) * 7),
@@ -293,7 +289,7 @@ async def test_what_is_sent_to_another_system_is_no_order_to_this_one(flying: Fl
 
 
 @pytest.mark.anyio
-async def test_a_set_mode_without_the_flag_for_custom_modes_names_none(flying: Flight) -> None:
+async def test_set_mode_without_custom_flag_has_no_modes(flying: Flight) -> None:
     vehicle = flying.vehicle
     vehicle.send(m.SetMode(vehicle.system_id, 0, CopterMode.LOITER))
     flying.copter.set_mode(CopterMode.LOITER)
@@ -306,7 +302,7 @@ async def test_a_set_mode_without_the_flag_for_custom_modes_names_none(flying: F
 
 
 @pytest.mark.anyio
-async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight) -> None:
+async def test_rest_of_superseded_order_is_not_sent(flying: Flight) -> None:
     vehicle = flying.vehicle
     place: dict[str, Any] = {"frame": 6, "x": 1, "y": 1, "z": 20.0}
     with vehicle.posted("motion") as order:
@@ -324,7 +320,7 @@ async def test_what_is_left_of_an_order_that_was_lost_is_not_sent(flying: Flight
 
 
 @pytest.mark.anyio
-async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
+async def test_posted_order_ends_action_without_hold() -> None:
     async with in_the_air() as flight:
         vehicle, errors = flight.vehicle, list[str]()
 
@@ -348,8 +344,8 @@ async def test_it_ends_the_flight_under_way_which_is_not_held_then() -> None:
 
 
 @pytest.mark.anyio
-async def test_a_mode_that_was_posted_before_is_not_held_against_a_flight() -> None:
-    """The flight is ordered before HEARTBEAT tells the mode: nobody has taken it over, and it is looked after."""
+async def test_posted_mode_before_flight_is_no_takeover() -> None:
+    """The flight is ordered before HEARTBEAT reports the mode: no takeover, and the flight is monitored."""
     async with in_the_air(latency_s=0.5) as flight:
         vehicle, told = flight.vehicle, flight.vehicle.telemetry.armed
         loiter = vehicle.autopilot.find_mode("LOITER")
@@ -357,7 +353,7 @@ async def test_a_mode_that_was_posted_before_is_not_held_against_a_flight() -> N
         async def post() -> None:
             with vehicle.posted("mode", "motion", modes=(loiter,)) as order:
                 await order.command(SET_MODE, *vehicle.autopilot.mode_order(loiter).params)
-                await order.until_told(5)
+                await order.wait_confirmed(5)
 
         before = told.updated_at
         await told.wait_until(lambda _: told.updated_at > before, timeout=5)
@@ -372,7 +368,7 @@ async def test_a_mode_that_was_posted_before_is_not_held_against_a_flight() -> N
 
 
 @pytest.mark.anyio
-async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
+async def test_posted_order_errors_say_why(grounded: Flight) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     faults.refuse(ARM, MavResult.FAILED, "PreArm: Compass not healthy")
     with (
@@ -383,19 +379,15 @@ async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
     faults.refuse(ARM, MavResult.ACCEPTED)
     with vehicle.posted("arm", armed=True) as order:
         await order.command(ARM, 1)
-        with pytest.raises(
-            OperationTimeout, match=r"not done within 2 s; the vehicle is in STABILIZE, not armed"
-        ):
-            await order.until_told(2)
-        grounded.copter.send(
-            m.CommandAck(ARM, MavResult.DENIED, 0, 0, 255, vehicle.connection.source_component)
-        )
+        with pytest.raises(OperationTimeout, match=r"not done within 2 s; the vehicle is in STABILIZE, not armed"):
+            await order.wait_confirmed(2)
+        grounded.copter.send(m.CommandAck(ARM, MavResult.DENIED, 0, 0, 255, vehicle.connection.source_component))
         with pytest.raises(CommandRejected, match="DENIED"):  # taken back
-            await order.until_told(2)
-    with pytest.raises(InvalidArgument, match="no subject is named"), vehicle.posted():
+            await order.wait_confirmed(2)
+    with pytest.raises(InvalidArgument, match="no subject is given"), vehicle.posted():
         pass
     grounded.wire.forget()
-    with pytest.raises(InvalidArgument, match="needs armed=True or armed=False"), vehicle.posted("arm"):
+    with pytest.raises(InvalidArgument, match="requires armed=True or armed=False"), vehicle.posted("arm"):
         pass
     with pytest.raises(InvalidArgument, match="the block of this order was left"):
         await order.command(ARM, 1)
@@ -403,7 +395,7 @@ async def test_what_is_refused_or_not_done_says_so(grounded: Flight) -> None:
 
 
 @pytest.mark.anyio
-async def test_a_command_int_may_fall_back_to_command_long(flying: Flight) -> None:
+async def test_command_int_unsupported_falls_back_to_command_long(flying: Flight) -> None:
     flying.copter.faults.refuse(MavCmd.DO_SET_HOME, MavResult.COMMAND_LONG_ONLY)
     place: dict[str, Any] = {"x": 10_000_000, "y": 20_000_000, "z": 30.0}
     with pytest.raises(CommandRejected):
@@ -417,8 +409,8 @@ async def test_a_command_int_may_fall_back_to_command_long(flying: Flight) -> No
 
 
 @pytest.mark.anyio
-async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(grounded: Flight) -> None:
-    """`arm()` is watched for 15 s after it was given up: what the program has posted since is meant."""
+async def test_posted_arming_is_not_undone_by_abandoned_arm(grounded: Flight) -> None:
+    """`arm()` is monitored for 15 s after it was abandoned: a later posted arming is intended."""
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     await vehicle.set_mode("GUIDED")
     faults.ignore(ARM, times=1)
@@ -432,8 +424,8 @@ async def test_an_arming_that_is_posted_is_not_undone_by_one_that_was_given_up(g
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("is_posted", [True, False])
-async def test_disarm_before_armed_is_told_leaves_a_pilots_arming(is_posted: bool) -> None:
-    """Armed, then disarmed, is told after the order to disarm; its answer is lost, and a pilot arms."""
+async def test_disarm_before_armed_report_keeps_pilots_arming(is_posted: bool) -> None:
+    """Arming and disarming are reported after the disarm command; its ack is lost, and a pilot arms."""
     async with open_flight(latency_s=0.3) as flight:
         vehicle, armed = flight.vehicle, flight.vehicle.telemetry.armed
         await vehicle.wait_ready()
@@ -468,7 +460,7 @@ async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flig
     async with anyio.create_task_group() as tasks:
 
         async def arm() -> None:
-            with pytest.raises(OperationRejected, match=r"the mode changed to .*it may still be carried out"):
+            with pytest.raises(OperationRejected, match=r"the mode changed to .*may still be carried out"):
                 await change_armed(grounded.vehicle, True)
 
         tasks.start_soon(arm)
@@ -477,8 +469,8 @@ async def test_classic_arming_a_pilot_ends_says_it_may_still_come(grounded: Flig
 
 
 @pytest.mark.anyio
-async def test_turning_after_a_given_up_and_a_refused_mode_goes_back_to_guided() -> None:
-    """RTL is in force and not told, LAND is refused: GUIDED as it was told last is no reason to leave it out."""
+async def test_set_heading_after_refused_mode_returns_to_guided() -> None:
+    """RTL is active and not reported yet, LAND is refused: the last report of GUIDED does not suffice."""
     async with in_the_air(latency_s=0.1) as flight:
         vehicle, faults, armed = flight.vehicle, flight.copter.faults, flight.vehicle.telemetry.armed
         told_at = armed.updated_at
@@ -495,7 +487,7 @@ async def test_turning_after_a_given_up_and_a_refused_mode_goes_back_to_guided()
 
 
 @pytest.mark.anyio
-async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(grounded: Flight) -> None:
+async def test_set_mode_base_mode_and_temporary_rejection_are_handled(grounded: Flight) -> None:
     vehicle, wire, faults = grounded.vehicle, grounded.wire, grounded.copter.faults
     guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
     faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
@@ -511,13 +503,13 @@ async def test_a_mode_is_asked_for_as_the_vehicle_knows_it_and_when_it_can(groun
     faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED)
     with vehicle.posted("mode", modes=(guided,)) as order, pytest.raises(CommandRejected):
         await order.set_mode(guided)
-    assert len(wire.commands(SET_MODE)) == 4 + MODE_ATTEMPTS
+    assert len(wire.commands(SET_MODE)) == 4 + MAX_MODE_ATTEMPTS
 
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("is_back", [False, True])
-async def test_a_mode_is_not_asked_for_again_into_a_silence_nor_over_a_pilot(is_back: bool) -> None:
-    """That it was too early, the vehicle said before: who has it now only a HEARTBEAT tells."""
+async def test_posted_mode_is_not_repeated_in_silence_or_after_takeover(is_back: bool) -> None:
+    """Only a HEARTBEAT shows who is in control after a TEMPORARILY_REJECTED."""
     async with in_the_air() as flight:
         vehicle, faults = flight.vehicle, flight.copter.faults
         land = vehicle.autopilot.find_mode("LAND")
@@ -540,7 +532,7 @@ async def test_a_mode_is_not_asked_for_again_into_a_silence_nor_over_a_pilot(is_
 
 
 @pytest.mark.anyio
-async def test_what_was_ordered_before_a_reboot_is_not_meant_after_it(grounded: Flight) -> None:
+async def test_orders_before_reboot_end(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     guided = vehicle.autopilot.find_mode("GUIDED")
     with vehicle.posted("mode", modes=(guided,)) as order:
@@ -552,7 +544,7 @@ async def test_what_was_ordered_before_a_reboot_is_not_meant_after_it(grounded: 
 
 
 @pytest.mark.anyio
-async def test_a_mode_that_is_told_counts_more_than_a_refusal(grounded: Flight) -> None:
+async def test_mode_reported_after_refusal_succeeds(grounded: Flight) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     guided = vehicle.autopilot.find_mode("GUIDED")
     faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
@@ -567,9 +559,7 @@ async def test_a_mode_that_is_told_counts_more_than_a_refusal(grounded: Flight) 
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("ends", ["the order", "the vehicle", "silence"])
-async def test_what_old_firmware_wants_is_not_sent_after_the_end_nor_into_a_silence(
-    grounded: Flight, ends: str
-) -> None:
+async def test_legacy_set_mode_is_not_sent_in_silence(grounded: Flight, ends: str) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     guided = vehicle.autopilot.find_mode("GUIDED")
     faults.refuse(SET_MODE, MavResult.UNSUPPORTED)
@@ -594,14 +584,14 @@ async def test_what_old_firmware_wants_is_not_sent_after_the_end_nor_into_a_sile
         if ends == "the order":
             posted.close()
         elif ends == "the vehicle":
-            vehicle._talk.close()
+            vehicle._session.close()
         await anyio.sleep(2)
     assert failed
     assert not grounded.wire.all(m.SetMode)
 
 
 @pytest.mark.anyio
-async def test_a_mode_is_not_asked_for_again_once_there_is_a_newer_order(grounded: Flight) -> None:
+async def test_posted_mode_superseded_is_not_repeated(grounded: Flight) -> None:
     vehicle, wire = grounded.vehicle, grounded.wire
     guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
     grounded.copter.faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
@@ -620,7 +610,7 @@ async def test_a_mode_is_not_asked_for_again_once_there_is_a_newer_order(grounde
 
 
 @pytest.mark.parametrize(("waited_s", "end"), [(9.0, ""), (11.0, TAKEN)])
-def test_mode_ordered_ten_seconds_ago_is_not_the_programs_any_more(waited_s: float, end: str) -> None:
+def test_mode_ordered_ten_seconds_ago_is_takeover(waited_s: float, end: str) -> None:
     stage = Stage()
     stage.post("mode", mode=GUIDED)
     stage.now += waited_s

@@ -37,7 +37,7 @@ def speed(flight: Px4Flight) -> float:
     return math.hypot(flight.px4.motion.velocity_north, flight.px4.motion.velocity_east)
 
 
-async def test_take_off_gives_the_altitude_above_the_sea_and_ends_in_loiter() -> None:
+async def test_px4_take_off_uses_amsl_altitude_and_ends_in_loiter() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
@@ -53,7 +53,7 @@ async def test_take_off_gives_the_altitude_above_the_sea_and_ends_in_loiter() ->
 
 
 @pytest.mark.parametrize("tells_landed_state", [True, False])
-async def test_take_off_is_not_sent_again_once_its_mode_was_told(
+async def test_take_off_is_not_repeated_after_mode_report(
     monkeypatch: pytest.MonkeyPatch, tells_landed_state: bool
 ) -> None:
     """It starts in LOITER, where it also ends, and stands for a second while the motors spin up."""
@@ -75,14 +75,12 @@ async def test_take_off_refused_says_why() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
-        flight.px4.faults.refuse(
-            MavCmd.NAV_TAKEOFF, MavResult.TEMPORARILY_REJECTED, "Takeoff denied: no GPS\t"
-        )
+        flight.px4.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.TEMPORARILY_REJECTED, "Takeoff denied: no GPS\t")
         with pytest.raises(CommandRejected, match="Takeoff denied: no GPS"):
             await flight.vehicle.take_off(12.0)
 
 
-async def test_take_off_cancelled_half_way_holds() -> None:
+async def test_take_off_cancelled_holds() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.arm()
@@ -121,8 +119,8 @@ async def test_go_to_with_speed_and_heading(flying: Px4Flight) -> None:
     assert command.z == pytest.approx(flying.vehicle.home.value.altitude_amsl_m + 15.0, abs=0.01)
 
 
-async def test_go_to_cancelled_half_way_stops_on_the_spot(flying: Px4Flight) -> None:
-    """LOITER is the mode of a PX4 that is on its way too: the mode alone would let it fly on."""
+async def test_px4_go_to_cancelled_stops_in_place(flying: Px4Flight) -> None:
+    """A PX4 on its way is in LOITER too: the mode alone would let it fly on."""
     with anyio.move_on_after(5.0) as scope:
         await flying.vehicle.go_to(north_of_home(flying, 300.0))
     assert scope.cancelled_caught
@@ -132,7 +130,7 @@ async def test_go_to_cancelled_half_way_stops_on_the_spot(flying: Px4Flight) -> 
     assert flying.vehicle.mode_name == "LOITER"
 
 
-async def test_an_order_after_a_cancelled_go_to_stays_in_force(flying: Px4Flight) -> None:
+async def test_order_after_cancelled_go_to_stays_valid(flying: Px4Flight) -> None:
     with anyio.move_on_after(4.0):
         await flying.vehicle.go_to(north_of_home(flying, 300.0))
     await flying.vehicle.go_to(north_of_home(flying, 5.0))
@@ -155,7 +153,7 @@ async def test_go_to_ends_when_a_pilot_takes_over(flying: Px4Flight) -> None:
     assert flying.px4.mode == POSITION
 
 
-async def test_hold_stops_what_is_on_its_way(flying: Px4Flight) -> None:
+async def test_px4_hold_stops_reposition(flying: Px4Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
         async def fly_on() -> None:
@@ -191,18 +189,16 @@ async def test_land(flying: Px4Flight) -> None:
 
 
 @pytest.mark.parametrize("is_taken", [False, True])
-async def test_a_mode_that_is_told_before_the_heartbeat_may_be_the_end_of_a_landing(
+async def test_land_current_mode_before_heartbeat_ends_landing(
     flying: Px4Flight, monkeypatch: pytest.MonkeyPatch, is_taken: bool
 ) -> None:
-    """It leaves LAND when it disarms; CURRENT_MODE comes up to a second before the HEARTBEAT that says so."""
+    """It leaves LAND when it disarms; CURRENT_MODE arrives up to a second before the HEARTBEAT."""
     told: list[str] = []
 
     def look() -> None:
         told.append(flying.vehicle.taken_over)
 
-    monkeypatch.setattr(
-        flying.vehicle.telemetry, "landed_state", StateCell[int]("landed_state", now, "nothing")
-    )
+    monkeypatch.setattr(flying.vehicle.telemetry, "landed_state", StateCell[int]("landed_state", now, "nothing"))
     async with anyio.create_task_group() as tasks:
 
         async def current_mode() -> None:

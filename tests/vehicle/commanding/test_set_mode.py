@@ -1,4 +1,4 @@
-"""Changing the flight mode: by name and number, refused, taken back, not done, and on firmware that knows it not."""
+"""Mode changes: by name and number, refused, revoked, not executed, and on firmware without the command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.mark.parametrize("mode", ["GUIDED", "guided", "Alt Hold", "ALT_HOLD", "althold", 4, CopterMode.LAND])
-async def test_by_name_and_by_number(grounded: Flight, mode: str | int) -> None:
+async def test_set_mode_by_name_and_number(grounded: Flight, mode: str | int) -> None:
     await grounded.vehicle.set_mode(mode)
     wanted = grounded.vehicle.autopilot.find_mode(mode)
     assert grounded.copter.mode.number == wanted.custom_mode
@@ -32,7 +32,7 @@ async def test_by_name_and_by_number(grounded: Flight, mode: str | int) -> None:
     assert (command.target_system, command.param1, command.param2) == (1, 1.0, wanted.custom_mode)
 
 
-async def test_an_unknown_name_lists_the_modes_and_sends_nothing(grounded: Flight) -> None:
+async def test_set_mode_unknown_name_lists_modes_and_sends_nothing(grounded: Flight) -> None:
     with pytest.raises(InvalidArgument) as caught:
         await grounded.vehicle.set_mode("GIUDED")
     text = str(caught.value)
@@ -41,7 +41,7 @@ async def test_an_unknown_name_lists_the_modes_and_sends_nothing(grounded: Fligh
     assert not grounded.wire.commands(MavCmd.DO_SET_MODE)
 
 
-async def test_a_refused_mode_says_why(flying: Flight) -> None:
+async def test_set_mode_refused_says_why(flying: Flight) -> None:
     with pytest.raises(CommandRejected) as caught:
         await flying.vehicle.set_mode("AUTO")
     assert caught.value.result == MavResult.FAILED
@@ -50,7 +50,7 @@ async def test_a_refused_mode_says_why(flying: Flight) -> None:
     assert flying.vehicle.mode_name == "GUIDED"
 
 
-async def test_firmware_without_the_command_gets_the_older_message() -> None:
+async def test_set_mode_unsupported_sends_legacy_message() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_SET_MODE])
     async with open_flight(copter) as flight:
         await flight.vehicle.set_mode("GUIDED")
@@ -58,18 +58,16 @@ async def test_firmware_without_the_command_gets_the_older_message() -> None:
         assert flight.wire.all(m.SetMode) == [m.SetMode(1, 1, CopterMode.GUIDED)]
 
 
-async def test_a_silent_vehicle_is_a_timeout_and_is_not_ordered_again(grounded: Flight) -> None:
+async def test_posted_mode_silent_vehicle_times_out_without_repeat(grounded: Flight) -> None:
     grounded.copter.faults.silent = True
     with pytest.raises(
-        CommandTimeout, match=r"MAV_CMD_DO_SET_MODE, sent once within 4\.0 s; not sent again: .* has not told"
+        CommandTimeout, match=r"MAV_CMD_DO_SET_MODE, sent once within 4\.0 s; not sent again: no HEARTBEAT received"
     ):
         await grounded.vehicle.set_mode("GUIDED")
 
 
 @pytest.mark.parametrize(("timeout", "waited_s"), [(2.0, 2.0), (4.0, 4.0), (6.0, 4.0), (12.0, 4.0)])
-async def test_the_answer_is_waited_for_as_long_as_there_is_time_and_four_seconds_at_most(
-    grounded: Flight, timeout: float, waited_s: float
-) -> None:
+async def test_set_mode_attempt_timeout_depends_on_timeout(grounded: Flight, timeout: float, waited_s: float) -> None:
     grounded.copter.faults.silent = True
     started = now()
     with pytest.raises(CommandTimeout, match=f"within {waited_s:.1f} s"):
@@ -77,7 +75,7 @@ async def test_the_answer_is_waited_for_as_long_as_there_is_time_and_four_second
     assert now() - started == pytest.approx(waited_s)
 
 
-async def test_accepted_but_not_changed_is_a_timeout(grounded: Flight) -> None:
+async def test_set_mode_accepted_not_executed_times_out(grounded: Flight) -> None:
     grounded.copter.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
     started = now()
     with pytest.raises(
@@ -87,32 +85,29 @@ async def test_accepted_but_not_changed_is_a_timeout(grounded: Flight) -> None:
     assert now() - started == pytest.approx(4.0, abs=0.6)
 
 
-async def test_a_number_that_no_table_knows_is_sent_all_the_same(grounded: Flight) -> None:
+async def test_set_mode_unknown_number_is_sent(grounded: Flight) -> None:
     with pytest.raises(CommandRejected, match="No such mode 99"):
         await grounded.vehicle.set_mode(99)
 
 
 class CopterWithAScript(SimulatedCopter):
-    """Tells of one more mode than the tables know, as a Lua script may add one."""
+    """Reports one more mode than the tables contain, as a Lua script may add one."""
 
     def available_modes(self) -> list[m.AvailableModes]:
         return [*super().available_modes(), m.AvailableModes(12, 12, 0, 118, 0, "Follow Boat")]
 
 
-async def test_a_mode_that_the_vehicle_tells_is_known_by_its_name() -> None:
+async def test_available_modes_name_is_accepted() -> None:
     async with open_flight(CopterWithAScript(boot_time_s=0.0)) as flight:
         await anyio.sleep(3.0)
-        assert (
-            flight.vehicle.autopilot.find_mode("follow boat", flight.vehicle.telemetry.mode_names).custom_mode
-            == 118
-        )
+        assert flight.vehicle.autopilot.find_mode("follow boat", flight.vehicle.telemetry.mode_names).custom_mode == 118
         with pytest.raises(CommandRejected, match="No such mode 118"):
             await flight.vehicle.set_mode("FOLLOW_BOAT")
         with pytest.raises(InvalidArgument, match="Follow Boat"):
             await flight.vehicle.set_mode("FOLLOW_TRAIN")
 
 
-async def test_modes_are_asked_for_until_they_are_told() -> None:
+async def test_available_modes_are_requested_until_received() -> None:
     """The link is bad when the vehicle connects: its own modes are asked for again."""
     copter = CopterWithAScript(boot_time_s=0.0)
     copter.faults.ignore(MavCmd.REQUEST_MESSAGE)
@@ -123,7 +118,7 @@ async def test_modes_are_asked_for_until_they_are_told() -> None:
         assert flight.vehicle.telemetry.mode_names == {118: "Follow Boat"}
 
 
-async def test_an_ack_to_another_ground_station_is_not_ours(grounded: Flight) -> None:
+async def test_ack_to_other_station_is_ignored(grounded: Flight) -> None:
     grounded.copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(grounded.vehicle.set_mode, "GUIDED")
@@ -139,7 +134,7 @@ async def test_an_ack_to_another_ground_station_is_not_ours(grounded: Flight) ->
     ("mode", "params"),
     [("POSCTL", (1, 3, 0)), ("LOITER", (1, 4, 3)), ("Hold", (1, 4, 3)), (3 << 16, (1, 3, 0))],
 )
-async def test_px4_main_and_sub_mode(mode: str | int, params: tuple[float, ...]) -> None:
+async def test_px4_mode_has_main_and_sub_mode(mode: str | int, params: tuple[float, ...]) -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.set_mode("ALTCTL")
@@ -149,13 +144,14 @@ async def test_px4_main_and_sub_mode(mode: str | int, params: tuple[float, ...])
         assert (command.param1, command.param2, command.param3) == params
 
 
-async def test_px4_takes_its_acceptance_back() -> None:
+async def test_px4_refusal_after_acceptance_raises() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         before = flight.px4.mode
         started = now()
         with pytest.raises(
-            OperationRejected, match=r"set_mode\(OFFBOARD\): the vehicle took its acceptance back"
+            OperationRejected,
+            match=r"set_mode\(OFFBOARD\): the vehicle accepted it first and refused it then",
         ):
             await flight.vehicle.set_mode("OFFBOARD")
         assert now() - started < 2.0
@@ -171,8 +167,8 @@ async def test_px4_heartbeats_lag_behind() -> None:
 
 
 @pytest.mark.parametrize("result", [MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED])
-async def test_every_refusal_after_an_acceptance_takes_it_back(grounded: Flight, result: MavResult) -> None:
-    """As of a PX4, which answers twice."""
+async def test_refusal_after_acceptance_raises(grounded: Flight, result: MavResult) -> None:
+    """Like a PX4, which acks twice."""
     grounded.copter.set_mode_from = lambda *_: MavResult.ACCEPTED  # type: ignore[method-assign]
     async with anyio.create_task_group() as tasks:
 
@@ -182,5 +178,5 @@ async def test_every_refusal_after_an_acceptance_takes_it_back(grounded: Flight,
             grounded.wire.deliver(FrameEncoder(1, 1).encode(again))
 
         tasks.start_soon(answer_again)
-        with pytest.raises(OperationRejected, match="the vehicle took its acceptance back"):
+        with pytest.raises(OperationRejected, match="the vehicle accepted it first and refused it then"):
             await grounded.vehicle.set_mode("GUIDED")

@@ -1,4 +1,4 @@
-"""What is on board beside the autopilot: heard of, and spoken to as the autopilot is."""
+"""Components other than the autopilot: discovery, commands, messages, metadata."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ async def on_board(*components: SimulatedCamera | SimulatedGimbal) -> AsyncItera
         yield vehicle
 
 
-async def test_what_has_been_heard_is_told_with_kind_and_age() -> None:
+async def test_components_are_listed_with_kind_and_age() -> None:
     async with on_board(SimulatedCamera(), SimulatedCamera(101), SimulatedGimbal()) as vehicle:
-        told = vehicle.components.value
-        assert [(each.component_id, each.device_id, each.kind) for each in told] == [
+        reported = vehicle.components.value
+        assert [(each.component_id, each.device_id, each.kind) for each in reported] == [
             (1, 0, "autopilot"),
             (100, 0, "camera"),
             (101, 0, "camera"),
             (154, 0, "gimbal"),
         ]
-        assert all(0 <= vehicle.connection.now() - each.heard_at <= 1.5 for each in told)
+        assert all(0 <= vehicle.connection.now() - each.received_at <= 1.5 for each in reported)
 
 
-async def test_the_list_grows_when_somebody_new_is_heard() -> None:
+async def test_new_component_is_added_to_the_list() -> None:
     camera = SimulatedCamera()
     camera.faults.silent = True
     async with on_board(camera) as vehicle:
@@ -57,12 +57,12 @@ async def test_the_list_grows_when_somebody_new_is_heard() -> None:
         assert vehicle.component(100).is_silent
         assert vehicle.component(100).kind == "unknown"
         camera.faults.silent = False
-        told = await vehicle.components.wait_until(lambda told: len(told) == 2, timeout=3)
-        assert told[1].kind == vehicle.component(100).kind == "camera"
+        reported = await vehicle.components.wait_until(lambda reported: len(reported) == 2, timeout=3)
+        assert reported[1].kind == vehicle.component(100).kind == "camera"
         assert not vehicle.component(100).is_silent
 
 
-async def test_devices_behind_the_autopilot_are_on_the_list() -> None:
+async def test_devices_attached_to_autopilot_are_listed() -> None:
     async with on_board() as vehicle:
         assert [each.device_id for each in vehicle.components.value] == [0]
         source = m.GimbalDeviceAttitudeStatus(0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, 0)
@@ -72,11 +72,11 @@ async def test_devices_behind_the_autopilot_are_on_the_list() -> None:
     async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
         assert len(vehicle.components.value) == 1
         copter.send(device)
-        told = await vehicle.components.wait_until(lambda told: len(told) == 2, timeout=3)
-        assert (told[1].component_id, told[1].device_id, told[1].kind) == (1, 2, "gimbal")
+        reported = await vehicle.components.wait_until(lambda reported: len(reported) == 2, timeout=3)
+        assert (reported[1].component_id, reported[1].device_id, reported[1].kind) == (1, 2, "gimbal")
 
 
-async def test_messages_come_from_the_component_at_the_rate_asked_of_it() -> None:
+async def test_component_messages_at_requested_rate() -> None:
     async with on_board(SimulatedCamera(), SimulatedCamera(101)) as vehicle:
         with (
             vehicle.subscribe(StreamSlow, capacity=10) as slow,
@@ -91,7 +91,7 @@ async def test_messages_come_from_the_component_at_the_rate_asked_of_it() -> Non
         assert {each.received_frame.component_id for each in came if each.received_frame} == {101}
 
 
-async def test_a_cell_has_the_messages_of_one_component_only() -> None:
+async def test_message_cell_is_per_component() -> None:
     async with on_board(SimulatedCamera(), SimulatedCamera(101)) as vehicle:
         of_second = vehicle.component(101).message(m.CameraSettings, rate_hz=2)
         assert vehicle.component(101).message(m.CameraSettings) is of_second
@@ -101,7 +101,7 @@ async def test_a_cell_has_the_messages_of_one_component_only() -> None:
         assert of_second.value.zoomLevel == 0
 
 
-async def test_a_stream_that_is_slow_names_its_component() -> None:
+async def test_slow_stream_warning_names_component() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         with vehicle.subscribe(StreamSlow, capacity=10) as slow:
@@ -114,7 +114,7 @@ async def test_a_stream_that_is_slow_names_its_component() -> None:
             assert event.component_id == 100
 
 
-async def test_commands_and_questions_go_to_the_component() -> None:
+async def test_commands_and_requests_reach_the_component() -> None:
     camera = SimulatedCamera()
     async with on_board(camera, SimulatedCamera(101)) as vehicle:
         component = vehicle.component(100)
@@ -130,22 +130,20 @@ async def test_commands_and_questions_go_to_the_component() -> None:
             await component.request(m.CameraInformation, timeout=2.0)
 
 
-async def test_an_answer_is_asked_for_again() -> None:
+async def test_lost_answer_is_requested_again() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
         camera.faults.drop_incoming = 1
         assert (await vehicle.component(100).request(m.CameraInformation)).model_name.startswith(b"Simulated")
 
 
-async def test_only_what_is_meant_is_returned() -> None:
+async def test_request_where_selects_the_message() -> None:
     async with on_board(SimulatedCamera(streams=["rtsp://127.0.0.1/a", "rtsp://127.0.0.1/b"])) as vehicle:
-        stream = await vehicle.component(100).request(
-            m.VideoStreamInformation, where=lambda each: each.stream_id == 2
-        )
+        stream = await vehicle.component(100).request(m.VideoStreamInformation, where=lambda each: each.stream_id == 2)
         assert stream.uri == "rtsp://127.0.0.1/b"
 
 
-async def test_an_id_that_cannot_be_is_refused() -> None:
+async def test_invalid_component_id_is_refused() -> None:
     async with on_board() as vehicle:
         for wrong in (0, 256, -1):
             with pytest.raises(InvalidArgument, match=f"component_id = {wrong} is not allowed: 1 to 255"):
@@ -153,17 +151,17 @@ async def test_an_id_that_cannot_be_is_refused() -> None:
         assert vehicle.component(100) is vehicle.component(100)
 
 
-async def test_everybody_who_is_heard_is_told_of() -> None:
+async def test_all_discovered_components_are_published() -> None:
     one = SimulatedCopter(system_id=1, boot_time_s=0.0, components=[SimulatedCamera()])
     two = SimulatedPx4(system_id=2, boot_time_s=1.0)
     async with simulated_link([one, two]) as link, open_connection(link) as connection:
         with connection.subscribe(VehicleFound, ComponentFound, capacity=10) as found:
             await anyio.sleep(2.5)
-            told = []
+            reported = []
             while (event := found.get_nowait()) is not None:
                 assert isinstance(event, VehicleFound | ComponentFound)
-                told.append((type(event), event.system_id, event.component_id))
-        assert sorted(told, key=lambda each: each[1:]) == [
+                reported.append((type(event), event.system_id, event.component_id))
+        assert sorted(reported, key=lambda each: each[1:]) == [
             (VehicleFound, 1, 1),
             (ComponentFound, 1, 100),
             (VehicleFound, 2, 1),
@@ -181,7 +179,7 @@ async def first_vehicles(connection: Connection, count: int) -> list[tuple[int, 
     raise AssertionError("the connection goes on, and so does the search")
 
 
-async def test_the_search_goes_on_while_nobody_new_is_heard() -> None:
+async def test_vehicle_search_continues_while_nothing_is_found() -> None:
     late = SimulatedPx4(system_id=2, boot_time_s=1.0)
     late.faults.silent = True
     copter = SimulatedCopter(boot_time_s=0.0)
@@ -199,7 +197,7 @@ async def test_the_search_goes_on_while_nobody_new_is_heard() -> None:
         assert [each[0] for each in await first_vehicles(connection, 2)] == [1, 2]
 
 
-async def test_the_autopilot_is_a_component_too() -> None:
+async def test_autopilot_is_a_component() -> None:
     async with on_board() as vehicle:
         autopilot = vehicle.component(vehicle.component_id)
         assert autopilot.kind == "autopilot"
@@ -209,7 +207,7 @@ async def test_the_autopilot_is_a_component_too() -> None:
 
 
 GENERAL = "/etc/extras/component_general.json.xz"
-"""Where a PX4 says that its files begin."""
+"""Address of PX4's general metadata."""
 
 
 @asynccontextmanager
@@ -225,29 +223,29 @@ def packed(content: object) -> bytes:
     return lzma.compress(json.dumps(content).encode())
 
 
-async def test_metadata_are_read_off_the_vehicle() -> None:
+async def test_metadata_is_read_by_mavftp() -> None:
     general = {"version": 1, "metadataTypes": [{"type": 1, "uri": "mftp://etc/extras/parameters.json"}, "?"]}
     parameters = {"version": 1, "parameters": []}
     files = {GENERAL: packed(general), "/etc/extras/parameters.json": json.dumps(parameters).encode()}
     async with px4_with(files) as component:
         assert await component.metadata() == general
         assert await component.metadata("parameter") == parameters
-        with pytest.raises(NotSupported, match="no metadata of its events"):
+        with pytest.raises(NotSupported, match="no events metadata"):
             await component.metadata("events")
 
 
 @pytest.mark.parametrize("content", [b"no JSON", b"[]", lzma.compress(b"{}")[:-5], b"[" * 100_000])
-async def test_damaged_metadata_are_told(content: bytes) -> None:
+async def test_damaged_metadata_is_file_format_error(content: bytes) -> None:
     async with px4_with({GENERAL: content}) as component:
         with pytest.raises(FileFormatError, match="component_general"):
             await component.metadata()
 
 
-async def test_who_tells_no_metadata_has_none() -> None:
+async def test_component_without_metadata_is_not_supported() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
-        with pytest.raises(NotSupported, match=r"component 100 tells of no metadata: .*DENIED"):
+        with pytest.raises(NotSupported, match=r"component 100 reports no metadata: .*DENIED"):
             await vehicle.component(100).metadata()
         camera.faults.silent = True
-        with pytest.raises(NotSupported, match="component 100 tells of no metadata: component 100 sent no"):
+        with pytest.raises(NotSupported, match="component 100 reports no metadata: component 100 sent no"):
             await vehicle.component(100).metadata()

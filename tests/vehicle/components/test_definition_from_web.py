@@ -1,4 +1,4 @@
-"""A camera's definition file from a server of the web: what is taken, and what ends the download."""
+"""Camera definition files from a web server: accepted files and failures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import NoReturn
 import anyio
 import pytest
 
-from aerokit._internal.files import LARGEST_FILE
+from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import FileFormatError, FileTimeout, OperationRejected
 from aerokit.parameters import parse_definition
 from aerokit.sim.components.camera_body import own_definition
@@ -21,21 +21,21 @@ pytestmark = pytest.mark.anyio
 PATIENCE_S = 5.0
 
 
-class Site:
-    """Answers each path as a test says."""
+class WebServer:
+    """HTTP handler that answers each path as configured by the test."""
 
     def __init__(self) -> None:
         self.answers: dict[str, Callable[[BaseHTTPRequestHandler], None]] = {}
         self.is_over = threading.Event()
         self.visitor_has_gone = threading.Event()
-        site = self
+        web_server = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 try:
-                    site.answers[self.path](self)
+                    web_server.answers[self.path](self)
                 except OSError:
-                    site.visitor_has_gone.set()
+                    web_server.visitor_has_gone.set()
 
             def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base class's word
                 pass
@@ -66,9 +66,9 @@ class Site:
 
 
 @pytest.fixture
-def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+def web_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[WebServer]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    made = Site()
+    made = WebServer()
     thread = threading.Thread(target=made.server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     try:
@@ -84,65 +84,65 @@ def no_files(_: int) -> NoReturn:
     raise AssertionError("this is no file of a component")
 
 
-async def fetched(uri: str, patience_s: float = PATIENCE_S) -> bytes:
-    return await fetch(uri, no_files, 100, patience_s)
+async def fetched(uri: str, idle_timeout_s: float = PATIENCE_S) -> bytes:
+    return await fetch(uri, no_files, 100, idle_timeout_s)
 
 
-async def test_a_definition_from_the_web(site: Site) -> None:
-    place = site.says("/camera.xml", own_definition())
+async def test_definition_is_fetched_from_the_web(web_server: WebServer) -> None:
+    place = web_server.says("/camera.xml", own_definition())
     assert len(parse_definition(await fetched(place)).settings) == 12
-    assert await fetched(site.leads("/latest", place)) == own_definition()
+    assert await fetched(web_server.leads("/latest", place)) == own_definition()
 
 
-async def test_what_the_server_does_not_give(site: Site) -> None:
+async def test_web_server_errors_are_operation_rejected(web_server: WebServer) -> None:
     with pytest.raises(OperationRejected, match="404"):
-        await fetched(site.says("/gone", b"", status=404))
-    with pytest.raises(OperationRejected, match=r"5 bytes did not come|IncompleteRead"):
-        await fetched(site.says("/cut", b"12345", length=10))
-    with pytest.raises(OperationRejected, match="was not given"):
+        await fetched(web_server.says("/gone", b"", status=404))
+    with pytest.raises(OperationRejected, match=r"5 bytes are missing|IncompleteRead"):
+        await fetched(web_server.says("/cut", b"12345", length=10))
+    with pytest.raises(OperationRejected, match="could not be fetched"):
         await fetched("http://127.0.0.1:1/camera.xml")
-    with pytest.raises(OperationRejected, match="was not given"):
+    with pytest.raises(OperationRejected, match="could not be fetched"):
         await fetched("http://127.0.0.1:port/camera.xml")
 
 
 @pytest.mark.parametrize("target", ["file:///etc/hostname", "ftp://127.0.0.1/a", "data:text/plain,a"])
-async def test_an_address_does_not_lead_to_files_of_this_computer(site: Site, target: str) -> None:
+async def test_file_url_is_refused(web_server: WebServer, target: str) -> None:
     with pytest.raises(OperationRejected):
-        await fetched(site.leads("/elsewhere", target))
+        await fetched(web_server.leads("/elsewhere", target))
 
 
-async def test_it_does_not_go_round_in_circles(site: Site) -> None:
+async def test_redirect_loop_is_an_error(web_server: WebServer) -> None:
     with pytest.raises(OperationRejected):
-        await fetched(site.leads("/round", f"{site.address}/round"))
+        await fetched(web_server.leads("/round", f"{web_server.address}/round"))
 
 
-async def test_no_more_is_taken_than_such_files_have(site: Site) -> None:
+async def test_oversized_web_file_is_refused(web_server: WebServer) -> None:
     with pytest.raises(FileFormatError, match="more than 16 MB"):
-        await fetched(site.says("/large", bytes(LARGEST_FILE + 1)))
+        await fetched(web_server.says("/large", bytes(MAX_FILE_SIZE + 1)))
 
 
-async def test_a_server_that_says_nothing(site: Site) -> None:
+async def test_silent_web_server_times_out(web_server: WebServer) -> None:
     def answer(_: BaseHTTPRequestHandler) -> None:
-        site.is_over.wait()
+        web_server.is_over.wait()
 
-    site.answers["/silent"] = answer
-    with pytest.raises(FileTimeout, match=r"did not come: nothing for 0\.2 s"):
-        await fetched(f"{site.address}/silent", patience_s=0.2)
+    web_server.answers["/silent"] = answer
+    with pytest.raises(FileTimeout, match=r"stalled: no data for 0\.2 s"):
+        await fetched(f"{web_server.address}/silent", idle_timeout_s=0.2)
 
 
-async def test_who_gives_up_leaves_no_thread_behind_that_waits(site: Site) -> None:
-    """The server sends a byte of its header now and then, for ever."""
+async def test_cancelled_fetch_leaves_no_thread(web_server: WebServer) -> None:
+    """The server keeps sending single bytes of its header."""
     loop, has_begun = asyncio.get_running_loop(), asyncio.Event()
 
     def drip(handler: BaseHTTPRequestHandler) -> None:
         loop.call_soon_threadsafe(has_begun.set)
         handler.wfile.write(b"HTTP/1.1 200 OK\r\nX-Long: ")
-        while not site.is_over.wait(0.01):
+        while not web_server.is_over.wait(0.01):
             handler.wfile.write(b"x")
 
-    site.answers["/drip"] = drip
+    web_server.answers["/drip"] = drip
     async with anyio.create_task_group() as group:
-        group.start_soon(fetched, f"{site.address}/drip")
+        group.start_soon(fetched, f"{web_server.address}/drip")
         await has_begun.wait()
         group.cancel_scope.cancel()
-    assert await asyncio.to_thread(site.visitor_has_gone.wait, 10)
+    assert await asyncio.to_thread(web_server.visitor_has_gone.wait, 10)

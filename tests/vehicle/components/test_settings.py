@@ -1,4 +1,4 @@
-"""Settings of components by PARAM_EXT, and what a camera's definition file says of them."""
+"""Settings of components by PARAM_EXT, with and without a camera definition file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 import aerokit
 from aerokit import messages as m
-from aerokit._internal.files import LARGEST_FILE
+from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import (
     FileError,
     FileFormatError,
@@ -35,8 +35,8 @@ pytestmark = pytest.mark.anyio
 LISTED = 12
 
 
-class Shelf:
-    """A camera, what was sent to it, and its settings on the other side."""
+class Bench:
+    """A camera, the messages sent to it, and its settings."""
 
     def __init__(self, camera: SimulatedCamera, vehicle: aerokit.Vehicle) -> None:
         self.camera, self.vehicle = camera, vehicle
@@ -44,7 +44,7 @@ class Shelf:
         self.settings: Settings = self.component.settings
         self.sent: list[Message] = []
         for kind in (m.ParamExtSet, m.ParamExtRequestRead, m.ParamExtRequestList, m.FileTransferProtocol):
-            camera.vehicle.overhear(kind, lambda message, _: self.sent.append(message))
+            camera.vehicle.observe(kind, lambda message, _: self.sent.append(message))
 
     def all(self, kind: type[Message]) -> list[Any]:
         return [each for each in self.sent if isinstance(each, kind)]
@@ -55,18 +55,18 @@ class Shelf:
 
 
 @asynccontextmanager
-async def on_board(*others: SimulatedCamera | SimulatedGimbal, **options: Any) -> AsyncIterator[Shelf]:
+async def on_board(*others: SimulatedCamera | SimulatedGimbal, **options: Any) -> AsyncIterator[Bench]:
     camera = SimulatedCamera(**options)
     copter = SimulatedCopter(boot_time_s=0.0, components=(camera, *others))
     async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
         await anyio.sleep(1.5)
-        yield Shelf(camera, vehicle)
+        yield Bench(camera, vehicle)
 
 
 # -------------------------------------------------------------------------- without a definition
 
 
-async def test_the_whole_list_with_numbers_and_texts() -> None:
+async def test_settings_download_with_numbers_and_texts() -> None:
     async with on_board() as shelf:
         found = await shelf.settings.download()
         assert len(found) == LISTED
@@ -81,39 +81,33 @@ async def test_the_whole_list_with_numbers_and_texts() -> None:
         assert len(shelf.all(m.ParamExtRequestList)) == 2
 
 
-async def test_what_is_lost_is_asked_for_again() -> None:
+async def test_lost_settings_are_requested_again() -> None:
     async with on_board() as shelf:
         shelf.camera.faults.loss = shelf.camera.faults.loss_incoming = 0.4
-        assert len(await shelf.settings.download(patience_s=60.0)) == LISTED
+        assert len(await shelf.settings.download(idle_timeout_s=60.0)) == LISTED
 
 
-async def test_a_component_without_settings() -> None:
+async def test_component_without_settings_times_out() -> None:
     async with on_board(SimulatedGimbal()) as shelf:
-        with pytest.raises(
-            ParameterTimeout, match=r"PARAM_EXT_REQUEST_LIST was not answered.*last heartbeat of"
-        ):
-            await shelf.vehicle.component(154).settings.download(patience_s=3.0)
+        with pytest.raises(ParameterTimeout, match=r"PARAM_EXT_REQUEST_LIST was not answered.*last heartbeat of"):
+            await shelf.vehicle.component(154).settings.download(idle_timeout_s=3.0)
         with pytest.raises(OperationTimeout, match=r"not done within 1 s"):
             await shelf.vehicle.component(154).settings.download(timeout=1.0)
 
 
-async def test_one_is_read_and_set_without_the_list() -> None:
+async def test_setting_is_read_and_set_without_list() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         assert settings.known("CAM_WBMODE") is None
         assert await settings.get("CAM_WBMODE") == 0
         assert (await settings.set("CAM_WBMODE", 4)).value == shelf.values["CAM_WBMODE"] == 4
-        assert (
-            (await settings.set("CAM_OWNER", "Zoë & Söhne")).value
-            == shelf.values["CAM_OWNER"]
-            == "Zoë & Söhne"
-        )
+        assert (await settings.set("CAM_OWNER", "Zoë & Söhne")).value == shelf.values["CAM_OWNER"] == "Zoë & Söhne"
         assert (await settings.set("CAM_EV", -1.5)).value == shelf.values["CAM_EV"] == -1.5
         assert len(shelf.all(m.ParamExtSet)) == 3
         assert settings.table["CAM_EV"].value == -1.5
 
 
-async def test_names_and_values_that_cannot_be_are_refused_before_anything_is_sent() -> None:
+async def test_invalid_names_and_values_are_refused() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.download()
@@ -121,7 +115,7 @@ async def test_names_and_values_that_cannot_be_are_refused_before_anything_is_se
         for name, value, complaint in (
             ("", 1, "parameter name"),
             ("A" * 17, 1, "17 characters"),
-            ("CAM_WBMODE", 1.5, "whole numbers"),
+            ("CAM_WBMODE", 1.5, "a whole number"),
             ("CAM_WBMODE", -1, r"CAM_WBMODE = -1 must be in 0\.\.4294967295"),
             ("CAM_WBMODE", "Sunny", "a number"),
             ("CAM_OWNER", 7, "a text or bytes"),
@@ -131,7 +125,7 @@ async def test_names_and_values_that_cannot_be_are_refused_before_anything_is_se
         assert shelf.sent == []
 
 
-async def test_an_unknown_name() -> None:
+async def test_unknown_setting_is_rejected() -> None:
     async with on_board() as shelf:
         with pytest.raises(ParameterRejected, match="no setting CAM_NOPE: it answers others"):
             await shelf.settings.get("CAM_NOPE")
@@ -140,7 +134,7 @@ async def test_an_unknown_name() -> None:
         assert shelf.all(m.ParamExtSet) == []
 
 
-async def test_a_refusal_of_the_camera_is_told_with_its_code() -> None:
+async def test_camera_refusal_has_its_code() -> None:
     async with on_board() as shelf:
         await shelf.settings.download()
         with pytest.raises(ParameterRejected, match="CAM_LENS was refused") as caught:
@@ -152,7 +146,7 @@ async def test_a_refusal_of_the_camera_is_told_with_its_code() -> None:
         assert shelf.settings.table["CAM_WBMODE"].value == 0
 
 
-async def test_what_takes_long_is_waited_for() -> None:
+async def test_setting_in_progress_is_awaited() -> None:
     async with on_board() as shelf:
         shelf.camera.parameters.slow["CAM_WBMODE"] = 4.0
         begun = shelf.vehicle.connection.now()
@@ -161,24 +155,24 @@ async def test_what_takes_long_is_waited_for() -> None:
         assert len(shelf.all(m.ParamExtSet)) == 1
 
 
-async def test_another_value_than_asked_for_is_returned() -> None:
+async def test_set_returns_the_value_taken() -> None:
     async with on_board() as shelf:
         shelf.camera.faults.parameter_limits["CAM_EV"] = (-1.0, 1.0)
         assert (await shelf.settings.set("CAM_EV", 2.5)).value == 1.0
 
 
-async def test_a_camera_that_falls_silent() -> None:
+async def test_silent_camera_times_out() -> None:
     async with on_board() as shelf:
         await shelf.settings.download()
         shelf.camera.faults.silent = True
         with pytest.raises(ParameterTimeout, match="PARAM_EXT_SET of CAM_EV was not confirmed, sent 1 times"):
-            await shelf.settings.set("CAM_EV", 1.0, patience_s=3.0)
+            await shelf.settings.set("CAM_EV", 1.0, idle_timeout_s=3.0)
         assert len(shelf.all(m.ParamExtSet)) == 1
         with pytest.raises(ParameterTimeout):
-            await shelf.settings.get("CAM_EV", patience_s=1.0)
+            await shelf.settings.get("CAM_EV", idle_timeout_s=1.0)
 
 
-async def test_changes_are_told_whoever_makes_them() -> None:
+async def test_setting_changes_are_published() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.download()
@@ -207,7 +201,7 @@ async def test_changes_are_told_whoever_makes_them() -> None:
         assert settings.table["CAM_WBMODE"] == Setting("CAM_WBMODE", 4, MavParamExtType.UINT32, 5)
 
 
-async def test_two_cameras_do_not_hear_each_other() -> None:
+async def test_two_cameras_have_separate_settings() -> None:
     async with on_board(SimulatedCamera(101)) as shelf:
         other = shelf.vehicle.component(101).settings
         await shelf.settings.download()
@@ -216,19 +210,19 @@ async def test_two_cameras_do_not_hear_each_other() -> None:
         assert shelf.settings.table["CAM_WBMODE"].value == shelf.values["CAM_WBMODE"] == 0
 
 
-async def test_after_a_reboot_nothing_is_known() -> None:
+async def test_reboot_clears_settings() -> None:
     async with on_board() as shelf:
         await shelf.settings.download()
         await shelf.vehicle.reboot()
         assert not shelf.settings.table
         assert not shelf.settings.is_complete
-        assert len(await shelf.settings.download(patience_s=20.0)) == LISTED
+        assert len(await shelf.settings.download(idle_timeout_s=20.0)) == LISTED
 
 
 # ---------------------------------------------------------------------------- with a definition
 
 
-async def test_the_definition_comes_from_the_camera_itself() -> None:
+async def test_definition_is_fetched_from_the_camera() -> None:
     async with on_board() as shelf:
         definition = await shelf.settings.fetch_definition()
         assert definition is shelf.settings.definition
@@ -236,7 +230,7 @@ async def test_the_definition_comes_from_the_camera_itself() -> None:
         assert (await shelf.settings.read("CAM_STAMP")).value is False
 
 
-async def test_the_definition_may_be_compressed_elsewhere_and_in_another_language() -> None:
+async def test_definition_compressed_remote_and_localized() -> None:
     async with on_board(SimulatedCamera(101)) as shelf:
         shelf.camera.files.put("/info/my camera.xml.xz", lzma.compress(own_definition()))
         german = await shelf.settings.fetch_definition("mftp://info/my%20camera.xml.xz", locale="de")
@@ -246,7 +240,7 @@ async def test_the_definition_may_be_compressed_elsewhere_and_in_another_languag
         assert len((await shelf.vehicle.component(101).settings.fetch_definition(other)).settings) == LISTED
 
 
-async def test_a_definition_from_a_file_or_made_before(tmp_path: Path) -> None:
+async def test_load_definition_from_file_or_object(tmp_path: Path) -> None:
     async with on_board(definition_uri="") as shelf:
         settings = shelf.settings
         await settings.download()
@@ -276,7 +270,7 @@ async def test_a_definition_from_a_file_or_made_before(tmp_path: Path) -> None:
         ("mftp:///picture.jpg", FileFormatError),
     ],
 )
-async def test_addresses_that_lead_nowhere(uri: str, error: type[Exception]) -> None:
+async def test_invalid_definition_addresses(uri: str, error: type[Exception]) -> None:
     async with on_board(definition_uri=uri) as shelf:
         shelf.camera.files.put("/picture.jpg", b"\xff\xd8" * 100)
         with pytest.raises(error):
@@ -284,15 +278,15 @@ async def test_addresses_that_lead_nowhere(uri: str, error: type[Exception]) -> 
         assert shelf.settings.definition is None
 
 
-async def test_a_file_that_says_it_is_too_large_is_not_fetched() -> None:
+async def test_oversized_definition_is_not_fetched() -> None:
     async with on_board(definition_uri="mftp:///large") as shelf:
-        shelf.camera.files.put("/large", bytes(LARGEST_FILE + 1))
+        shelf.camera.files.put("/large", bytes(MAX_FILE_SIZE + 1))
         with pytest.raises(FileFormatError, match="more than 16 MB"):
             await shelf.settings.fetch_definition()
         assert len(shelf.all(m.FileTransferProtocol)) < 10
 
 
-async def test_options_go_by_their_names() -> None:
+async def test_options_are_set_by_name() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.fetch_definition()
@@ -302,7 +296,7 @@ async def test_options_go_by_their_names() -> None:
         assert settings.options("CAM_EV") == {}
 
 
-async def test_what_is_not_allowed_is_refused_before_it_is_sent() -> None:
+async def test_disallowed_values_are_refused() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.fetch_definition()
@@ -322,7 +316,7 @@ async def test_what_is_not_allowed_is_refused_before_it_is_sent() -> None:
         assert settings.excluded_by("CAM_EV") == ()
 
 
-async def test_what_decides_is_read_before_if_it_is_not_known() -> None:
+async def test_unknown_deciding_settings_are_read_first() -> None:
     async with on_board() as shelf:
         await shelf.settings.fetch_definition()
         with pytest.raises(InvalidArgument, match="excluded by CAM_EXPMODE = Auto"):
@@ -340,7 +334,7 @@ GHOST = b"""<parameter name="CAM_GHOST" type="uint8"><options><option name="on" 
 
 
 @pytest.mark.parametrize("is_downloaded", [True, False])
-async def test_what_the_camera_has_not_is_not_asked_for_each_time(is_downloaded: bool) -> None:
+async def test_absent_settings_are_requested_once(is_downloaded: bool) -> None:
     async with on_board() as shelf:
         shelf.camera.files.put("/ghost.xml", own_definition().replace(b"</parameters>", GHOST))
         await shelf.settings.fetch_definition("mftp:///ghost.xml")
@@ -354,7 +348,7 @@ async def test_what_the_camera_has_not_is_not_asked_for_each_time(is_downloaded:
         assert [type(each) for each in shelf.sent] == [m.ParamExtSet]
 
 
-async def test_ranges_follow_the_other_settings() -> None:
+async def test_options_depend_on_other_settings() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.fetch_definition()
@@ -363,16 +357,14 @@ async def test_ranges_follow_the_other_settings() -> None:
         await settings.set("CAM_ISO", 800)
         await shelf.component.command(MavCmd.SET_CAMERA_MODE, 0, CameraMode.VIDEO)
         assert list(settings.options("CAM_ISO")) == ["100", "200", "400"]
-        with pytest.raises(
-            InvalidArgument, match=r"CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100'"
-        ):
+        with pytest.raises(InvalidArgument, match=r"CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100'"):
             await settings.set("CAM_ISO", 800)
         await settings.set("CAM_MODE", "Photo")
         assert shelf.camera.mode == CameraMode.IMAGE
         assert (await settings.set("CAM_ISO", 800)).value == 800
 
 
-async def test_what_may_change_with_an_option_is_read_again() -> None:
+async def test_dependent_settings_are_read_again() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.fetch_definition()
@@ -386,18 +378,18 @@ async def test_what_may_change_with_an_option_is_read_again() -> None:
         assert settings.table["CAM_ISO"].value == shelf.values["CAM_ISO"] == 200
 
 
-async def test_what_cannot_be_read_again_is_not_known_any_more() -> None:
+async def test_unreadable_dependent_setting_is_forgotten() -> None:
     async with on_board() as shelf:
         settings = shelf.settings
         await settings.fetch_definition()
         await settings.download()
         shelf.camera.faults.mute_parameters.add("CAM_ISO")
-        await settings.set("CAM_EXPMODE", "Manual", patience_s=4.0)
+        await settings.set("CAM_EXPMODE", "Manual", idle_timeout_s=4.0)
         assert settings.known("CAM_ISO") is None
         assert settings.known("CAM_EV") is not None
 
 
-async def test_what_can_only_be_written_is_not_read() -> None:
+async def test_write_only_setting_is_not_read() -> None:
     pin = b'<parameter name="CAM_PIN" type="uint32" writeonly="1"/></parameters>'
     async with on_board(definition=own_definition().replace(b"</parameters>", pin)) as shelf:
         await shelf.settings.fetch_definition()
@@ -405,7 +397,7 @@ async def test_what_can_only_be_written_is_not_read() -> None:
         assert shelf.all(m.ParamExtRequestRead) == []
 
 
-async def test_settings_the_file_does_not_know_are_set_as_they_are() -> None:
+async def test_settings_without_definition_are_sent_unchanged() -> None:
     async with on_board() as shelf:
         text = own_definition().replace(b'name="CAM_WBMODE"', b'name="CAM_OTHER"')
         shelf.camera.files.put("/other.xml", text)
@@ -413,8 +405,8 @@ async def test_settings_the_file_does_not_know_are_set_as_they_are() -> None:
         assert (await shelf.settings.set("CAM_WBMODE", 4)).value == 4
 
 
-async def test_the_simulated_camera_refuses_what_its_definition_does_not_allow() -> None:
-    """By the wire, as a program without the definition would."""
+async def test_simulated_camera_refuses_disallowed_values() -> None:
+    """Bypass the definition by sending a message."""
     async with on_board() as shelf:
         await shelf.component.command(MavCmd.VIDEO_STOP_CAPTURE, 0)
         with pytest.raises(ParameterRejected) as caught:
@@ -432,7 +424,7 @@ async def test_the_simulated_camera_refuses_what_its_definition_does_not_allow()
 # ------------------------------------------------------------------------- files of components
 
 
-async def test_files_of_a_component() -> None:
+async def test_component_files() -> None:
     async with on_board(SimulatedCamera(101)) as shelf:
         shelf.camera.files.put("/DCIM/0001.jpg", bytes(range(256)) * 40)
         files = shelf.component.files

@@ -1,4 +1,4 @@
-"""MAVFTP servers that break the standard: every call ends, with an error that says what was wrong."""
+"""MAVFTP servers that violate the standard: every call ends with an error that names the violation."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def serve(flight: Flight, answer: Answer) -> None:
 
 
 def opened(request: FtpMessage) -> FtpMessage | None:
-    """The answers to everything but reads."""
+    """Answers to all requests except reads."""
     if request.opcode == MavFtpOpcode.OPENFILERO:
         return ack(request, SIZE.to_bytes(4, "little"))
     if request.opcode in (MavFtpOpcode.BURSTREADFILE, MavFtpOpcode.READFILE):
@@ -80,13 +80,13 @@ def empty_blocks(request: FtpMessage) -> Iterator[FtpMessage]:
 
 
 @pytest.mark.parametrize("answer", [short_block, end_at_once, empty_blocks])
-async def test_a_file_that_ends_before_its_size_is_not_whole(grounded: Flight, answer: Answer) -> None:
+async def test_file_shorter_than_its_size_is_an_error(grounded: Flight, answer: Answer) -> None:
     serve(grounded, answer)
-    with pytest.raises(RemoteProtocolError, match=f"of the {SIZE} bytes"):
+    with pytest.raises(RemoteProtocolError, match=f"its size is {SIZE}"):
         await grounded.vehicle.files.read("/a")
 
 
-async def test_a_block_far_beyond_the_others_is_not_waited_up_to(grounded: Flight) -> None:
+async def test_block_far_ahead_is_ignored(grounded: Flight) -> None:
     def far_and_near(request: FtpMessage) -> Iterator[FtpMessage]:
         if request.opcode == MavFtpOpcode.OPENFILERO:
             yield ack(request, (0xFFFF_FFFF).to_bytes(4, "little"))
@@ -98,12 +98,12 @@ async def test_a_block_far_beyond_the_others_is_not_waited_up_to(grounded: Fligh
     serve(grounded, far_and_near)
     with pytest.raises(FileError):
         await grounded.vehicle.files.crc32("/a")
-    with pytest.raises(Exception, match="0 bytes are there"):
-        await grounded.vehicle.files.read("/a", patience_s=2.0)
+    with pytest.raises(Exception, match="0 bytes received"):
+        await grounded.vehicle.files.read("/a", idle_timeout_s=2.0)
 
 
-async def test_a_file_that_is_shorter_when_it_is_opened_again(grounded: Flight) -> None:
-    """What the vehicle makes up as it is read may be: its size says nothing."""
+async def test_file_shrinking_before_reopen_is_an_error(grounded: Flight) -> None:
+    """Virtual files are exempt: their size is unknown until they are read."""
     openings = 0
 
     def shrinks(request: FtpMessage) -> Iterator[FtpMessage]:
@@ -125,17 +125,15 @@ async def test_a_file_that_is_shorter_when_it_is_opened_again(grounded: Flight) 
     assert 500 < len(await grounded.vehicle.files.read("@PARAM/param.pck")) < SIZE
 
 
-@pytest.mark.parametrize(("patience_s", "waited_s"), [(2.0, 2.0), (10.0, 3.0)])
-async def test_closing_is_not_waited_for_longer_than_three_seconds_when_there_is_an_error_to_tell(
-    grounded: Flight, patience_s: float, waited_s: float
-) -> None:
+@pytest.mark.parametrize(("idle_timeout_s", "waited_s"), [(2.0, 2.0), (10.0, 3.0)])
+async def test_error_waits_at_most_3_s_for_close(grounded: Flight, idle_timeout_s: float, waited_s: float) -> None:
     def never_closes(request: FtpMessage) -> Iterator[FtpMessage]:
         if request.opcode != MavFtpOpcode.TERMINATESESSION:
             yield opened(request) or nak(request, MavFtpErr.FAIL)
 
     serve(grounded, never_closes)
     with pytest.raises(FileError, match="read /any"):
-        await grounded.vehicle.files.read("/any", patience_s=patience_s)
+        await grounded.vehicle.files.read("/any", idle_timeout_s=idle_timeout_s)
     closings = [
         at
         for at, message in grounded.wire.sent
@@ -146,13 +144,13 @@ async def test_closing_is_not_waited_for_longer_than_three_seconds_when_there_is
 
 
 @pytest.mark.parametrize("data", [b"Fa\t1\0", b""])
-async def test_a_listing_without_an_end_is_an_error(grounded: Flight, data: bytes) -> None:
+async def test_endless_listing_is_an_error(grounded: Flight, data: bytes) -> None:
     serve(grounded, lambda request: iter([ack(request, data)]))
     with pytest.raises(RemoteProtocolError, match="does not end"):
         await grounded.vehicle.files.list("/")
 
 
-async def test_a_size_that_is_no_number_is_not_known(grounded: Flight) -> None:
+async def test_listing_invalid_size_is_none(grounded: Flight) -> None:
     def listing(request: FtpMessage) -> Iterator[FtpMessage]:
         yield ack(request, "Fa\t²\0".encode()) if request.offset == 0 else nak(request, MavFtpErr.EOF)
 
@@ -161,7 +159,7 @@ async def test_a_size_that_is_no_number_is_not_known(grounded: Flight) -> None:
     assert (entry.name, entry.size) == ("a", None)
 
 
-async def test_a_file_that_is_not_there_after_writing_is_told(grounded: Flight) -> None:
+async def test_write_of_vanished_file_raises(grounded: Flight) -> None:
     def forgetful(request: FtpMessage) -> Iterator[FtpMessage]:
         missing = request.opcode == MavFtpOpcode.CALCFILECRC
         yield nak(request, MavFtpErr.FILENOTFOUND) if missing else ack(request, bytes(4))
@@ -172,7 +170,7 @@ async def test_a_file_that_is_not_there_after_writing_is_told(grounded: Flight) 
 
 
 @pytest.mark.parametrize("code", [MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND])
-async def test_a_server_without_checksums_is_believed(grounded: Flight, code: MavFtpErr) -> None:
+async def test_write_without_crc_support_is_trusted(grounded: Flight, code: MavFtpErr) -> None:
     asked: list[int] = []
 
     def answer(request: FtpMessage) -> Iterator[FtpMessage]:
@@ -184,8 +182,8 @@ async def test_a_server_without_checksums_is_believed(grounded: Flight, code: Ma
     assert MavFtpOpcode.CALCFILECRC in asked
 
 
-async def test_what_the_first_sending_has_opened_is_closed_and_opened_anew(grounded: Flight) -> None:
-    """Its answer was lost, and the server has one session and no memory of who opened it."""
+async def test_session_of_lost_reply_is_closed_and_reopened(grounded: Flight) -> None:
+    """The answer was lost, and the server has a single session without an owner."""
     asked: list[MavFtpOpcode] = []
 
     def answer(request: FtpMessage) -> Iterator[FtpMessage]:
@@ -208,7 +206,7 @@ async def test_what_the_first_sending_has_opened_is_closed_and_opened_anew(groun
     assert asked[opens[1] : opens[2]] == [MavFtpOpcode.OPENFILERO, MavFtpOpcode.TERMINATESESSION]
 
 
-async def test_a_refusal_of_the_first_sending_closes_nothing_of_others(grounded: Flight) -> None:
+async def test_refused_open_closes_no_other_session(grounded: Flight) -> None:
     asked: list[int] = []
 
     def answer(request: FtpMessage) -> Iterator[FtpMessage]:
@@ -222,9 +220,7 @@ async def test_a_refusal_of_the_first_sending_closes_nothing_of_others(grounded:
 
 
 @pytest.mark.parametrize("code", [MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND, MavFtpErr.FILENOTFOUND])
-async def test_without_checksums_the_beginning_of_a_file_is_believed_too(
-    grounded: Flight, tmp_path: Path, code: MavFtpErr
-) -> None:
+async def test_resume_without_crc_support_is_trusted(grounded: Flight, tmp_path: Path, code: MavFtpErr) -> None:
     content = b"x" * 500
 
     def answer(request: FtpMessage) -> Iterator[FtpMessage]:
@@ -248,10 +244,8 @@ async def test_without_checksums_the_beginning_of_a_file_is_believed_too(
         assert (tmp_path / "to").read_bytes() == b"y" * DATA_SIZE + content[DATA_SIZE:]
 
 
-async def test_more_than_a_file_holds_is_refused_before_anything_is_sent(
-    grounded: Flight, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(files, "LARGEST", 10)
+async def test_oversized_write_is_refused(grounded: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "MAX_FILE_SIZE", 10)
     asked: list[int] = []
 
     def answer(request: FtpMessage) -> Iterator[FtpMessage]:

@@ -1,4 +1,4 @@
-"""Files on both autopilots: every operation, every kind of end, and nothing left open."""
+"""Files on both autopilots: all operations, all kinds of end, no session left open."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
-from aerokit.protocols.exchange import Progress
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.protocols.ftp import FtpMessage
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink, run_virtual
@@ -38,14 +38,14 @@ Op = MavFtpOpcode
 
 
 class Bench:
-    """A simulated vehicle with files, and a program on it."""
+    """A simulated vehicle with files, and a connection to it."""
 
     def __init__(self, simulated: Any, vehicle: aerokit.Vehicle, wire: Any, root: str) -> None:
         self.simulated, self.vehicle, self.wire, self.root = simulated, vehicle, wire, root
         self.files = vehicle.files
 
     def put(self, name: str, data: bytes) -> str:
-        """A file on the vehicle; its path."""
+        """Create a file on the vehicle and return its path."""
         path = f"{self.root}/{name}"
         file = self.simulated.ftp.files.open(path, writing=True, create=True)
         file.write(0, data)
@@ -60,7 +60,7 @@ class Bench:
         return [FtpMessage.decode(each.payload) for each in self.wire.all(m.FileTransferProtocol)]
 
     async def all_closed(self) -> None:
-        """Within seconds the vehicle has nothing open, and nobody here waits for anything."""
+        """Check that within seconds the vehicle has no open session, and no task waits here."""
         for _ in range(200):
             if not self.simulated.ftp.open_sessions:
                 return
@@ -102,7 +102,7 @@ async def px4() -> AsyncIterator[Bench]:
 
 
 @pytest.mark.parametrize("size", [0, 5, 238, 239, 240, 478, 20_000])
-async def test_what_is_written_is_read(bench: Bench, size: int) -> None:
+async def test_write_read_round_trip(bench: Bench, size: int) -> None:
     path = f"{bench.root}/new.bin"
     await bench.files.write(path, DATA[:size])
     assert bench.get("new.bin") == DATA[:size]
@@ -110,7 +110,7 @@ async def test_what_is_written_is_read(bench: Bench, size: int) -> None:
     await bench.all_closed()
 
 
-async def test_files_are_listed(bench: Bench) -> None:
+async def test_list_returns_entries(bench: Bench) -> None:
     before = await bench.files.list(bench.root)
     for number in range(40):
         bench.put(f"file-{number:02}.bin", DATA[:number])
@@ -123,7 +123,7 @@ async def test_files_are_listed(bench: Bench) -> None:
     assert await bench.files.list(f"{bench.root}/more") == ()
 
 
-async def test_names_change_and_go(bench: Bench) -> None:
+async def test_rename_and_remove(bench: Bench) -> None:
     path, files = bench.put("a.bin", b"a"), bench.files
     await files.make_directory(f"{bench.root}/d")
     await files.rename(path, f"{bench.root}/d/b")
@@ -137,12 +137,12 @@ async def test_names_change_and_go(bench: Bench) -> None:
     assert (refused.value.code, refused.value.path) == (MavFtpErr.FILENOTFOUND, path)
 
 
-async def test_a_checksum_of_the_vehicle(bench: Bench) -> None:
+async def test_crc32_of_the_vehicle(bench: Bench) -> None:
     # of "123456789", with nothing inverted
     assert await bench.files.crc32(bench.put("check", b"123456789")) == 0x2DFD2D88
 
 
-async def test_truncating(px4: Bench, ardupilot: Bench) -> None:
+async def test_truncate(px4: Bench, ardupilot: Bench) -> None:
     path = px4.put("long", DATA)
     await px4.files.truncate(path, 100)
     assert await px4.files.read(path) == DATA[:100]
@@ -150,7 +150,7 @@ async def test_truncating(px4: Bench, ardupilot: Bench) -> None:
         await ardupilot.files.truncate(ardupilot.put("long", DATA), 100)
 
 
-async def test_errors_of_the_file_system(bench: Bench) -> None:
+async def test_file_system_errors(bench: Bench) -> None:
     with pytest.raises(FileError) as exists:
         await bench.files.make_directory(bench.root)
     assert exists.value.code == MavFtpErr.FILEEXISTS
@@ -162,14 +162,14 @@ async def test_errors_of_the_file_system(bench: Bench) -> None:
     await bench.all_closed()
 
 
-async def test_virtual_files_end_where_they_end(ardupilot: Bench) -> None:
+async def test_virtual_files_are_read_to_their_end(ardupilot: Bench) -> None:
     packed = await ardupilot.files.read("@PARAM/param.pck")
     assert packed[:2] == b"\x1b\x67"
     assert len(packed) > 1000
 
 
 @pytest.mark.parametrize("path", ["", "a\0b", "x" * 239, "\ud800", 5])
-async def test_paths_that_cannot_be_are_refused_before_anything_is_sent(ardupilot: Bench, path: Any) -> None:
+async def test_invalid_paths_are_refused(ardupilot: Bench, path: Any) -> None:
     files = ardupilot.files
     calls: list[Callable[[], Any]] = [
         lambda: files.read(path),
@@ -190,7 +190,7 @@ async def test_paths_that_cannot_be_are_refused_before_anything_is_sent(ardupilo
     assert ardupilot.sent() == []
 
 
-async def test_other_arguments_that_cannot_be(ardupilot: Bench) -> None:
+async def test_invalid_arguments_are_refused(ardupilot: Bench) -> None:
     files = ardupilot.files
     with pytest.raises(InvalidArgument, match="together"):
         await files.rename("/" + "a" * 150, "/" + "b" * 150)
@@ -200,37 +200,37 @@ async def test_other_arguments_that_cannot_be(ardupilot: Bench) -> None:
     for seconds in (0.0, -1.0, float("nan")):
         with pytest.raises(InvalidArgument, match="timeout"):
             await files.read("/a", timeout=seconds)
-        with pytest.raises(InvalidArgument, match="patience_s"):
-            await files.read("/a", patience_s=seconds)
+        with pytest.raises(InvalidArgument, match="idle_timeout_s"):
+            await files.read("/a", idle_timeout_s=seconds)
     assert ardupilot.sent() == []
 
 
-async def test_whether_there_is_any_mavftp(bench: Bench) -> None:
+async def test_is_supported(bench: Bench) -> None:
     assert await bench.files.is_supported()
 
 
-# ------------------------------------------------------------------------------- the disk here
+# ------------------------------------------------------------------------------- local disk
 
 
-async def test_a_file_is_copied_both_ways(bench: Bench, tmp_path: Path) -> None:
+async def test_download_and_upload_copy_files(bench: Bench, tmp_path: Path) -> None:
     source, to = tmp_path / "source", tmp_path / "to"
     source.write_bytes(DATA)
-    told: list[Progress] = []
-    await bench.files.upload(source, f"{bench.root}/copy", on_progress=told.append)
+    reported: list[TransferProgress] = []
+    await bench.files.upload(source, f"{bench.root}/copy", on_progress=reported.append)
     assert bench.get("copy") == DATA
-    assert (told[-1].done, told[-1].total, told[-1].fraction) == (len(DATA), len(DATA), 1.0)
-    told.clear()
-    await bench.files.download(f"{bench.root}/copy", to, on_progress=told.append)
+    assert (reported[-1].done, reported[-1].total, reported[-1].fraction) == (len(DATA), len(DATA), 1.0)
+    reported.clear()
+    await bench.files.download(f"{bench.root}/copy", to, on_progress=reported.append)
     assert to.read_bytes() == DATA
-    assert (told[-1].done, told[-1].total) == (len(DATA), len(DATA))
-    assert told[-1].rate > 0
+    assert (reported[-1].done, reported[-1].total) == (len(DATA), len(DATA))
+    assert reported[-1].rate > 0
     assert names_in(tmp_path) == ["source", "to"]
 
 
-async def test_an_interrupted_download_goes_on(bench: Bench, tmp_path: Path) -> None:
+async def test_download_resumes(bench: Bench, tmp_path: Path) -> None:
     path, to, part = bench.put("long", DATA), tmp_path / "to", tmp_path / "to.part"
 
-    def stop(progress: Progress) -> None:
+    def stop(progress: TransferProgress) -> None:
         if progress.done > 5000:
             scope.cancel()
 
@@ -241,13 +241,13 @@ async def test_an_interrupted_download_goes_on(bench: Bench, tmp_path: Path) -> 
     assert len(kept) > 5000
     assert not to.exists()
     await bench.all_closed()
-    told: list[Progress] = []
-    await bench.files.download(path, to, resume=True, on_progress=told.append)
+    reported: list[TransferProgress] = []
+    await bench.files.download(path, to, resume=True, on_progress=reported.append)
     assert to.read_bytes() == DATA
-    assert told[0].done > len(kept)
+    assert reported[0].done > len(kept)
 
 
-async def test_the_beginning_of_another_file_is_noticed(bench: Bench, tmp_path: Path) -> None:
+async def test_resume_detects_another_file(bench: Bench, tmp_path: Path) -> None:
     path, to = bench.put("long", DATA), tmp_path / "to"
     for wrong in (b"x" * 1000, b"x" * len(DATA), b"x" * (len(DATA) + 5)):
         (tmp_path / "to.part").write_bytes(wrong)
@@ -255,13 +255,13 @@ async def test_the_beginning_of_another_file_is_noticed(bench: Bench, tmp_path: 
         assert to.read_bytes() == DATA
 
 
-async def test_without_resume_what_was_left_is_gone(bench: Bench, tmp_path: Path) -> None:
+async def test_download_without_resume_discards_the_part(bench: Bench, tmp_path: Path) -> None:
     (tmp_path / "to.part").write_bytes(b"x" * 1000)
     await bench.files.download(bench.put("long", DATA), tmp_path / "to")
     assert (tmp_path / "to").read_bytes() == DATA
 
 
-async def test_disks_that_cannot_be_written_or_read(ardupilot: Bench, tmp_path: Path) -> None:
+async def test_local_disk_errors_propagate(ardupilot: Bench, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="nowhere"):
         await ardupilot.files.download("/APM/a", tmp_path / "nowhere" / "to")
     with pytest.raises(OSError, match="nothing"):
@@ -272,10 +272,10 @@ async def test_disks_that_cannot_be_written_or_read(ardupilot: Bench, tmp_path: 
     assert names_in(tmp_path) == []
 
 
-# ----------------------------------------------------------------------------- ends of all kinds
+# ----------------------------------------------------------------------------- kinds of end
 
 
-async def test_cancelled_at_any_moment_the_session_is_closed(bench: Bench) -> None:
+async def test_cancellation_at_any_time_closes_the_session(bench: Bench) -> None:
     path = bench.put("long", DATA)
     for milliseconds in range(0, 400, 23):
         for call in (bench.files.read(path), bench.files.write(f"{bench.root}/w", DATA)):
@@ -285,14 +285,14 @@ async def test_cancelled_at_any_moment_the_session_is_closed(bench: Bench) -> No
     assert await bench.files.read(path) == DATA
 
 
-async def test_a_cancelled_transfer_says_so_at_once(ardupilot: Bench) -> None:
+async def test_cancelled_transfer_closes_immediately(ardupilot: Bench) -> None:
     path = ardupilot.put("long", DATA)
     with anyio.move_on_after(0.06):
         await ardupilot.files.read(path)
     assert ardupilot.sent()[-1].opcode == Op.TERMINATESESSION
 
 
-async def test_a_time_limit_for_all_of_it(bench: Bench) -> None:
+async def test_timeout_limits_the_whole_call(bench: Bench) -> None:
     path = bench.put("long", DATA)
     bench.simulated.faults.loss = 0.0
     with pytest.raises(FileTimeout, match=r"not done within 0\.02 s") as raised:
@@ -301,9 +301,9 @@ async def test_a_time_limit_for_all_of_it(bench: Bench) -> None:
     await bench.all_closed()
 
 
-async def test_a_vehicle_that_does_not_answer(bench: Bench) -> None:
+async def test_silent_vehicle_times_out(bench: Bench) -> None:
     bench.simulated.faults.no_ftp = True
-    for call in (bench.files.read("/a", patience_s=2.0), bench.files.list("/a", patience_s=2.0)):
+    for call in (bench.files.read("/a", idle_timeout_s=2.0), bench.files.list("/a", idle_timeout_s=2.0)):
         with pytest.raises(FileTimeout, match="no answer"):
             await call
     assert len(bench.sent()) < 80
@@ -311,7 +311,7 @@ async def test_a_vehicle_that_does_not_answer(bench: Bench) -> None:
     assert await bench.files.read(bench.put("a", b"a")) == b"a"
 
 
-async def test_operations_take_turns(bench: Bench) -> None:
+async def test_operations_are_serialized(bench: Bench) -> None:
     paths = [bench.put(f"f{number}", DATA[: 1000 * number]) for number in range(5)]
     read: dict[int, bytes] = {}
 
@@ -325,7 +325,7 @@ async def test_operations_take_turns(bench: Bench) -> None:
     assert list(read) == sorted(read)
 
 
-async def test_leaving_the_block_ends_what_runs() -> None:
+async def test_block_exit_ends_operations() -> None:
     async with open_flight(latency_s=0.02, rates={}) as flight:
         reading = asyncio.ensure_future(flight.vehicle.files.read("@PARAM/param.pck"))
         await anyio.sleep(0.05)
@@ -335,11 +335,11 @@ async def test_leaving_the_block_ends_what_runs() -> None:
         await flight.vehicle.files.read("/a")
 
 
-async def test_a_session_that_the_vehicle_has_closed_is_opened_again(bench: Bench) -> None:
+async def test_session_closed_by_vehicle_is_reopened(bench: Bench) -> None:
     path = bench.put("long", DATA)
     rest = iter([True])
 
-    def restart(progress: Progress) -> None:
+    def restart(progress: TransferProgress) -> None:
         if progress.done > 4000 and next(rest, False):
             bench.simulated.ftp.restart()
 
@@ -350,8 +350,8 @@ async def test_a_session_that_the_vehicle_has_closed_is_opened_again(bench: Benc
     await bench.all_closed()
 
 
-async def test_a_session_of_another_program_is_waited_for(bench: Bench) -> None:
-    """Which has died with a file open: the vehicle closes it some time after the last request."""
+async def test_session_of_another_program_is_awaited(bench: Bench) -> None:
+    """The other program has died with a file open: the vehicle closes it after a time-out."""
     path = bench.put("long", DATA)
     request = FtpMessage(77, Op.OPENFILERO, 200, len(path), data=path.encode())
     bench.wire.write(frame_of(m.FileTransferProtocol(0, bench.vehicle.system_id, 1, request.encode())))
@@ -363,19 +363,19 @@ async def test_a_session_of_another_program_is_waited_for(bench: Bench) -> None:
     await bench.all_closed()
 
 
-async def test_a_session_of_another_program_that_works_is_left_alone(px4: Bench) -> None:
+async def test_active_session_of_another_program_is_not_closed(px4: Bench) -> None:
     path = px4.put("long", DATA)
     request = FtpMessage(77, Op.OPENFILERO, 0, len(path), data=path.encode())
     frame = frame_of(m.FileTransferProtocol(0, px4.vehicle.system_id, 1, request.encode()))
     px4.wire.write(frame)
     await anyio.sleep(0.2)
     with pytest.raises(FileError, match="another program") as refused:
-        await px4.files.read(path, patience_s=3.0)
+        await px4.files.read(path, idle_timeout_s=3.0)
     assert refused.value.code == MavFtpErr.NOSESSIONSAVAILABLE
     assert px4.simulated.ftp.open_sessions == 1
 
 
-async def test_what_was_written_is_compared(ardupilot: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_write_is_verified(ardupilot: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     path = "/APM/new.bin"
     tree = ardupilot.simulated.ftp.files
     opened = tree.open
@@ -399,7 +399,7 @@ def names_in(directory: Path) -> list[str]:
 
 
 def frame_of(message: m.FileTransferProtocol) -> bytes:
-    """As another ground station sends it."""
+    """The request as sent by another ground station."""
     return FrameEncoder(250, 190).encode(message)
 
 
@@ -409,7 +409,7 @@ def frame_of(message: m.FileTransferProtocol) -> bytes:
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
 @pytest.mark.parametrize("loss", [0.05, 0.3])
 @pytest.mark.parametrize("seed", range(3))
-def test_over_a_bad_radio(make: Any, loss: float, seed: int) -> None:
+def test_transfer_over_bad_radio(make: Any, loss: float, seed: int) -> None:
     async def main() -> None:
         simulated = make(boot_time_s=0.0)
         async with simulated_link(simulated) as link:

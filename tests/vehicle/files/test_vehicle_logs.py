@@ -1,4 +1,4 @@
-"""Flight logs on both autopilots: by MAVFTP and by LOG_*, every kind of end, and nothing left sending."""
+"""Flight logs on both autopilots: by MAVFTP and by LOG_*, all kinds of end, no transfer left running."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from flight_harness import open_flight, open_px4
 import aerokit
 from aerokit import messages as m
 from aerokit.errors import FileError, FileTimeout, InvalidArgument
-from aerokit.protocols.exchange import Progress
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink, run_virtual
 from aerokit.vehicle.files.files import FileEntry
-from aerokit.vehicle.files.log_paths import log_path
-from aerokit.vehicle.files.logs import LogEntry
+from aerokit.vehicle.files.logs import LogEntry, log_path
 
 pytestmark = pytest.mark.anyio
 
 
 class Bench:
-    """A simulated vehicle with flight logs, and a program on it."""
+    """A simulated vehicle with flight logs, and a connection to it."""
 
     def __init__(self, simulated: Any, vehicle: aerokit.Vehicle, wire: Any) -> None:
         self.simulated, self.vehicle, self.wire = simulated, vehicle, wire
@@ -73,14 +72,14 @@ async def ardupilot() -> AsyncIterator[Bench]:
         yield bench
 
 
-async def test_logs_are_listed(bench: Bench) -> None:
+async def test_list_returns_logs(bench: Bench) -> None:
     entries = await bench.logs.list()
     assert [each.size for each in entries] == [each.size for each in bench.server.logs]
     assert entries[0].id == bench.vehicle.autopilot.first_log_id
     assert entries[0].time_utc == datetime.fromtimestamp(bench.server.logs[0].time_utc, tz=timezone.utc)
 
 
-async def test_logs_are_read_by_either_way(bench: Bench) -> None:
+async def test_read_by_messages_and_mavftp(bench: Bench) -> None:
     for number, entry in enumerate(await bench.logs.list()):
         for method in ("auto", "log"):
             assert await bench.logs.read(entry, method=method) == bench.content(number)
@@ -88,14 +87,14 @@ async def test_logs_are_read_by_either_way(bench: Bench) -> None:
     await bench.all_quiet()
 
 
-async def test_logs_are_read_by_mavftp(ardupilot: Bench) -> None:
+async def test_read_by_mavftp(ardupilot: Bench) -> None:
     entries = await ardupilot.logs.list()
     ardupilot.wire.forget()
     assert await ardupilot.logs.read(entries[0], method="ftp") == ardupilot.content(0)
     assert not ardupilot.wire.all(m.LogRequestData)
 
 
-async def test_in_flight_only_mavftp_reads_them(ardupilot: Bench) -> None:
+async def test_in_flight_only_mavftp_works(ardupilot: Bench) -> None:
     """ArduPilot ignores LOG_* messages while it is armed."""
     entries = await ardupilot.logs.list()
     await ardupilot.vehicle.wait_ready()
@@ -103,16 +102,16 @@ async def test_in_flight_only_mavftp_reads_them(ardupilot: Bench) -> None:
     assert await ardupilot.logs.read(entries[0]) == ardupilot.content(0)
     ardupilot.wire.forget()
     with pytest.raises(FileTimeout, match="does not answer"):
-        await ardupilot.logs.read(entries[0], method="log", patience_s=2.0)
+        await ardupilot.logs.read(entries[0], method="log", idle_timeout_s=2.0)
     assert not ardupilot.wire.all(m.FileTransferProtocol)
     with pytest.raises(FileTimeout, match="does not answer"):
-        await ardupilot.logs.list(patience_s=2.0)
+        await ardupilot.logs.list(idle_timeout_s=2.0)
 
 
-async def test_downloads_go_on_where_they_were_left(bench: Bench, tmp_path: Path) -> None:
+async def test_download_resumes(bench: Bench, tmp_path: Path) -> None:
     entry, to = (await bench.logs.list())[0], tmp_path / "flight.bin"
 
-    def stop(progress: Progress) -> None:
+    def stop(progress: TransferProgress) -> None:
         assert progress.total == entry.size
         if progress.done > 20_000:
             scope.cancel()
@@ -122,25 +121,25 @@ async def test_downloads_go_on_where_they_were_left(bench: Bench, tmp_path: Path
     await bench.all_quiet()
     (part,) = names_in(tmp_path)
     assert part.startswith("flight.bin.log")
-    told: list[Progress] = []
-    await bench.logs.download(entry, to, method="log", on_progress=told.append)
-    assert told[0].done > 20_000
+    reported: list[TransferProgress] = []
+    await bench.logs.download(entry, to, method="log", on_progress=reported.append)
+    assert reported[0].done > 20_000
     assert to.read_bytes() == bench.content(0)
     assert names_in(tmp_path) == ["flight.bin"]
 
 
-async def test_downloads_by_mavftp(ardupilot: Bench, tmp_path: Path) -> None:
+async def test_download_by_mavftp(ardupilot: Bench, tmp_path: Path) -> None:
     entry = (await ardupilot.logs.list())[1]
     await ardupilot.logs.download(entry, tmp_path / "b.bin", method="ftp")
     assert (tmp_path / "b.bin").read_bytes() == ardupilot.content(1)
 
 
-async def test_a_log_that_is_not_there(bench: Bench) -> None:
+async def test_missing_log_is_file_error(bench: Bench) -> None:
     with pytest.raises(FileError, match="log 77: there is no such log"):
         await bench.logs.read(77)
     entry = (await bench.logs.list())[0]
     larger = entry.replace(size=entry.size + 1)
-    with pytest.raises(FileError, match="list them again"):
+    with pytest.raises(FileError, match=r"call list\(\) again"):
         await bench.logs.read(larger)
 
 
@@ -152,16 +151,16 @@ MORE = 30_001
     ("kind", "method"),
     [("ardupilot", "auto"), ("ardupilot", "log"), ("ardupilot", "ftp"), ("px4", "auto"), ("px4", "log")],
 )
-async def test_a_log_that_is_still_written_comes_as_far_as_it_goes(
+async def test_growing_log_is_read_to_its_current_end(
     kind: str, method: Any, clock_s: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """ArduPilot tells its clock's time while it writes, and the file's afterwards, which may be earlier."""
+    """ArduPilot reports its clock while it writes, and afterwards the time of the file, which may be earlier."""
     async with open_bench(kind) as bench:
         entry = (await bench.logs.list())[-1]
         assert entry.time_utc is not None
         time_utc, server = int(entry.time_utc.timestamp()) + clock_s, bench.server
         server.write_on(MORE, time_utc)
-        for tenths in range(1, 6):  # in the midst of it
+        for tenths in range(1, 6):  # during the download
             bench.simulated.call_later(tenths / 10, lambda: server.write_on(100, time_utc))
         with caplog.at_level("INFO", "aerokit"):
             content = await bench.logs.read(entry, method=method)
@@ -169,15 +168,13 @@ async def test_a_log_that_is_still_written_comes_as_far_as_it_goes(
             await bench.logs.download(entry, tmp_path / "flight.bin", method=method)
         assert bench.content(-1).startswith(content)
         assert bench.content(-1).startswith((tmp_path / "flight.bin").read_bytes())
-        said = [each.getMessage() for each in caplog.records]
-        assert f"log {entry.id} was still being written when it was listed with {entry.size} byt" in said[0]
-        assert f"it had {len(content)} when it was asked for" in said[0]
+        texts = [each.getMessage() for each in caplog.records]
+        assert f"log {entry.id} was still being written: listed with {entry.size} byt" in texts[0]
+        assert f"downloaded with {len(content)}" in texts[0]
         await bench.all_quiet()
 
 
-async def test_a_log_that_does_not_grow_is_read_without_a_word(
-    ardupilot: Bench, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_complete_log_is_not_reported_as_growing(ardupilot: Bench, caplog: pytest.LogCaptureFixture) -> None:
     entry = (await ardupilot.logs.list())[-1]
     with caplog.at_level("INFO", "aerokit"):
         await ardupilot.logs.read(entry, method="log")
@@ -185,8 +182,8 @@ async def test_a_log_that_does_not_grow_is_read_without_a_word(
     assert not [each for each in caplog.records if "being written" in each.getMessage()]
 
 
-async def test_in_flight_mavftp_reads_a_log_that_has_ended_since(ardupilot: Bench) -> None:
-    """Reading one by LOG_* ends the log that is written, and arming begins another one."""
+async def test_log_ended_since_listing_is_read_in_flight(ardupilot: Bench) -> None:
+    """Reading a log by LOG_* ends the current one, and arming starts another."""
     older, entry = await ardupilot.logs.list()
     ardupilot.server.write_on(MORE, 1_789_996_000)
     content = ardupilot.content(-1)
@@ -195,24 +192,22 @@ async def test_in_flight_mavftp_reads_a_log_that_has_ended_since(ardupilot: Benc
     await ardupilot.vehicle.arm()
     assert await ardupilot.logs.read(entry) == content
     with pytest.raises(FileTimeout, match="does not answer"):
-        await ardupilot.logs.read(older.replace(size=older.size - 1), patience_s=2.0)
+        await ardupilot.logs.read(older.replace(size=older.size - 1), idle_timeout_s=2.0)
 
 
-async def test_a_log_of_another_time_is_another_log(bench: Bench) -> None:
+async def test_log_with_another_time_is_another_log(bench: Bench) -> None:
     entry = (await bench.logs.list())[-1]
     assert entry.time_utc is not None
     bench.server.write_on(MORE, int(entry.time_utc.timestamp()) - 100_000)
-    with pytest.raises(FileError, match="list them again"):
+    with pytest.raises(FileError, match=r"call list\(\) again"):
         await bench.logs.read(entry, method="log")
 
 
-async def test_an_interrupted_download_of_a_log_that_grows_is_whole_in_the_end(
-    ardupilot: Bench, tmp_path: Path
-) -> None:
-    """Its CRC is that of more than came: it begins anew."""
+async def test_resumed_download_of_growing_log_is_complete(ardupilot: Bench, tmp_path: Path) -> None:
+    """The CRC covers more than was received, so the download restarts."""
     entry, to = (await ardupilot.logs.list())[-1], tmp_path / "flight.bin"
 
-    def stop(progress: Progress) -> None:
+    def stop(progress: TransferProgress) -> None:
         if progress.done > 20_000:
             scope.cancel()
 
@@ -231,7 +226,7 @@ async def test_an_interrupted_download_of_a_log_that_grows_is_whole_in_the_end(
     assert names_in(tmp_path) == ["flight.bin"]
 
 
-async def test_arguments_that_cannot_be(bench: Bench) -> None:
+async def test_invalid_log_arguments_are_refused(bench: Bench) -> None:
     bench.wire.forget()
     logs: Any = bench.logs
     for log in (-1, 65536, "1"):
@@ -245,18 +240,18 @@ async def test_arguments_that_cannot_be(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("log_id", [0, 65535])
-async def test_every_number_that_a_log_can_have_is_asked_for(bench: Bench, log_id: int) -> None:
+async def test_all_log_ids_are_accepted(bench: Bench, log_id: int) -> None:
     with suppress(FileError):
         assert await bench.logs.read(log_id) == bench.content(log_id)
     assert bench.sent() > 0
 
 
-async def test_erased_logs_are_gone(bench: Bench) -> None:
+async def test_erase_removes_logs(bench: Bench) -> None:
     await bench.logs.erase()
     assert await bench.logs.list() == ()
 
 
-async def test_cancelled_at_any_moment_nothing_goes_on(bench: Bench) -> None:
+async def test_cancellation_at_any_time_ends_the_transfer(bench: Bench) -> None:
     entry = (await bench.logs.list())[0]
     for milliseconds in range(0, 300, 37):
         with anyio.move_on_after(milliseconds / 1000):
@@ -265,7 +260,7 @@ async def test_cancelled_at_any_moment_nothing_goes_on(bench: Bench) -> None:
     assert await bench.logs.read(entry, method="log") == bench.content(0)
 
 
-async def test_a_time_limit_for_all_of_it(bench: Bench) -> None:
+async def test_timeout_limits_the_whole_call(bench: Bench) -> None:
     entry = (await bench.logs.list())[0]
     with pytest.raises(FileTimeout, match=r"not done within 0\.1 s") as raised:
         await bench.logs.read(entry, method="log", timeout=0.1)
@@ -273,16 +268,16 @@ async def test_a_time_limit_for_all_of_it(bench: Bench) -> None:
     await bench.all_quiet()
 
 
-async def test_which_file_is_which_log() -> None:
+async def test_log_path_identifies_files() -> None:
     class Listing:
-        """The files of a PX4 that has written its list."""
+        """Files of a PX4 that has written its list."""
 
-        async def list(self, path: str, *, patience_s: float) -> tuple[FileEntry, ...]:
+        async def list(self, path: str, *, idle_timeout_s: float) -> tuple[FileEntry, ...]:
             if path != "/fs/microsd/log":
                 raise FileError("no", path=path, code=10)
             return (FileEntry("2026-11-21", None, True),)
 
-        async def read(self, path: str, *, patience_s: float) -> bytes:
+        async def read(self, path: str, *, idle_timeout_s: float) -> bytes:
             assert path == "/fs/microsd/logdata.txt"
             return b"1795 10 /fs/microsd/log/2026-11-21/a.ulg\n1796 20 /fs/microsd/log/2026-11-21/b.ulg\n"
 
@@ -301,7 +296,7 @@ def names_in(directory: Path) -> list[str]:
 @pytest.mark.parametrize("make", [SimulatedCopter, SimulatedPx4])
 @pytest.mark.parametrize("loss", [0.05, 0.3])
 @pytest.mark.parametrize("seed", range(2))
-def test_over_a_bad_radio(make: Any, loss: float, seed: int) -> None:
+def test_transfer_over_bad_radio(make: Any, loss: float, seed: int) -> None:
     async def main() -> None:
         simulated = make(boot_time_s=0.0)
         async with simulated_link(simulated) as link:

@@ -1,4 +1,4 @@
-"""`vehicle.gimbal` and what is looked at: which firmware is told what, and what it tells; on virtual time."""
+"""`vehicle.gimbal` and regions of interest: commands and messages by firmware; on virtual time."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def params(message: Message) -> tuple[int, ...]:
     return tuple(round(getattr(fields, f"param{number}")) for number in (1, 2, 3, 7))
 
 
-async def test_it_points_where_it_is_told_and_tells_so() -> None:
+async def test_gimbal_points_and_reports_attitude() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         await gimbal.point(-45.0, 90.0, wait=False)
-        told = await gimbal.attitude.wait_until(lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5)
-        assert told.yaw_deg == pytest.approx(90, abs=2)
+        reported = await gimbal.attitude.wait_until(lambda each: abs((each.pitch_deg or 0.0) + 45) < 1, timeout=5)
+        assert reported.yaw_deg == pytest.approx(90, abs=2)
         assert gimbal.attitude.source == Source(1, 1, "GIMBAL_DEVICE_ATTITUDE_STATUS")
         (command,) = flight.wire.commands(PITCHYAW)
         assert (command.target_component, command.param5) == (1, 28)  # type: ignore[union-attr]
@@ -68,7 +68,7 @@ async def test_it_points_where_it_is_told_and_tells_so() -> None:
 @pytest.mark.parametrize(
     "autopilot", [with_gimbal, partial(SimulatedPx4, boot_time_s=0.0, parameters={"MNT_MODE_IN": 4.0})]
 )
-async def test_attitude_that_is_waited_for_is_asked_for_until_nobody_waits(
+async def test_attitude_is_requested_while_awaited(
     autopilot: Callable[[], SimulatedVehicle],
 ) -> None:
     vehicle_there = autopilot()
@@ -85,7 +85,7 @@ async def test_attitude_that_is_waited_for_is_asked_for_until_nobody_waits(
         assert vehicle_there.channels[0].streams.interval(stream) in (0.25, before)
 
 
-async def test_attitude_that_nobody_waits_for_is_not_asked_for_any_more() -> None:
+async def test_attitude_request_ends_with_the_last_watcher() -> None:
     copter = with_gimbal()
     async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
         await vehicle.gimbal.attitude.wait_until(lambda _: True, timeout=5)
@@ -93,7 +93,7 @@ async def test_attitude_that_nobody_waits_for_is_not_asked_for_any_more() -> Non
         assert copter.channels[0].streams.interval(m.GimbalDeviceAttitudeStatus.ID) == 0.0
 
 
-async def test_roll_is_the_mounts_whose_yaw_is_the_vehicles() -> None:
+async def test_point_with_roll_uses_mount_command() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         await flight.vehicle.set_heading(90.0, tolerance_deg=1.0)
         flight.wire.forget()
@@ -103,7 +103,7 @@ async def test_roll_is_the_mounts_whose_yaw_is_the_vehicles() -> None:
         assert not flight.wire.commands(PITCHYAW)
 
 
-async def test_a_manager_that_denies_is_claimed_and_given_back() -> None:
+async def test_denied_order_claims_control_until_release() -> None:
     async with open_flight() as flight:
         flight.copter.faults.refuse(PITCHYAW, DENIED)
         with pytest.raises(CommandRejected):
@@ -120,7 +120,7 @@ async def test_a_manager_that_denies_is_claimed_and_given_back() -> None:
         assert [params(each)[:2] for each in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3)]
 
 
-async def test_firmware_without_commands_gets_messages_and_is_not_asked_again() -> None:
+async def test_old_firmware_gets_mount_messages() -> None:
     async with open_flight() as flight:
         for each in (PITCHYAW, MOUNT):
             flight.copter.faults.refuse(each, UNSUPPORTED)
@@ -132,7 +132,7 @@ async def test_firmware_without_commands_gets_messages_and_is_not_asked_again() 
         assert [each.mount_mode for each in flight.wire.all(m.MountConfigure)] == [2, 2]
 
 
-async def test_a_stand_alone_gimbal_of_the_vehicle_tells_too_and_the_first_counts() -> None:
+async def test_standalone_gimbal_is_reported_and_first_one_wins() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, components=[SimulatedGimbal(171), SimulatedGimbal(154)])
     async with open_flight(copter) as flight:
         attitude = flight.vehicle.gimbal.attitude
@@ -143,22 +143,20 @@ async def test_a_stand_alone_gimbal_of_the_vehicle_tells_too_and_the_first_count
         assert attitude.value.pitch_deg == 0.0
 
 
-async def test_what_the_mount_tells_counts_until_a_gimbal_tells() -> None:
+async def test_mount_attitude_is_used_until_a_gimbal_reports() -> None:
     async with open_flight() as flight:
         attitude, deliver = flight.vehicle.gimbal.attitude, flight.wire.deliver
         heading = (await flight.vehicle.attitude.wait_until(lambda _: True, timeout=5)).yaw_deg
         deliver(FrameEncoder(1, 1).encode(m.MountOrientation(0, 1.0, -30.0, 10.0)))
         assert attitude.value.pitch_deg == -30.0
         assert attitude.value.yaw_deg == pytest.approx((heading + 10.0) % 360.0, abs=0.1)
-        deliver(
-            FrameEncoder(1, 154).encode(m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0))
-        )
+        deliver(FrameEncoder(1, 154).encode(m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)))
         assert attitude.value.pitch_deg == 0.0
         deliver(FrameEncoder(1, 1).encode(m.MountOrientation(0, 1.0, -40.0, 10.0)))
         assert attitude.value.pitch_deg == 0.0
 
 
-async def test_a_reboot_forgets_it() -> None:
+async def test_reboot_clears_gimbal_state() -> None:
     async with open_flight(with_gimbal()) as flight:
         vehicle = flight.vehicle
         with vehicle.rate(m.GimbalDeviceAttitudeStatus, 10.0):
@@ -168,7 +166,7 @@ async def test_a_reboot_forgets_it() -> None:
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, 361.0])
-async def test_angles_out_of_range_send_nothing(wrong: float, grounded: Flight) -> None:
+async def test_angles_out_of_range_are_refused(wrong: float, grounded: Flight) -> None:
     gimbal = grounded.vehicle.gimbal
     for pitch, yaw, roll in ((wrong, 0.0, 0.0), (0.0, wrong, 0.0), (0.0, 0.0, wrong)):
         with pytest.raises(InvalidArgument, match=r"_deg = .* is not allowed"):
@@ -176,11 +174,11 @@ async def test_angles_out_of_range_send_nothing(wrong: float, grounded: Flight) 
     assert not [each for kind in (PITCHYAW, MOUNT) for each in grounded.wire.commands(kind)]
 
 
-# ------------------------------------------------------------------------------------------------ places
+# ------------------------------------------------------------------------------------------------ regions of interest
 
 
 @pytest.mark.parametrize("result", [UNSUPPORTED, MavResult.COMMAND_LONG_ONLY])
-async def test_old_firmware_is_told_the_old_region_of_interest(flying: Flight, result: int) -> None:
+async def test_old_firmware_gets_legacy_roi_command(flying: Flight, result: int) -> None:
     flying.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, result)
     flying.copter.faults.refuse(MavCmd.DO_SET_ROI_NONE, UNSUPPORTED)
     home = flying.vehicle.home.value.altitude_amsl_m
@@ -193,7 +191,7 @@ async def test_old_firmware_is_told_the_old_region_of_interest(flying: Flight, r
     assert params(flying.wire.commands(ROI)[-1]) == (0, 0, 0, 0)
 
 
-async def test_who_knows_command_int_and_does_not_answer_is_not_told_the_old_one(flying: Flight) -> None:
+async def test_unanswered_command_int_roi_has_no_legacy_fallback(flying: Flight) -> None:
     flying.copter.faults.ignore(MavCmd.DO_SET_ROI_LOCATION)
     with pytest.raises(CommandTimeout):
         await flying.vehicle.look_at(place(flying, altitude_relative_m=10.0))
@@ -203,7 +201,7 @@ async def test_who_knows_command_int_and_does_not_answer_is_not_told_the_old_one
     assert len(flying.wire.commands(ROI)) == 1
 
 
-async def test_px4_looks_at_altitudes_above_the_sea() -> None:
+async def test_px4_roi_uses_amsl_altitude() -> None:
     async with simulated_link(SimulatedPx4(boot_time_s=1.0)) as link:
         wire = Wire(link)
         async with aerokit.connect(wire) as vehicle:
@@ -216,7 +214,7 @@ async def test_px4_looks_at_altitudes_above_the_sea() -> None:
 
 
 class WithoutCommandInt(SimulatedCopter):
-    """Firmware that knows home's command as COMMAND_LONG alone."""
+    """Firmware that supports setting home by COMMAND_LONG only."""
 
     def make_commands(self) -> dict[int, CommandHandler]:
         commands = super().make_commands()
@@ -225,28 +223,26 @@ class WithoutCommandInt(SimulatedCopter):
         return commands
 
 
-async def test_home_is_set_where_no_command_int_is_known() -> None:
+async def test_set_home_without_command_int() -> None:
     async with in_the_air(copter=WithoutCommandInt(boot_time_s=0.0)) as flight:
         wanted = place(flight, altitude_amsl_m=flight.vehicle.home.value.altitude_amsl_m)
         await flight.vehicle.set_home(wanted)
-        assert flight.vehicle.home.value.position.distance_to(wanted) < 1.0  # 32 bits of a float
+        assert flight.vehicle.home.value.position.distance_to(wanted) < 1.0  # precision of a 32-bit float
         kinds = [type(each) for each in flight.wire.commands(MavCmd.DO_SET_HOME)]
         assert kinds == [m.CommandInt, m.CommandLong]
 
 
-async def test_home_of_px4_is_set_in_the_one_frame_that_it_takes() -> None:
+async def test_set_home_px4_uses_global_frame() -> None:
     async with simulated_link(SimulatedPx4(boot_time_s=1.0)) as link, aerokit.connect(link) as vehicle:
         await vehicle.wait_ready()
         home = vehicle.home.value.position
         there = home.offset(north_m=50.0)
-        wanted = Position(
-            there.latitude_deg, there.longitude_deg, altitude_amsl_m=vehicle.home.value.altitude_amsl_m
-        )
+        wanted = Position(there.latitude_deg, there.longitude_deg, altitude_amsl_m=vehicle.home.value.altitude_amsl_m)
         await vehicle.set_home(wanted)
         assert vehicle.home.value.position.distance_to(wanted) < 0.1
 
 
-async def test_what_another_station_is_denied_is_no_reason_to_claim_control() -> None:
+async def test_denial_of_another_station_claims_no_control() -> None:
     async with in_the_air(copter=with_gimbal()) as flight:
         flight.copter.faults.ignore(PITCHYAW, times=1)
         async with anyio.create_task_group() as tasks:
@@ -254,13 +250,13 @@ async def test_what_another_station_is_denied_is_no_reason_to_claim_control() ->
             await anyio.sleep(0.1)
             flight.copter.send(m.CommandAck(PITCHYAW, DENIED, 0, 0, 254, 190))
             await anyio.sleep(0.1)
-            assert flight.vehicle._talk.commands.last_result(PITCHYAW) is None
+            assert flight.vehicle._session.commands.last_result(PITCHYAW) is None
         await flight.vehicle.gimbal.point(-20.0, 0.0, wait=False)
         assert not flight.wire.commands(CONFIGURE)
 
 
 @pytest.mark.parametrize("newer", ["stop_looking", "go_to"])
-async def test_what_is_looked_at_with_old_firmware_is_no_order_after_a_newer_one(newer: str) -> None:
+async def test_legacy_roi_is_not_sent_after_newer_order(newer: str) -> None:
     async with in_the_air() as flight:
         vehicle, target = flight.vehicle, place(flight, altitude_relative_m=5.0)
         flight.copter.faults.ignore(MavCmd.DO_SET_ROI_LOCATION)
@@ -282,8 +278,8 @@ async def test_what_is_looked_at_with_old_firmware_is_no_order_after_a_newer_one
         assert not flight.wire.commands(ROI)
 
 
-async def test_after_a_reboot_the_vehicle_may_know_more() -> None:
-    """As with a mount that is there from the next boot on."""
+async def test_unsupported_command_is_tried_again_after_reboot() -> None:
+    """E.g. a mount that is enabled from the next boot on."""
     async with open_flight(copter=with_gimbal()) as flight:
         vehicle, sent = flight.vehicle, flight.wire.commands
         await vehicle.wait_ready()

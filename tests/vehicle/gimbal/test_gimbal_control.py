@@ -1,4 +1,4 @@
-"""`gimbal.control()` and `gimbal.rates()`: taken, told, lost, given back; rates that end with their code."""
+"""`gimbal.control()` and `gimbal.rates()`: taking, confirming, losing, releasing control; streams of rates."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Boom(Exception):
 # ------------------------------------------------------------------------------------------- control
 
 
-async def test_it_is_taken_told_and_given_back() -> None:
+async def test_control_is_taken_confirmed_and_released() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         async with flight.vehicle.gimbal.control() as control:
@@ -66,7 +66,7 @@ async def test_it_is_taken_told_and_given_back() -> None:
         assert configured(flight)[-1] == (-3, -3, *KEEP, 154)
 
 
-async def test_the_autopilots_is_asked_for_what_it_does_not_tell_by_itself() -> None:
+async def test_control_requests_status_from_autopilot() -> None:
     async with mounted() as flight:
         for _ in range(2):
             async with flight.vehicle.gimbal.control():
@@ -75,7 +75,7 @@ async def test_the_autopilots_is_asked_for_what_it_does_not_tell_by_itself() -> 
         assert configured(flight)[0] == (*us(flight), *KEEP, 0)
 
 
-async def test_secondary_control_is_beside_the_primary() -> None:
+async def test_secondary_control_coexists_with_primary() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         takes_control(flight)
@@ -89,7 +89,7 @@ async def test_secondary_control_is_beside_the_primary() -> None:
 
 
 @pytest.mark.parametrize("how", ["raises", "is cancelled"])
-async def test_it_is_given_back_without_waiting(how: str) -> None:
+async def test_control_released_without_waiting(how: str) -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         left_at = math.nan
@@ -108,7 +108,7 @@ async def test_it_is_given_back_without_waiting(how: str) -> None:
         assert gimbal.primary == (0, 0)
 
 
-async def test_what_was_given_back_in_passing_is_said_again_until_it_is_answered() -> None:
+async def test_background_release_is_retried_until_acknowledged() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         with pytest.raises(Boom):
@@ -120,7 +120,7 @@ async def test_what_was_given_back_in_passing_is_said_again_until_it_is_answered
         assert gimbal.primary == (0, 0)
 
 
-async def test_the_end_of_the_vehicles_block_gives_it_back() -> None:
+async def test_vehicle_block_end_releases_control() -> None:
     gimbal = SimulatedGimbal()
     async with anyio.create_task_group() as tasks:
         async with beside(gimbal) as flight:
@@ -137,7 +137,7 @@ async def test_the_end_of_the_vehicles_block_gives_it_back() -> None:
         tasks.cancel_scope.cancel()
 
 
-async def test_losing_it_is_an_event_and_ends_what_waits() -> None:
+async def test_lost_control_publishes_event_and_ends_waits() -> None:
     gimbal = SimulatedGimbal(slew_deg_s=5.0)
     async with beside(gimbal) as flight:
         with flight.vehicle.subscribe(events.GimbalControlLost) as lost:
@@ -161,7 +161,7 @@ async def test_losing_it_is_an_event_and_ends_what_waits() -> None:
         assert gimbal.primary == OTHER, "nothing is given back that somebody else has"
 
 
-async def test_who_was_told_nothing_is_told_when_the_block_is_left() -> None:
+async def test_unnoticed_loss_raises_on_block_exit() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         with pytest.raises(GimbalTaken):
@@ -175,7 +175,7 @@ async def test_who_was_told_nothing_is_told_when_the_block_is_left() -> None:
                 raise Boom
 
 
-async def test_who_has_it_twice_and_loses_one_still_has_it() -> None:
+async def test_losing_one_of_two_controls_keeps_the_other() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         async with flight.vehicle.gimbal.control() as primary:
@@ -188,7 +188,7 @@ async def test_who_has_it_twice_and_loses_one_still_has_it() -> None:
         assert (gimbal.primary, gimbal.secondary) == ((0, 0), OTHER)
 
 
-async def test_a_status_that_was_overtaken_takes_nothing_away() -> None:
+async def test_out_of_order_status_does_not_lose_control() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control() as control:
         status = m.GimbalManagerStatus(gimbal.time_boot_ms - 700, 0, 154, *OTHER, 0, 0)
@@ -198,7 +198,7 @@ async def test_a_status_that_was_overtaken_takes_nothing_away() -> None:
         assert control.is_held
 
 
-async def test_one_block_at_a_time_has_it() -> None:
+async def test_second_control_block_is_busy() -> None:
     async with beside(SimulatedGimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         async with gimbal.control() as control:
@@ -216,7 +216,7 @@ async def test_one_block_at_a_time_has_it() -> None:
             control.raise_if_taken()
 
 
-async def test_a_second_try_keeps_what_the_first_one_gave_back_without_an_answer() -> None:
+async def test_new_block_keeps_control_despite_unanswered_release() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         control = flight.vehicle.gimbal.control
@@ -232,7 +232,7 @@ async def test_a_second_try_keeps_what_the_first_one_gave_back_without_an_answer
         assert gimbal.primary == (0, 0)
 
 
-async def test_an_attempt_that_was_given_up_takes_nothing_from_another_task() -> None:
+async def test_cancelled_attempt_keeps_control_of_another_task() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         gimbal.faults.delay_ack(CONFIGURE, 0.6, times=1)
@@ -253,7 +253,7 @@ async def test_an_attempt_that_was_given_up_takes_nothing_from_another_task() ->
 
 
 @pytest.mark.parametrize("end", ["left", "refused"])
-async def test_what_was_left_to_a_later_block_is_given_back_by_it(end: str) -> None:
+async def test_deferred_release_is_sent_by_later_block(end: str) -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         control = flight.vehicle.gimbal.control
@@ -262,9 +262,7 @@ async def test_what_was_left_to_a_later_block_is_given_back_by_it(end: str) -> N
                 gimbal.faults.drop_incoming = 1
                 raise Boom
         if end == "refused":
-            gimbal.faults.refuse(
-                CONFIGURE, MavResult.TEMPORARILY_REJECTED, times=2
-            )  # one is taken for the other's
+            gimbal.faults.refuse(CONFIGURE, MavResult.TEMPORARILY_REJECTED, times=2)  # both blocks use the same ids
             with pytest.raises(CommandRejected):
                 async with control():
                     pass
@@ -275,7 +273,7 @@ async def test_what_was_left_to_a_later_block_is_given_back_by_it(end: str) -> N
         assert gimbal.primary == (0, 0)
 
 
-async def test_secondary_control_that_nobody_was_told_of_is_given_back_beside_the_primary() -> None:
+async def test_unconfirmed_secondary_control_is_released() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         gimbal.faults.lose_ack(CONFIGURE, times=4)
@@ -286,16 +284,16 @@ async def test_secondary_control_that_nobody_was_told_of_is_given_back_beside_th
         assert (gimbal.primary, gimbal.secondary) == (us(flight), (0, 0))
 
 
-async def test_who_waits_for_its_loss_is_told_that_the_block_was_left() -> None:
+async def test_until_lost_raises_when_block_ends() -> None:
     async with beside(SimulatedGimbal()) as flight:
         async with flight.vehicle.gimbal.control() as control:
             waits = asyncio.ensure_future(control.until_lost())
             await anyio.sleep(0.5)
-        with pytest.raises(OperationRejected, match="was left"):
+        with pytest.raises(OperationRejected, match="has ended"):
             await waits
 
 
-async def test_a_refusal_and_a_lie_are_told() -> None:
+async def test_control_refused_or_unconfirmed_raises() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         gimbal.faults.refuse(CONFIGURE, MavResult.TEMPORARILY_REJECTED, times=1)
@@ -303,10 +301,10 @@ async def test_a_refusal_and_a_lie_are_told() -> None:
             async with flight.vehicle.gimbal.control():
                 pass
         gimbal.faults.refuse(CONFIGURE, MavResult.ACCEPTED, times=1)
-        with pytest.raises(OperationTimeout, match="being told that we are in control"):
+        with pytest.raises(OperationTimeout, match="confirmation of our control"):
             async with flight.vehicle.gimbal.control():
                 pass
-        await anyio.sleep(1.0)  # it is given back, though the manager does not say that we have it
+        await anyio.sleep(1.0)  # released, although the manager never confirmed it
         assert configured(flight)[-1][:2] == (-3, -3)
         gimbal.faults.refuse(CONFIGURE, MavResult.UNSUPPORTED, times=1)
         with pytest.raises(NotSupported, match="has no gimbal manager"):
@@ -314,15 +312,15 @@ async def test_a_refusal_and_a_lie_are_told() -> None:
                 pass
 
 
-async def test_autopilots_know_no_secondary_control() -> None:
+async def test_autopilot_secondary_control_is_not_supported() -> None:
     async with mounted() as flight:
-        with pytest.raises(NotSupported, match="ArduCopter knows no secondary control; nothing was sent"):
+        with pytest.raises(NotSupported, match="ArduCopter has no secondary control; nothing was sent"):
             async with flight.vehicle.gimbal.control(secondary=True):
                 pass
         assert not configured(flight)
 
 
-async def test_px4_retracts_nothing_and_looks_at_no_system() -> None:
+async def test_px4_retract_and_look_at_system_are_not_supported() -> None:
     async with open_px4() as flight:
         gimbal = flight.vehicle.gimbal
         for order in (gimbal.retract(), gimbal.look_at_system(2)):
@@ -331,7 +329,7 @@ async def test_px4_retracts_nothing_and_looks_at_no_system() -> None:
         assert not flight.wire.commands(PITCHYAW)
 
 
-async def test_after_a_silence_it_is_given_back_when_the_vehicle_is_heard() -> None:
+async def test_control_is_released_after_silence() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         with pytest.raises(OperationTimeout, match="not sent yet, because the vehicle is silent"):
@@ -348,7 +346,7 @@ async def test_after_a_silence_it_is_given_back_when_the_vehicle_is_heard() -> N
 
 
 def pitchyaws(flight: Any) -> list[tuple[float, float]]:
-    """The rates that were streamed, degrees per second."""
+    """Streamed rates in degrees per second."""
     return [
         (round(math.degrees(each.pitch_rate), 2), round(math.degrees(each.yaw_rate), 2))
         for each in flight.wire.all(m.GimbalManagerSetPitchyaw)
@@ -356,7 +354,7 @@ def pitchyaws(flight: Any) -> list[tuple[float, float]]:
 
 
 @pytest.mark.parametrize("frame", ["vehicle", "earth"])
-async def test_rates_are_sent_while_they_are_fed_and_end_in_zero(frame: Any) -> None:
+async def test_rates_are_streamed_and_end_with_zero(frame: Any) -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         async with flight.vehicle.gimbal.rates(0.0, 0.0, frame=frame, rate_hz=10.0) as stream:
@@ -376,7 +374,7 @@ async def test_rates_are_sent_while_they_are_fed_and_end_in_zero(frame: Any) -> 
 
 
 @pytest.mark.parametrize("how", ["raises", "is cancelled"])
-async def test_rates_end_in_zero_without_waiting(how: str) -> None:
+async def test_rates_cancelled_end_with_zero_without_waiting(how: str) -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         stream = flight.vehicle.gimbal.rates(-5.0, 0.0)
@@ -399,7 +397,7 @@ async def test_rates_end_in_zero_without_waiting(how: str) -> None:
             stream.set(1.0, 1.0)
 
 
-async def test_first_rates_without_an_answer_end_in_zero() -> None:
+async def test_unanswered_first_rates_end_with_zero() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         gimbal.faults.lose_ack(PITCHYAW, times=None)
@@ -415,7 +413,7 @@ async def test_first_rates_without_an_answer_end_in_zero() -> None:
         assert (commands[-1].param3, commands[-1].param4) == (0, 0)
 
 
-async def test_first_rates_that_were_refused_need_no_zero() -> None:
+async def test_refused_first_rates_send_no_zero() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         gimbal.faults.refuse(PITCHYAW, MavResult.TEMPORARILY_REJECTED, times=1)
@@ -426,7 +424,7 @@ async def test_first_rates_that_were_refused_need_no_zero() -> None:
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
 
-async def test_rates_stay_with_the_gimbal_that_was_the_first() -> None:
+async def test_rates_stay_with_their_gimbal() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     async with beside(one, two) as flight:
         flight.wire.deliver(FrameEncoder(1, 1).encode(m.GimbalManagerStatus(0, 0, 154, 0, 0, 0, 0)))
@@ -440,7 +438,7 @@ async def test_rates_stay_with_the_gimbal_that_was_the_first() -> None:
         assert flight.vehicle.gimbals.ids == (171, 154)
 
 
-async def test_rates_that_nobody_feeds_stop() -> None:
+async def test_stale_rates_stop_the_stream() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         with pytest.raises(SetpointStreamStopped, match="no new rates came for"):
@@ -461,7 +459,7 @@ async def test_rates_that_nobody_feeds_stop() -> None:
 
 
 @pytest.mark.parametrize("silence_s", [0.0, 30.0])
-async def test_rates_to_a_manager_that_is_silent_stop(silence_s: float) -> None:
+async def test_silent_manager_stops_rates(silence_s: float) -> None:
     gimbal = SimulatedGimbal(yaw_deg=(-9999.0, 9999.0))
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         began = now()
@@ -480,7 +478,7 @@ async def test_rates_to_a_manager_that_is_silent_stop(silence_s: float) -> None:
         assert gimbal.angles() == here
 
 
-async def test_another_order_ends_them_and_holds() -> None:
+async def test_newer_order_stops_rates_without_zero() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         with pytest.raises(SetpointStreamStopped, match="another order was given"):
@@ -492,7 +490,7 @@ async def test_another_order_ends_them_and_holds() -> None:
         assert math.degrees(gimbal.angles()[1]) == pytest.approx(-30, abs=0.5)
 
 
-async def test_who_takes_control_ends_them() -> None:
+async def test_lost_control_stops_rates() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight, flight.vehicle.gimbal.control():
         with pytest.raises(GimbalTaken):
@@ -506,7 +504,7 @@ async def test_who_takes_control_ends_them() -> None:
         assert not flight.wire.commands(PITCHYAW)
 
 
-async def test_rates_without_control_claim_it_where_that_is_denied() -> None:
+async def test_denied_rates_claim_control() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
@@ -515,16 +513,16 @@ async def test_rates_without_control_claim_it_where_that_is_denied() -> None:
         assert math.degrees(gimbal.angles()[1]) == pytest.approx(-5, abs=1)
 
 
-async def test_mounts_of_old_know_no_rates() -> None:
+async def test_old_mount_does_not_support_rates() -> None:
     async with open_flight() as flight:
         flight.copter.faults.refuse(PITCHYAW, MavResult.UNSUPPORTED)
-        with pytest.raises(NotSupported, match="which knows rates"):
+        with pytest.raises(NotSupported, match="which is needed for rates"):
             async with flight.vehicle.gimbal.rates():
                 pass
         assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
 
 
-async def test_px4_is_told_rates_by_another_message() -> None:
+async def test_px4_rates_use_set_attitude() -> None:
     async with open_px4() as flight:
         flight.px4.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
         async with flight.vehicle.gimbal.rates(-5.0, 0.0) as stream:
@@ -536,7 +534,7 @@ async def test_px4_is_told_rates_by_another_message() -> None:
         assert math.degrees(sent.angular_velocity_z) == pytest.approx(10.0)
 
 
-async def test_rates_are_checked_and_entered_once() -> None:
+async def test_rates_are_validated_and_entered_once() -> None:
     async with beside(SimulatedGimbal()) as flight:
         gimbal = flight.vehicle.gimbal
         for wrong in (
@@ -549,7 +547,7 @@ async def test_rates_are_checked_and_entered_once() -> None:
                 gimbal.rates(**wrong)  # type: ignore[arg-type]
         assert not flight.wire.commands(PITCHYAW)
         stream = gimbal.rates()
-        with pytest.raises(SetpointStreamStopped, match="inside their `async with`"):
+        with pytest.raises(SetpointStreamStopped, match="inside the `async with`"):
             stream.set(1.0, 1.0)
         async with stream:
             with pytest.raises(InvalidArgument):
@@ -570,7 +568,7 @@ async def px4_with_gimbal() -> AsyncIterator[Px4Flight]:
         yield flight
 
 
-async def test_px4s_gimbal_is_controlled_by_ids_in_figures() -> None:
+async def test_px4_control_uses_explicit_ids() -> None:
     async with px4_with_gimbal() as flight:
         gimbal = flight.vehicle.gimbal
         assert await flight.vehicle.gimbals.discover() == (1,)
@@ -590,10 +588,10 @@ async def test_px4s_gimbal_is_controlled_by_ids_in_figures() -> None:
         assert not flight.wire.all(m.GimbalManagerSetPitchyaw)
 
 
-async def test_px4_takes_control_on_its_way_home() -> None:
+async def test_px4_return_takes_control() -> None:
     async with px4_with_gimbal() as flight:
         await flight.take_off(20.0)
-        with pytest.raises(GimbalTaken, match="nobody has it now"):
+        with pytest.raises(GimbalTaken, match="it has no controller now"):
             async with flight.vehicle.gimbal.control() as control:
                 await flight.vehicle.set_mode("RTL")
                 assert await control.until_lost() == (0, 0)
@@ -601,7 +599,7 @@ async def test_px4_takes_control_on_its_way_home() -> None:
         assert flight.px4.gimbal.in_control == (0, 0)
 
 
-async def test_px4_looks_at_a_place() -> None:
+async def test_px4_look_at_position() -> None:
     async with px4_with_gimbal() as flight:
         await flight.take_off(20.0)
         there = flight.vehicle.position.value.offset(east_m=60.0, up_m=-20.0)

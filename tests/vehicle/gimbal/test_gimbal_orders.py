@@ -1,4 +1,4 @@
-"""`vehicle.gimbal` and `vehicle.gimbals`: orders return when it points there, and go to whoever manages it."""
+"""`vehicle.gimbal` and `vehicle.gimbals`: orders return when reached, and go to the gimbal's manager."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.mavlink.enums import MavCmd, MavMountMode, MavResult
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
-from aerokit.vehicle.gimbal.discovery import MOST
+from aerokit.vehicle.gimbal.discovery import MAX_GIMBALS
 
 pytestmark = pytest.mark.anyio
 
@@ -41,25 +41,25 @@ def degrees(gimbal: SimulatedGimbal) -> list[float]:
 # ------------------------------------------------------------------------------------------- pointing
 
 
-async def test_it_returns_when_it_points_there() -> None:
+async def test_point_returns_when_reached() -> None:
     gimbal = SimulatedGimbal(slew_deg_s=30.0)
     async with beside(gimbal) as flight:
         began = now()
         await flight.vehicle.gimbal.point(-60.0, 90.0, tolerance_deg=1.0)
         assert now() - began == pytest.approx(3.0, abs=1.2)
-        told = flight.vehicle.gimbal.attitude.value
-        assert told.pitch_deg == pytest.approx(-60, abs=1)
-        assert told.yaw_deg == pytest.approx(90, abs=1)
+        reported = flight.vehicle.gimbal.attitude.value
+        assert reported.pitch_deg == pytest.approx(-60, abs=1)
+        assert reported.yaw_deg == pytest.approx(90, abs=1)
 
 
-async def test_without_waiting_it_returns_when_it_was_accepted() -> None:
+async def test_point_without_wait_returns_when_accepted() -> None:
     async with beside(SimulatedGimbal(slew_deg_s=10.0)) as flight:
         began = now()
         await flight.vehicle.gimbal.point(-60.0, 90.0, wait=False)
         assert now() - began < 0.5
 
 
-async def test_angles_from_the_nose_turn_with_the_vehicle() -> None:
+async def test_vehicle_frame_yaw_turns_with_the_vehicle() -> None:
     gimbal = SimulatedGimbal()
     async with in_the_air(copter=SimulatedCopter(boot_time_s=0.0, components=[gimbal])) as flight:
         await flight.vehicle.gimbal.point(-20.0, -30.0, frame="vehicle")
@@ -72,12 +72,12 @@ async def test_angles_from_the_nose_turn_with_the_vehicle() -> None:
         assert flags[-1] == LOCKED
 
 
-async def test_straight_down_any_yaw_will_do() -> None:
+async def test_straight_down_ignores_yaw() -> None:
     async with beside(SimulatedGimbal()) as flight:
         await flight.vehicle.gimbal.point(-90.0, 123.0)
 
 
-async def test_the_autopilots_gimbal_is_asked_where_it_points_meanwhile() -> None:
+async def test_autopilot_attitude_is_requested_while_pointing() -> None:
     async with mounted() as flight:
         await flight.vehicle.gimbal.point(-45.0, 90.0)
         (command,) = flight.wire.commands(PITCHYAW)
@@ -88,32 +88,32 @@ async def test_the_autopilots_gimbal_is_asked_where_it_points_meanwhile() -> Non
         assert of_it == [250_000, 0]
 
 
-async def test_what_it_cannot_reach_is_an_error_that_says_where_it_points() -> None:
+async def test_unreachable_angle_timeout_reports_attitude() -> None:
     async with beside(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
         with pytest.raises(OperationTimeout) as caught:
             await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=4.0)
-        assert "not there within 4 s: it points to pitch -45.0" in str(caught.value)
-        assert "wanted was pitch -80.0, yaw from north 0.0" in str(caught.value)
+        assert "not reached within 4 s: it points to pitch -45.0" in str(caught.value)
+        assert "expected pitch -80.0, yaw from north 0.0" in str(caught.value)
 
 
-async def test_what_fails_stands_in_the_error() -> None:
+async def test_timeout_reports_device_errors() -> None:
     async with beside(SimulatedGimbal(attitude_rate_hz=0.0)) as flight:
         status = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 16)
         copter = flight.copter
         copter.every(0.2, lambda: copter.send(status, None, (1, 154)))
-        with pytest.raises(OperationTimeout, match="it says: POWER_ERROR"):
+        with pytest.raises(OperationTimeout, match="it reports POWER_ERROR"):
             await flight.vehicle.gimbal.point(-30.0, 0.0, timeout=3.0)
 
 
-async def test_a_gimbal_that_tells_nothing_is_not_there() -> None:
+async def test_gimbal_without_attitude_times_out() -> None:
     async with open_flight() as flight:
         for command in (PITCHYAW, MOUNT):
             flight.copter.faults.refuse(command, MavResult.ACCEPTED)
-        with pytest.raises(OperationTimeout, match="it does not tell where it points"):
+        with pytest.raises(OperationTimeout, match="it does not report its attitude"):
             await flight.vehicle.gimbal.point(-45.0, 0.0, timeout=2.0)
 
 
-async def test_an_old_attitude_is_no_arrival() -> None:
+async def test_attitude_before_the_order_does_not_count() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         await flight.vehicle.gimbal.point(-10.0, 0.0)
@@ -123,7 +123,7 @@ async def test_an_old_attitude_is_no_arrival() -> None:
             await flight.vehicle.gimbal.point(-10.0, 0.0, timeout=2.0)
 
 
-async def test_a_newer_order_ends_the_wait_for_the_one_before() -> None:
+async def test_newer_order_ends_earlier_wait() -> None:
     gimbal = SimulatedGimbal(slew_deg_s=10.0)
     async with beside(gimbal) as flight:
         ends: list[str] = []
@@ -142,7 +142,7 @@ async def test_a_newer_order_ends_the_wait_for_the_one_before() -> None:
         assert degrees(gimbal)[1] == pytest.approx(-20, abs=3)
 
 
-async def test_looking_somewhere_by_the_vehicle_ends_it_too() -> None:
+async def test_vehicle_roi_ends_gimbal_wait() -> None:
     async with in_the_air(copter=copter_with_mount()) as flight:
         flight.copter.faults.ignore(PITCHYAW, times=1)
 
@@ -157,7 +157,7 @@ async def test_looking_somewhere_by_the_vehicle_ends_it_too() -> None:
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
 
-async def test_a_reboot_ends_the_wait() -> None:
+async def test_reboot_ends_pointing_wait() -> None:
     async with beside(SimulatedGimbal(slew_deg_s=1.0)) as flight:
 
         async def reboot() -> None:
@@ -170,7 +170,7 @@ async def test_a_reboot_ends_the_wait() -> None:
                 await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=30.0)
 
 
-async def test_a_silent_vehicle_ends_the_wait() -> None:
+async def test_silent_vehicle_ends_pointing_wait() -> None:
     async with beside(SimulatedGimbal(slew_deg_s=1.0)) as flight:
 
         async def fall_silent() -> None:
@@ -183,7 +183,7 @@ async def test_a_silent_vehicle_ends_the_wait() -> None:
                 await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=40.0)
 
 
-async def test_a_mode_of_the_vehicle_does_not_end_the_wait() -> None:
+async def test_mode_change_does_not_end_pointing_wait() -> None:
     async with in_the_air(copter=copter_with_mount()) as flight:
         flight.copter.parameters["MNT1_PITCH_MIN"] = -90.0
         async with anyio.create_task_group() as tasks:
@@ -195,7 +195,7 @@ async def test_a_mode_of_the_vehicle_does_not_end_the_wait() -> None:
 
 
 @pytest.mark.parametrize(("name", "flag"), [("neutral", Flags.NEUTRAL), ("retract", Flags.RETRACT)])
-async def test_it_rests_when_it_says_so_and_stands(name: str, flag: int) -> None:
+async def test_neutral_returns_when_flagged_and_still(name: str, flag: int) -> None:
     gimbal = SimulatedGimbal(slew_deg_s=30.0)
     async with beside(gimbal) as flight:
         await flight.vehicle.gimbal.point(-60.0, 0.0, frame="vehicle")
@@ -209,10 +209,8 @@ async def test_it_rests_when_it_says_so_and_stands(name: str, flag: int) -> None
         assert command.param5 == flag  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize(
-    ("name", "mode"), [("neutral", MavMountMode.NEUTRAL), ("retract", MavMountMode.RETRACT)]
-)
-async def test_mounts_of_old_have_modes_for_it(name: str, mode: int) -> None:
+@pytest.mark.parametrize(("name", "mode"), [("neutral", MavMountMode.NEUTRAL), ("retract", MavMountMode.RETRACT)])
+async def test_old_mount_neutral_uses_mount_mode(name: str, mode: int) -> None:
     async with mounted() as flight:
         flight.copter.faults.refuse(PITCHYAW, MavResult.UNSUPPORTED)
         await getattr(flight.vehicle.gimbal, name)()
@@ -221,7 +219,7 @@ async def test_mounts_of_old_have_modes_for_it(name: str, mode: int) -> None:
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
 
-# --------------------------------------------------------------------------------------------- places
+# --------------------------------------------------------------------------------------------- regions of interest
 
 
 def place(flight: Flight, **metres: float) -> Position:
@@ -229,7 +227,7 @@ def place(flight: Flight, **metres: float) -> Position:
 
 
 @pytest.mark.parametrize("kind", ["autopilot", "beside"])
-async def test_it_looks_at_a_place_until_it_is_told_to_stop(kind: str) -> None:
+async def test_look_at_tracks_until_stop_looking(kind: str) -> None:
     is_beside = kind == "beside"
     fitted = SimulatedCopter(boot_time_s=0.0, components=[SimulatedGimbal()])
     async with in_the_air(20.0, copter=fitted if is_beside else copter_with_mount()) as flight:
@@ -238,9 +236,9 @@ async def test_it_looks_at_a_place_until_it_is_told_to_stop(kind: str) -> None:
         async with vehicle.gimbal.control():
             target = place(flight, east_m=30.0, up_m=-20.0)
             await vehicle.gimbal.look_at(target)
-            told = vehicle.gimbal.attitude.value
-            assert told.yaw_deg == pytest.approx(90, abs=6)
-            assert told.pitch_deg == pytest.approx(-33.7, abs=6)
+            reported = vehicle.gimbal.attitude.value
+            assert reported.yaw_deg == pytest.approx(90, abs=6)
+            assert reported.pitch_deg == pytest.approx(-33.7, abs=6)
             await vehicle.gimbal.stop_looking()
         target_component = 154 if is_beside else 1
         for command in (MavCmd.DO_SET_ROI_LOCATION, MavCmd.DO_SET_ROI_NONE):
@@ -248,18 +246,18 @@ async def test_it_looks_at_a_place_until_it_is_told_to_stop(kind: str) -> None:
             assert sent.target_component == target_component
 
 
-async def test_it_looks_at_another_vehicle_where_that_tells_it_is() -> None:
+async def test_look_at_system_follows_reported_position() -> None:
     async with in_the_air(20.0, copter=copter_with_mount()) as flight:
         there = place(flight, east_m=-40.0)
         x, y = round(there.latitude_deg * 1e7), round(there.longitude_deg * 1e7)
         assert there.altitude_amsl_m is not None
-        told = FrameEncoder(7, 1).encode(
+        reported = FrameEncoder(7, 1).encode(
             m.GlobalPositionInt(0, x, y, round(there.altitude_amsl_m * 1e3), 20000, 0, 0, 0, 0)
         )
 
         def tell() -> None:
-            flight.copter.receive(told, flight.copter.now)
-            flight.wire.deliver(told)
+            flight.copter.receive(reported, flight.copter.now)
+            flight.wire.deliver(reported)
 
         flight.copter.every(0.5, tell)
         await flight.vehicle.gimbal.look_at_system(7)
@@ -268,13 +266,13 @@ async def test_it_looks_at_another_vehicle_where_that_tells_it_is() -> None:
         assert attitude.pitch_deg == pytest.approx(0, abs=6)
 
 
-async def test_a_vehicle_that_is_not_heard_is_not_looked_at() -> None:
+async def test_look_at_unknown_system_times_out() -> None:
     async with in_the_air(copter=copter_with_mount()) as flight:
-        with pytest.raises(OperationTimeout, match="where system 9 is was not heard here"):
+        with pytest.raises(OperationTimeout, match="the position of system 9 is unknown"):
             await flight.vehicle.gimbal.look_at_system(9, timeout=3.0)
 
 
-async def test_only_the_autopilots_first_gimbal_looks_at_places() -> None:
+async def test_only_first_autopilot_gimbal_supports_roi() -> None:
     async with in_the_air(copter=copter_with_mount()) as flight:
         second = flight.vehicle.gimbals[2]
         for order in (second.look_at(place(flight, east_m=9.0)), second.look_at_system(7)):
@@ -283,7 +281,7 @@ async def test_only_the_autopilots_first_gimbal_looks_at_places() -> None:
         assert not flight.wire.commands(MavCmd.DO_SET_ROI_LOCATION)
 
 
-async def test_a_place_claims_control_where_it_is_denied() -> None:
+async def test_denied_roi_claims_control() -> None:
     gimbal = SimulatedGimbal()
     async with in_the_air(copter=SimulatedCopter(boot_time_s=0.0, components=[gimbal])) as flight:
         await flight.vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
@@ -293,7 +291,7 @@ async def test_a_place_claims_control_where_it_is_denied() -> None:
         await flight.vehicle.gimbal.stop_looking()
 
 
-async def test_an_autopilot_that_denies_a_place_is_not_claimed() -> None:
+async def test_roi_denied_by_autopilot_claims_nothing() -> None:
     async with in_the_air(copter=copter_with_mount()) as flight:
         flight.copter.faults.refuse(MavCmd.DO_SET_ROI_LOCATION, MavResult.DENIED)
         with pytest.raises(CommandRejected):
@@ -304,22 +302,30 @@ async def test_an_autopilot_that_denies_a_place_is_not_claimed() -> None:
 # -------------------------------------------------------------------------------------------- limits
 
 
-async def test_limits_that_somebody_else_asked_for_refuse_nothing() -> None:
+async def test_limits_apply_only_after_information() -> None:
     async with mounted() as flight:
         flight.vehicle.gimbal  # noqa: B018 - it begins to listen
-        told = m.GimbalManagerInformation(0, 0, 1, 0, 0, -0.1, 0.1, 0, 0)
-        flight.wire.deliver(FrameEncoder(1, 1).encode(told))
+        reported = m.GimbalManagerInformation(0, 0, 1, 0, 0, -0.1, 0.1, 0, 0)
+        flight.wire.deliver(FrameEncoder(1, 1).encode(reported))
         await flight.vehicle.gimbal.point(-45.0, 0.0)
 
 
-async def test_information_of_a_gimbal_beside_the_autopilot() -> None:
+async def test_information_of_component_gimbal() -> None:
     async with beside(SimulatedGimbal(pitch_deg=(-80.0, 10.0))) as flight:
-        told = await flight.vehicle.gimbal.information()
-        assert (told.gimbal_device_id, told.manager_component_id) == (154, 154)
-        assert told.pitch_deg == (-80.0, 10.0)
-        assert (told.vendor, told.model, told.firmware_version) == ("aerokit", "Simulated gimbal", "0.0.0")
-        assert told.axes == ("roll", "pitch", "yaw")
-        assert (told.retracts, told.has_neutral, told.looks_at_places) == (True, True, True)
+        reported = await flight.vehicle.gimbal.information()
+        assert (reported.gimbal_device_id, reported.manager_component_id) == (154, 154)
+        assert reported.pitch_deg == (-80.0, 10.0)
+        assert (reported.vendor, reported.model, reported.firmware_version) == (
+            "aerokit",
+            "Simulated gimbal",
+            "0.0.0",
+        )
+        assert reported.axes == ("roll", "pitch", "yaw")
+        assert (reported.can_retract, reported.has_neutral, reported.can_point_at_location) == (
+            True,
+            True,
+            True,
+        )
         for pitch, roll in ((-85.0, 0.0), (20.0, 0.0), (0.0, 40.0)):
             with pytest.raises(InvalidArgument, match="is not allowed: gimbal 154 turns from"):
                 await flight.vehicle.gimbal.point(pitch, 0.0, roll_deg=roll)
@@ -329,15 +335,15 @@ async def test_information_of_a_gimbal_beside_the_autopilot() -> None:
             await flight.vehicle.gimbal.point(-10, 0, tolerance_deg=0.01, timeout=0.05)
 
 
-async def test_information_of_the_autopilots_gimbal() -> None:
+async def test_information_of_autopilot_gimbal() -> None:
     async with mounted() as flight:
-        told = await flight.vehicle.gimbal.information()
-        assert (told.gimbal_device_id, told.manager_component_id, told.vendor) == (1, 1, "")
-        assert (told.pitch_deg, told.yaw_deg) == ((-90.0, 20.0), (-180.0, 180.0))
+        reported = await flight.vehicle.gimbal.information()
+        assert (reported.gimbal_device_id, reported.manager_component_id, reported.vendor) == (1, 1, "")
+        assert (reported.pitch_deg, reported.yaw_deg) == ((-90.0, 20.0), (-180.0, 180.0))
         assert flight.vehicle.gimbals.ids == (1,)
 
 
-async def test_without_a_gimbal_there_is_no_information() -> None:
+async def test_information_without_gimbal_is_rejected() -> None:
     async with open_flight() as flight:
         flight.copter.faults.refuse(REQUEST, MavResult.FAILED)
         with pytest.raises(CommandRejected):
@@ -345,7 +351,7 @@ async def test_without_a_gimbal_there_is_no_information() -> None:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 46.0, math.nan])
-async def test_tolerances_have_limits(tolerance: float, grounded: Flight) -> None:
+async def test_tolerance_out_of_range_is_refused(tolerance: float, grounded: Flight) -> None:
     with pytest.raises(InvalidArgument, match="tolerance_deg"):
         await grounded.vehicle.gimbal.point(0, 0, tolerance_deg=tolerance)
     with pytest.raises(InvalidArgument, match="frame"):
@@ -356,7 +362,7 @@ async def test_tolerances_have_limits(tolerance: float, grounded: Flight) -> Non
 # ------------------------------------------------------------------------------------------- several
 
 
-async def test_several_gimbals_are_found_and_told_apart() -> None:
+async def test_several_gimbals_are_discovered() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     copter = copter_with_mount(components=[one, two])
     async with open_flight(copter) as flight:
@@ -375,7 +381,7 @@ async def test_several_gimbals_are_found_and_told_apart() -> None:
         assert claimed == [171]
 
 
-async def test_the_first_is_the_autopilots_though_another_one_tells_where_it_points() -> None:
+async def test_first_gimbal_is_the_autopilots() -> None:
     async with open_flight(copter_with_mount(components=[SimulatedGimbal()])) as flight:
         await flight.vehicle.gimbals.discover()
         assert flight.vehicle.gimbal.attitude.source == Source(1, 154, "GIMBAL_DEVICE_ATTITUDE_STATUS")
@@ -384,15 +390,15 @@ async def test_the_first_is_the_autopilots_though_another_one_tells_where_it_poi
         assert [each.target_component for each in flight.wire.commands(PITCHYAW)] == [1]
 
 
-async def test_one_that_is_named_and_was_not_heard_is_asked_who_manages_it() -> None:
+async def test_undiscovered_gimbal_is_asked_for_its_manager() -> None:
     gimbal = SimulatedGimbal(172, attitude_rate_hz=0.0)
     async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[gimbal])) as flight:
-        told = await flight.vehicle.gimbals.get(172).information()
-        assert told.manager_component_id == 172
+        reported = await flight.vehicle.gimbals.get(172).information()
+        assert reported.manager_component_id == 172
 
 
-async def test_an_autopilot_manages_a_gimbal_with_an_id_of_its_own() -> None:
-    """As PX4 does that speaks MAVLink to its gimbal: the autopilot's word goes before the gimbal's."""
+async def test_autopilot_manages_component_gimbal() -> None:
+    """PX4 with a MAVLink gimbal: the autopilot takes precedence over the gimbal as manager."""
     async with beside(SimulatedGimbal()) as flight:
         flight.wire.deliver(FrameEncoder(1, 1).encode(m.GimbalManagerStatus(0, 0, 154, 0, 0, 0, 0)))
         flight.copter.faults.refuse(PITCHYAW, MavResult.ACCEPTED)
@@ -401,30 +407,30 @@ async def test_an_autopilot_manages_a_gimbal_with_an_id_of_its_own() -> None:
         assert (command.target_component, command.param7) == (1, 154)  # type: ignore[union-attr]
 
 
-async def test_gimbals_from_the_air_fill_no_table() -> None:
+async def test_number_of_gimbals_is_bounded() -> None:
     async with open_flight() as flight:
         flight.vehicle.gimbal  # noqa: B018 - it begins to listen
         for number in range(2, 200):
             message = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
             flight.wire.deliver(FrameEncoder(1, number).encode(message))
         gimbals = flight.vehicle.gimbals
-        assert len(gimbals) == MOST
+        assert len(gimbals) == MAX_GIMBALS
         with pytest.raises(BusyError):
             gimbals.get(250)
-        assert len({id(each) for each in gimbals}) == MOST
+        assert len({id(each) for each in gimbals}) == MAX_GIMBALS
         assert gimbals.get(1) is gimbals.get(1)
     with pytest.raises(InvalidArgument):
         gimbals.get(0)
 
 
-async def test_a_device_id_of_an_old_autopilot_is_its_first() -> None:
+async def test_zero_device_id_is_first_autopilot_gimbal() -> None:
     async with open_flight() as flight:
         message = m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, (1, 0, 0, 0), 0, 0, 0, 0)
         flight.wire.deliver(FrameEncoder(1, 1).encode(message))
         assert flight.vehicle.gimbals.ids == (1,)
 
 
-def tells(flight: Flight, component: int, message: object) -> None:
+def report(flight: Flight, component: int, message: object) -> None:
     flight.wire.deliver(FrameEncoder(1, component).encode(message))  # type: ignore[arg-type]
 
 
@@ -432,27 +438,27 @@ def attitude_of(number: int, q: tuple[float, ...] = (1, 0, 0, 0)) -> m.GimbalDev
     return m.GimbalDeviceAttitudeStatus(0, 0, 0, 32, q, 0, 0, 0, 0, gimbal_device_id=number)
 
 
-async def test_what_is_told_with_the_id_of_another_is_nobodys() -> None:
+async def test_foreign_device_id_is_ignored() -> None:
     async with beside(SimulatedGimbal()) as flight:
-        tells(flight, 154, attitude_of(9))
-        tells(flight, 30, attitude_of(154, (0, 1, 0, 0)))
+        report(flight, 154, attitude_of(9))
+        report(flight, 30, attitude_of(154, (0, 1, 0, 0)))
         assert flight.vehicle.gimbals.ids == (154,)
         assert flight.vehicle.gimbal.attitude.value.roll_deg == pytest.approx(0, abs=1)
         await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
-        tells(flight, 154, m.GimbalManagerInformation(0, 0, 9, 0, 0, 0, 0, 0, 0))
-        tells(flight, 191, m.GimbalManagerStatus(0, 0, 171, 0, 0, 0, 0))
+        report(flight, 154, m.GimbalManagerInformation(0, 0, 9, 0, 0, 0, 0, 0, 0))
+        report(flight, 191, m.GimbalManagerStatus(0, 0, 171, 0, 0, 0, 0))
         assert flight.vehicle.gimbals.ids == (154,)
 
 
-async def test_ids_are_the_senders_own_or_numbers_behind_it() -> None:
+async def test_device_ids_are_own_id_or_number() -> None:
     async with open_flight() as flight:
         flight.vehicle.gimbal  # noqa: B018 - it begins to listen
         for sender, number in ((1, 2), (30, 0), (40, 40), (50, 6), (171, 0)):
-            tells(flight, sender, attitude_of(number))
+            report(flight, sender, attitude_of(number))
         assert flight.vehicle.gimbals.ids == (2, 30, 40, 6, 171)
 
 
-async def test_one_that_is_gone_is_the_first_no_more() -> None:
+async def test_gone_gimbal_is_no_longer_first() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     async with beside(one, two) as flight:
         vehicle = flight.vehicle
@@ -473,21 +479,21 @@ async def test_one_that_is_gone_is_the_first_no_more() -> None:
         assert vehicle.gimbals.ids == (154, 171)
 
 
-async def test_after_an_outage_of_the_link_the_first_is_the_same() -> None:
+async def test_first_gimbal_is_kept_after_link_outage() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     async with beside(one, two) as flight:
         await anyio.sleep(12.0)
         for each in (flight.copter, one, two):
             each.faults.silent = True
         await anyio.sleep(15.0)
-        tells(flight, 171, attitude_of(0))
+        report(flight, 171, attitude_of(0))
         assert flight.vehicle.gimbals.ids == (154, 171)
         two.faults.silent = flight.copter.faults.silent = False
         await anyio.sleep(3.0)
         assert flight.vehicle.gimbals.ids == (154, 171)
 
 
-async def test_one_that_is_in_use_stays_the_first() -> None:
+async def test_gimbal_in_use_stays_first() -> None:
     one, two = SimulatedGimbal(154), SimulatedGimbal(171)
     async with beside(one, two) as flight:
         await flight.vehicle.gimbals[171].point(-30.0, 0.0, frame="vehicle")
@@ -497,67 +503,67 @@ async def test_one_that_is_in_use_stays_the_first() -> None:
             await flight.vehicle.gimbal.point(-30.0, 0.0, frame="vehicle", timeout=20.0)
 
 
-async def test_a_status_from_somebody_else_moves_no_orders() -> None:
+async def test_foreign_status_does_not_redirect_orders() -> None:
     async with beside(SimulatedGimbal()) as flight:
-        tells(flight, 191, m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0))
+        report(flight, 191, m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0))
         assert flight.vehicle.gimbal.controllers.value.primary != (9, 9)
-        tells(flight, 191, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
+        report(flight, 191, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
         await flight.vehicle.gimbal.point(-20.0, 0.0, frame="vehicle")
         assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {154}
 
 
 @pytest.mark.parametrize("number", [0, 30])
-async def test_a_gimbal_of_any_id_is_its_own_manager(number: int) -> None:
+async def test_gimbal_of_any_id_manages_itself(number: int) -> None:
     async with open_flight() as flight:
         gimbals = flight.vehicle.gimbals
-        tells(flight, 30, attitude_of(number))
-        tells(flight, 30, m.GimbalManagerStatus(0, 0, number, 0, 0, 0, 0))
-        tells(flight, 191, m.GimbalManagerInformation(0, 0, 30, 0, 0, 0, 0, 0, 0))
+        report(flight, 30, attitude_of(number))
+        report(flight, 30, m.GimbalManagerStatus(0, 0, number, 0, 0, 0, 0))
+        report(flight, 191, m.GimbalManagerInformation(0, 0, 30, 0, 0, 0, 0, 0, 0))
         with pytest.raises(CommandTimeout):
             await gimbals[30].point(0.0, 0.0, wait=False)
         assert {each.target_component for each in flight.wire.commands(PITCHYAW)} == {30}
 
 
-async def test_another_manager_counts_when_the_one_in_use_is_gone() -> None:
+async def test_gone_manager_is_replaced() -> None:
     gimbal = SimulatedGimbal()
     async with beside(gimbal) as flight:
         gimbal.faults.silent = True
         status = m.GimbalManagerStatus(0, 0, 154, 9, 9, 0, 0)
         await anyio.sleep(9.0)
-        tells(flight, 191, status)
+        report(flight, 191, status)
         assert flight.vehicle.gimbal.controllers.value.primary == (0, 0)
         await anyio.sleep(3.0)
-        tells(flight, 191, status)
+        report(flight, 191, status)
         assert flight.vehicle.gimbal.controllers.value.primary == (9, 9)
 
 
-async def test_a_manager_that_told_what_it_is_goes_before_one_that_did_not() -> None:
+async def test_manager_with_information_takes_precedence() -> None:
     async with open_flight() as flight:
         vehicle = flight.vehicle
         vehicle.gimbal  # noqa: B018 - it begins to listen
-        tells(flight, 154, attitude_of(0))
-        tells(flight, 191, m.GimbalManagerStatus(0, 0, 154, 1, 1, 0, 0))
+        report(flight, 154, attitude_of(0))
+        report(flight, 191, m.GimbalManagerStatus(0, 0, 154, 1, 1, 0, 0))
         assert vehicle.gimbal.controllers.value.primary == (1, 1)
-        tells(flight, 192, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
-        tells(flight, 192, m.GimbalManagerStatus(0, 0, 154, 2, 2, 0, 0))
-        tells(flight, 191, m.GimbalManagerStatus(0, 0, 154, 1, 1, 0, 0))
+        report(flight, 192, m.GimbalManagerInformation(0, 0, 154, 0, 0, 0, 0, 0, 0))
+        report(flight, 192, m.GimbalManagerStatus(0, 0, 154, 2, 2, 0, 0))
+        report(flight, 191, m.GimbalManagerStatus(0, 0, 154, 1, 1, 0, 0))
         assert vehicle.gimbal.controllers.value.primary == (2, 2)
-        tells(flight, 1, m.GimbalManagerStatus(0, 0, 154, 3, 3, 0, 0))
-        tells(flight, 192, m.GimbalManagerStatus(0, 0, 154, 2, 2, 0, 0))
+        report(flight, 1, m.GimbalManagerStatus(0, 0, 154, 3, 3, 0, 0))
+        report(flight, 192, m.GimbalManagerStatus(0, 0, 154, 2, 2, 0, 0))
         assert vehicle.gimbal.controllers.value.primary == (3, 3)
 
 
 @pytest.mark.parametrize("wrong", [math.inf, -math.inf, math.nan])
-async def test_angles_that_are_no_numbers_are_not_known(wrong: float) -> None:
+async def test_nan_attitude_is_unknown(wrong: float) -> None:
     async with open_flight() as flight:
         attitude = flight.vehicle.gimbal.attitude
         for place in range(4):
-            tells(flight, 154, attitude_of(0, tuple(wrong if place == each else 0.5 for each in range(4))))
-            told = attitude.value
-            assert (told.pitch_deg, told.roll_deg, told.yaw_deg, told.yaw_from_nose_deg) == (None,) * 4
+            report(flight, 154, attitude_of(0, tuple(wrong if place == each else 0.5 for each in range(4))))
+            reported = attitude.value
+            assert (reported.pitch_deg, reported.roll_deg, reported.yaw_deg, reported.yaw_from_nose_deg) == (None,) * 4
 
 
-async def test_true_is_no_system_id() -> None:
+async def test_look_at_system_refuses_bool() -> None:
     async with mounted() as flight:
         with pytest.raises(InvalidArgument, match="system_id = True is not allowed: 1 to 255"):
             await flight.vehicle.gimbal.look_at_system(True)

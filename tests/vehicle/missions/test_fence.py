@@ -1,4 +1,4 @@
-"""vehicle.fence: up, down, cleared, on and off."""
+"""vehicle.fence: upload, download, clear, enable."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aerokit import messages as m
 from aerokit.errors import CommandRejected, InvalidArgument, MissionRejected, NotSupported
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Fence, FenceCircle, FencePolygon, Mission, waypoint
-from aerokit.missions.compare import Storage
+from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
 
 pytestmark = pytest.mark.anyio
@@ -33,7 +33,7 @@ FENCE = Fence(
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 @pytest.mark.parametrize("method", ["auto", "items"])
-async def test_there_and_back(opened: Any, method: Any) -> None:
+async def test_upload_download_round_trip(opened: Any, method: Any) -> None:
     async with opened() as flight:
         fence = flight.vehicle.fence
         await fence.upload(FENCE, method=method)
@@ -43,7 +43,7 @@ async def test_there_and_back(opened: Any, method: Any) -> None:
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
-async def test_nothing_about_a_fence_is_said_in_mavlink_1(opened: Any) -> None:
+async def test_fence_over_mavlink_1_is_not_supported(opened: Any) -> None:
     """Its mission type is an extension field, which MAVLink 1 cuts off: the vehicle would clear its mission."""
     async with opened() as flight:
         vehicle = flight.vehicle
@@ -60,7 +60,7 @@ async def test_nothing_about_a_fence_is_said_in_mavlink_1(opened: Any) -> None:
         assert mission.matches(await vehicle.mission.download(method="items"))
 
 
-async def test_one_circle_more_for_ardupilot() -> None:
+async def test_ardupilot_counts_an_extra_circle() -> None:
     """ArduPilot writes a fence only when it has all of it, also in parts."""
     wider = FENCE.replace(circles=[FenceCircle(place(0, 0), 450.0), FENCE.circles[1]])
     async with open_flight() as flight:
@@ -68,20 +68,20 @@ async def test_one_circle_more_for_ardupilot() -> None:
         flight.wire.forget()
         await flight.vehicle.fence.upload(wider, method="items")
         assert len(flight.wire.all(m.MissionItemInt)) == 1
-        assert wider.matches(await flight.vehicle.fence.download(), Storage.ARDUPILOT)
+        assert wider.matches(await flight.vehicle.fence.download(), ItemStorage.ARDUPILOT)
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
-async def test_a_fence_that_is_refused_leaves_the_old_one(opened: Any) -> None:
+async def test_refused_fence_keeps_the_old_one(opened: Any) -> None:
     async with opened() as flight:
         await flight.vehicle.fence.upload(FENCE)
         many = Fence([FencePolygon([place(i, i % 2) for i in range(70)])] * 200)
-        with pytest.raises(MissionRejected, match="the vehicle holds what it held before"):
+        with pytest.raises(MissionRejected, match="the vehicle still holds its previous items"):
             await flight.vehicle.fence.upload(many, method="items")
         assert FENCE.matches(await flight.vehicle.fence.download())
 
 
-async def test_on_and_off() -> None:
+async def test_fence_enable_and_disable() -> None:
     async with open_flight() as flight:
         await flight.vehicle.fence.upload(FENCE)
         await flight.vehicle.fence.enable()
@@ -93,7 +93,7 @@ async def test_on_and_off() -> None:
             await other.vehicle.fence.enable()
 
 
-async def test_a_mission_is_no_fence() -> None:
+async def test_uploading_a_mission_as_fence_is_refused() -> None:
     async with open_flight() as flight:
         plan: Any = Mission()
         with pytest.raises(InvalidArgument, match="a Fence"):

@@ -1,4 +1,4 @@
-"""Flying a mission: started, paused, resumed, waited for; who steers; what is told on the way."""
+"""Flying a mission: start, pause, resume, wait, take-over by a pilot, progress."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ AnyFlight = Flight | Px4Flight
 
 @asynccontextmanager
 async def armed(opened: Any, *ends: MissionItem) -> AsyncIterator[AnyFlight]:
-    """A short mission is there, the vehicle stands armed on the ground."""
+    """Flight with a short mission uploaded, armed on the ground."""
     async with opened() as flight:
         await flight.vehicle.wait_ready()
         await flight.vehicle.mission.upload(short_mission(flight, *ends))
@@ -46,12 +46,12 @@ async def armed(opened: Any, *ends: MissionItem) -> AsyncIterator[AnyFlight]:
 
 
 def landing() -> MissionItem:
-    """Where it is, which ArduPilot alone understands."""
+    """A position that only ArduPilot accepts."""
     return MissionItem(MavCmd.NAV_LAND, 3)
 
 
-def all_of(told: Subscription[Any]) -> list[Any]:
-    return list(iter(told.get_nowait, None))
+def all_of(reported: Subscription[Any]) -> list[Any]:
+    return list(iter(reported.get_nowait, None))
 
 
 async def reaches(flight: AnyFlight, item: int) -> None:
@@ -65,17 +65,17 @@ async def reaches(flight: AnyFlight, item: int) -> None:
     ("opened", "end"),
     [(open_flight, None), (open_flight, landing()), (open_px4, None), (open_px4, return_to_launch())],
 )
-async def test_from_the_ground_to_the_end(opened: Any, end: MissionItem | None) -> None:
+async def test_mission_from_takeoff_to_end(opened: Any, end: MissionItem | None) -> None:
     kinds = (events.MissionItemReached, events.MissionCurrentChanged, events.MissionFinished)
     async with armed(opened, *([] if end is None else [end])) as flight:
         vehicle, mission = flight.vehicle, flight.vehicle.mission
-        with vehicle.subscribe(*kinds, capacity=50) as told:
+        with vehicle.subscribe(*kinds, capacity=50) as reported:
             await mission.start()
             await mission.wait_finished(timeout=200)
             if end is not None:
                 assert vehicle.landed_state.value == 1 or not vehicle.is_armed
             await anyio.sleep(0.1)
-            seen = all_of(told)
+            seen = all_of(reported)
         reached = [event.item for event in seen if isinstance(event, events.MissionItemReached)]
         assert reached == sorted(set(reached))
         assert reached[:2] == [0, 1]  # PX4 may leave one out
@@ -85,7 +85,7 @@ async def test_from_the_ground_to_the_end(opened: Any, end: MissionItem | None) 
         assert sum(isinstance(event, events.MissionFinished) for event in seen) == 1
 
 
-async def test_of_firmware_that_tells_no_state_the_last_item_is_the_end(
+async def test_without_mission_state_last_item_is_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """ArduPilot before 4.3: MISSION_CURRENT has the item alone."""
@@ -100,7 +100,7 @@ async def test_of_firmware_that_tells_no_state_the_last_item_is_the_end(
         assert all_of(reached)[-1].seq == mission.count.value
 
 
-async def test_a_pause_is_waited_through() -> None:
+async def test_wait_finished_continues_through_pause() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission
         await mission.start()
@@ -113,12 +113,12 @@ async def test_a_pause_is_waited_through() -> None:
             assert mission.current.value == 1
             await mission.resume()
         assert mission.progress.value.state == 5
-        await mission.start(1)  # again, from elsewhere
-        assert not mission._watch.is_complete
+        await mission.start(1)  # from another task
+        assert not mission._tracker.is_complete
         await mission.wait_finished(timeout=60)
 
 
-async def test_px4_pauses_and_flies_it_twice() -> None:
+async def test_px4_pause_resume_and_second_flight() -> None:
     async with armed(open_px4) as flight:
         mission = flight.vehicle.mission
         await mission.start()
@@ -130,17 +130,17 @@ async def test_px4_pauses_and_flies_it_twice() -> None:
         started = now()
         await mission.start(1)
         await mission.wait_finished(timeout=60)
-        assert now() - started > 2  # what it said of the first time did not count
+        assert now() - started > 2  # the completion of the first flight did not count
 
 
-async def test_the_current_item() -> None:
+async def test_set_current_changes_the_item() -> None:
     async with armed(open_flight) as flight:
         mission = flight.vehicle.mission
         await mission.set_current(2)
         await mission.current.wait_until(lambda current: current == 2, timeout=3)
         assert flight.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)[0].param1 == 3
         await mission.start(0)
-        assert flight.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)[-1].param1 == 0  # with jumps counted anew
+        assert flight.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)[-1].param1 == 0  # resets the jump counts
         await mission.current.wait_until(lambda current: current == 0, timeout=3)
     async with armed(open_px4) as other:
         await other.vehicle.mission.set_current(2)
@@ -149,32 +149,32 @@ async def test_the_current_item() -> None:
         assert not other.wire.commands(MavCmd.DO_SET_MISSION_CURRENT)
 
 
-async def test_jumps_lead_to_the_item_that_is_meant() -> None:
+async def test_jump_targets_are_renumbered() -> None:
     async with armed(open_flight) as flight:
         vehicle = flight.vehicle
         await vehicle.mission.upload(Mission([*short_mission(flight), jump(1, repeat=1)]))
-        with vehicle.subscribe(events.MissionItemReached, capacity=50) as told:
+        with vehicle.subscribe(events.MissionItemReached, capacity=50) as reported:
             await vehicle.mission.start()
             await vehicle.mission.wait_finished(timeout=100)
             await anyio.sleep(0.1)
-            assert [event.item for event in all_of(told)] == [0, 1, 2, 1, 2]
+            assert [event.item for event in all_of(reported)] == [0, 1, 2, 1, 2]
 
 
-async def test_an_item_that_is_flown_to_again_is_reached_again() -> None:
-    """PX4 tells each that is reached several times; it counts once, unless the vehicle went for it again."""
+async def test_repeated_item_is_reached_again() -> None:
+    """PX4 reports each reached item several times; it counts again only if the vehicle approached it again."""
     async with armed(open_px4) as flight:
         mission = flight.vehicle.mission
-        with flight.vehicle.subscribe(events.MissionItemReached, capacity=50) as told:
+        with flight.vehicle.subscribe(events.MissionItemReached, capacity=50) as reported:
             await mission.start()
-            while (await told.get(timeout=60)).item != 1:
+            while (await reported.get(timeout=60)).item != 1:
                 pass
             await mission.current.wait_until(lambda current: current == 2, timeout=5)
             await mission.set_current(1)
-            assert (await told.get(timeout=60)).item == 1
-            assert (await told.get(timeout=60)).item == 2
+            assert (await reported.get(timeout=60)).item == 1
+            assert (await reported.get(timeout=60)).item == 2
 
 
-async def test_count_and_current_without_a_mission() -> None:
+async def test_count_and_current_without_mission() -> None:
     async with open_flight() as flight:
         await flight.vehicle.mission.count.wait_until(lambda count: count == 0, timeout=5)
         assert flight.vehicle.mission.current.value is None
@@ -186,10 +186,10 @@ async def test_count_and_current_without_a_mission() -> None:
         assert other.vehicle.mission.current.value is None
 
 
-# ---------------------------------------------------------------------------------- who steers
+# ---------------------------------------------------------------------------------- take-over
 
 
-async def test_a_pilot_takes_it_out_of_its_mission() -> None:
+async def test_pilot_mode_change_ends_wait_finished() -> None:
     async with armed(open_flight) as flight:
         assert isinstance(flight, Flight)
         mission = flight.vehicle.mission
@@ -202,7 +202,7 @@ async def test_a_pilot_takes_it_out_of_its_mission() -> None:
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
-async def test_another_order_ends_the_waiting(opened: Any) -> None:
+async def test_newer_order_ends_wait_finished(opened: Any) -> None:
     async with armed(opened) as flight:
         await flight.vehicle.mission.start()
         await reaches(flight, 1)
@@ -212,17 +212,15 @@ async def test_another_order_ends_the_waiting(opened: Any) -> None:
                 await flight.vehicle.mission.wait_finished()
 
 
-async def test_it_is_not_flown_at_all() -> None:
+async def test_wait_finished_without_start_is_rejected() -> None:
     async with armed(open_flight) as flight:
-        with pytest.raises(OperationRejected, match="does not fly its mission, it is in GUIDED"):
+        with pytest.raises(OperationRejected, match="is not flying its mission, it is in GUIDED"):
             await flight.vehicle.mission.wait_finished(timeout=20)
-        with pytest.raises(
-            OperationRejected, match="does not fly its mission, it is in GUIDED; nothing was sent"
-        ):
+        with pytest.raises(OperationRejected, match="is not flying its mission, it is in GUIDED; nothing was sent"):
             await flight.vehicle.mission.pause()
 
 
-async def test_disarmed_on_the_way() -> None:
+async def test_disarming_ends_wait_finished() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.start()
         await reaches(flight, 1)
@@ -232,19 +230,19 @@ async def test_disarmed_on_the_way() -> None:
                 await flight.vehicle.mission.wait_finished()
 
 
-async def test_silence_and_impatience() -> None:
+async def test_wait_finished_silence_and_timeout() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.start()
         with pytest.raises(OperationTimeout, match=r"not done within 2 s; at item 0 of 3"):
             await flight.vehicle.mission.wait_finished(timeout=2)
-        assert flight.vehicle.mode_name == "AUTO"  # it goes on
+        assert flight.vehicle.mode_name == "AUTO"  # the vehicle continues
         assert isinstance(flight, Flight)
         flight.copter.faults.silent = True
         with pytest.raises(HeartbeatTimeout):
             await flight.vehicle.mission.wait_finished()
 
 
-async def test_a_start_that_is_given_up_ends_in_holding() -> None:
+async def test_cancelled_start_holds() -> None:
     async with armed(open_flight) as flight:
         assert isinstance(flight, Flight)
         flight.copter.faults.ignore(MavCmd.MISSION_START)
@@ -255,13 +253,13 @@ async def test_a_start_that_is_given_up_ends_in_holding() -> None:
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
-async def test_what_cannot_be_started(opened: Any) -> None:
+async def test_start_is_refused_when_impossible(opened: Any) -> None:
     async with opened() as flight:
         await flight.vehicle.wait_ready()
         mission = flight.vehicle.mission
         await mission.upload(short_mission(flight))
         flight.wire.forget()
-        with pytest.raises(OperationRejected, match=r"not armed: arm\(\) comes first; nothing was sent"):
+        with pytest.raises(OperationRejected, match=r"not armed: call arm\(\) first; nothing was sent"):
             await mission.start()
         with pytest.raises(OperationRejected, match="not armed"):
             await mission.resume()
@@ -274,10 +272,10 @@ async def test_what_cannot_be_started(opened: Any) -> None:
         assert not flight.wire.commands(MavCmd.DO_SET_MODE)
 
 
-async def test_the_vehicles_reason_for_not_starting() -> None:
+async def test_refused_start_has_the_vehicles_reasons() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.clear()
-        with pytest.raises(InvalidArgument, match="the vehicle's mission is empty: upload") as caught:
+        with pytest.raises(InvalidArgument, match="the vehicle's mission is empty: call upload") as caught:
             await flight.vehicle.mission.start()
         assert "item" not in str(caught.value)
         assert isinstance(flight, Flight)
@@ -285,7 +283,7 @@ async def test_the_vehicles_reason_for_not_starting() -> None:
             await flight.vehicle.mission.resume()
 
 
-async def test_a_mission_that_is_flown_is_not_cleared_but_replaced() -> None:
+async def test_active_mission_is_replaced_but_not_cleared() -> None:
     async with armed(open_flight) as flight:
         await flight.vehicle.mission.start()
         flight.wire.forget()
@@ -295,7 +293,7 @@ async def test_a_mission_that_is_flown_is_not_cleared_but_replaced() -> None:
         assert flight.vehicle.mode_name == "AUTO"
 
 
-async def test_while_nobody_knows_how_many_items_there_are_every_number_of_one_is_allowed() -> None:
+async def test_item_number_is_unchecked_while_count_unknown() -> None:
     async with open_flight(rates={}) as flight:
         mission = flight.vehicle.mission
         assert not mission.count.is_known

@@ -1,4 +1,4 @@
-"""vehicle.mission: up, down, cleared, changed in part, by items and by file; and what goes wrong."""
+"""vehicle.mission: upload, download, clear, partial changes, by items and by file; and failures."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
-from aerokit.missions.compare import Storage
+from aerokit.missions.compare import ItemStorage
 from aerokit.position import Position
-from aerokit.protocols.exchange import Progress
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
 
 UNKNOWN = MissionItem(31_000, 3)
-"""No autopilot knows this command, and nothing says so before it is asked."""
+"""No autopilot supports this command, which shows only when it is sent."""
 
 
 def held_by(flight: Flight | Px4Flight) -> Mission:
@@ -41,15 +41,15 @@ def held_by(flight: Flight | Px4Flight) -> Mission:
 
 
 def holds(flight: Flight | Px4Flight, mission: Mission) -> bool:
-    storage = Storage.ARDUPILOT if isinstance(flight, Flight) else Storage.PX4
+    storage = ItemStorage.ARDUPILOT if isinstance(flight, Flight) else ItemStorage.PX4
     return mission.matches(held_by(flight), storage)
 
 
-# -------------------------------------------------------------------------------- there and back
+# -------------------------------------------------------------------------------- round trip
 
 
 @pytest.mark.parametrize("method", ["items", "ftp", "auto"])
-async def test_a_copters_home_is_hidden(method: Any) -> None:
+async def test_copter_home_item_is_hidden(method: Any) -> None:
     mission = Mission([*long_mission(12), jump(2, repeat=3)])
     async with open_flight(latency_s=0.02) as flight:
         await flight.vehicle.wait_ready()
@@ -58,25 +58,25 @@ async def test_a_copters_home_is_hidden(method: Any) -> None:
         assert len(flight.copter.missions.items(0)) == 14
         assert flight.copter.missions.items(0)[13].param1 == 3
         found = await flight.vehicle.mission.download(method=method)
-        assert mission.matches(found, Storage.ARDUPILOT)
+        assert mission.matches(found, ItemStorage.ARDUPILOT)
         assert found.home is not None
         assert flight.vehicle.mission.count.value == 13
         assert bool(flight.wire.all(m.FileTransferProtocol)) == (method != "items")
         assert bool(flight.wire.all(m.MissionItemInt)) == (method == "items")
 
 
-async def test_px4_has_no_home_and_no_file() -> None:
+async def test_px4_has_no_home_item_and_no_file() -> None:
     mission = long_mission(12)
     async with open_px4() as flight:
         await flight.vehicle.mission.upload(mission)
         assert holds(flight, mission)
-        assert mission.matches(await flight.vehicle.mission.download(), Storage.PX4)
+        assert mission.matches(await flight.vehicle.mission.download(), ItemStorage.PX4)
         asked = len(flight.wire.all(m.FileTransferProtocol))
         await flight.vehicle.mission.download()
-        assert len(flight.wire.all(m.FileTransferProtocol)) == asked  # once is enough to know
+        assert len(flight.wire.all(m.FileTransferProtocol)) == asked  # the result is remembered
 
 
-async def test_items_are_sent_ahead() -> None:
+async def test_items_are_sent_before_requested() -> None:
     async with open_flight(latency_s=0.05) as flight:
         started = asyncio.get_running_loop().time()
         await flight.vehicle.mission.upload(long_mission(50), method="items", verify=False)
@@ -85,35 +85,31 @@ async def test_items_are_sent_ahead() -> None:
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
-async def test_an_empty_mission_is_none(opened: Any) -> None:
+async def test_empty_mission_clears(opened: Any) -> None:
     async with opened() as flight:
         await flight.vehicle.mission.upload(long_mission(3))
         await flight.vehicle.mission.upload(Mission())
         assert len(held_by(flight)) == 0
         assert flight.vehicle.mission.count.value == 0
         assert flight.wire.all(m.MissionClearAll)
-        assert await flight.vehicle.mission.download() == Mission(
-            home=(await flight.vehicle.mission.download()).home
-        )
+        assert await flight.vehicle.mission.download() == Mission(home=(await flight.vehicle.mission.download()).home)
         await flight.vehicle.mission.upload(long_mission(3))
         await flight.vehicle.mission.clear()
         assert len(held_by(flight)) == 0
 
 
-async def test_progress() -> None:
-    told: list[Progress] = []
+async def test_upload_progress() -> None:
+    reported: list[TransferProgress] = []
     async with open_flight(latency_s=0.02) as flight:
-        await flight.vehicle.mission.upload(
-            long_mission(20), method="items", verify=False, on_progress=told.append
-        )
-    assert (told[-1].done, told[-1].total) == (21, 21)
-    assert told[-1].rate > 0
+        await flight.vehicle.mission.upload(long_mission(20), method="items", verify=False, on_progress=reported.append)
+    assert (reported[-1].done, reported[-1].total) == (21, 21)
+    assert reported[-1].rate > 0
 
 
 # ----------------------------------------------------------------------------------------- changes
 
 
-async def test_nothing_is_sent_when_px4_holds_it_already() -> None:
+async def test_px4_equal_plan_is_not_sent() -> None:
     async with open_px4() as flight:
         mission = flight.vehicle.mission
         await mission.upload(long_mission(12))
@@ -123,11 +119,11 @@ async def test_nothing_is_sent_when_px4_holds_it_already() -> None:
         assert sent_for_plans(flight.wire) == []
         await mission.upload(long_mission(12), only_changes=False)
         assert len(flight.wire.all(m.MissionItemInt)) == 12
-        await mission.upload(changed(long_mission(12), 4))  # it takes no parts
+        await mission.upload(changed(long_mission(12), 4))  # the fence has no partial upload
         assert holds(flight, changed(long_mission(12), 4))
 
 
-async def test_only_what_differs_is_sent_to_ardupilot() -> None:
+async def test_ardupilot_gets_only_changed_items() -> None:
     async with open_flight() as flight:
         mission = flight.vehicle.mission
         await mission.upload(long_mission(40))
@@ -141,12 +137,14 @@ async def test_only_what_differs_is_sent_to_ardupilot() -> None:
         await mission.upload(changed(long_mission(40), 3, 4, 20))
         assert not flight.wire.all(m.MissionItemInt)
         flight.wire.forget()
-        await mission.upload(changed(long_mission(40), *range(0, 40, 2)), method="items")  # too many for that
+        await mission.upload(
+            changed(long_mission(40), *range(0, 40, 2)), method="items"
+        )  # too many differences for a partial upload
         assert not flight.wire.all(m.MissionWritePartialList)
         assert holds(flight, changed(long_mission(40), *range(0, 40, 2)))
 
 
-async def test_somebody_else_has_changed_it_meanwhile() -> None:
+async def test_ardupilot_plan_changed_by_another_station() -> None:
     async with open_flight() as flight:
         mission = flight.vehicle.mission
         await mission.upload(long_mission(40))
@@ -158,7 +156,7 @@ async def test_somebody_else_has_changed_it_meanwhile() -> None:
         assert holds(flight, changed(long_mission(40), 4))
 
 
-async def test_and_px4_tells_so() -> None:
+async def test_px4_plan_changed_by_another_station() -> None:
     async with open_px4() as flight:
         await flight.vehicle.mission.upload(long_mission(5))
         flight.px4.missions.replace(0, long_mission(6).to_items())
@@ -172,7 +170,7 @@ async def test_and_px4_tells_so() -> None:
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 @pytest.mark.parametrize("method", ["auto", "items"])
-async def test_the_item_and_what_is_left(opened: Any, method: Any) -> None:
+async def test_rejected_upload_names_item_and_remains(opened: Any, method: Any) -> None:
     async with opened(latency_s=0.02) if opened is open_flight else opened() as flight:
         await flight.vehicle.mission.upload(long_mission(30))
         bad = Mission([*long_mission(17), UNKNOWN, *long_mission(4)])
@@ -180,24 +178,24 @@ async def test_the_item_and_what_is_left(opened: Any, method: Any) -> None:
             await flight.vehicle.mission.upload(bad, method=method)
         assert (caught.value.item, caught.value.result) == (17, Result.UNSUPPORTED)
         keeps = opened is open_px4
-        assert ("holds what it held before" in str(caught.value)) == keeps
+        assert ("still holds its previous items" in str(caught.value)) == keeps
         assert holds(flight, long_mission(30)) == keeps
-        await flight.vehicle.mission.upload(long_mission(30))  # it is not taken for held
+        await flight.vehicle.mission.upload(long_mission(30))  # it was not recorded as uploaded
         assert holds(flight, long_mission(30))
 
 
-async def test_a_part_that_is_refused() -> None:
+async def test_rejected_partial_upload() -> None:
     async with open_flight() as flight:
         await flight.vehicle.mission.upload(long_mission(30))
         items = list(long_mission(30))
         items[7] = UNKNOWN
-        with pytest.raises(MissionRejected, match=r"item 7.*holds what it held before") as caught:
+        with pytest.raises(MissionRejected, match=r"item 7.*still holds its previous items") as caught:
             await flight.vehicle.mission.upload(Mission(items))
         assert caught.value.item == 7
         assert holds(flight, long_mission(30))
 
 
-async def test_too_many_and_its_own_words() -> None:
+async def test_too_many_items_has_the_vehicles_reasons() -> None:
     async with open_flight() as flight:
         with pytest.raises(MissionRejected, match="items are supported") as caught:
             await flight.vehicle.mission.upload(long_mission(1200), method="items")
@@ -206,7 +204,7 @@ async def test_too_many_and_its_own_words() -> None:
         assert caught.value.reasons
 
 
-async def test_a_vehicle_that_keeps_something_else() -> None:
+async def test_wrong_readback_is_verification_failed() -> None:
     async with open_flight() as flight:
         items = flight.copter.missions
 
@@ -221,16 +219,14 @@ async def test_a_vehicle_that_keeps_something_else() -> None:
         await flight.vehicle.mission.upload(long_mission(9), method="items", only_changes=False, verify=False)
 
 
-async def test_a_file_is_compared_to_the_last_digit(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_mission_file_is_compared_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Items that go through 32-bit floats are not, and a file does not."""
     async with open_flight() as flight:
         items = flight.copter.missions
         replace = items.replace
 
         def keep_something_else(type_: int, given: Any, **options: Any) -> Any:
-            return replace(
-                type_, [each.replace(x=each.x + 3 * (each.frame == 3)) for each in given], **options
-            )
+            return replace(type_, [each.replace(x=each.x + 3 * (each.frame == 3)) for each in given], **options)
 
         monkeypatch.setattr(items, "replace", keep_something_else)
         mission = long_mission(1)
@@ -240,7 +236,7 @@ async def test_a_file_is_compared_to_the_last_digit(monkeypatch: pytest.MonkeyPa
         assert difference == f"item 0 (NAV_WAYPOINT): x is {mission[0].x + 3} instead of {mission[0].x}"
 
 
-async def test_no_files() -> None:
+async def test_ftp_method_without_mavftp_is_not_supported() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.no_ftp = True
     async with open_flight(copter) as flight:
@@ -259,11 +255,11 @@ async def test_no_files() -> None:
         (Fence(circles=[FenceCircle(Position(47, 8), 10)]), {}, "plan"),
         ([MissionItem(16, 3)], {}, "plan"),
         (long_mission(2), {"method": "ftpp"}, "method"),
-        (long_mission(2), {"patience_s": 0}, "patience_s"),
+        (long_mission(2), {"idle_timeout_s": 0}, "idle_timeout_s"),
         (long_mission(2), {"timeout": -1.0}, "timeout"),
     ],
 )
-async def test_nonsense_is_not_sent(plan: Any, options: dict[str, Any], text: str) -> None:
+async def test_invalid_plan_is_not_sent(plan: Any, options: dict[str, Any], text: str) -> None:
     async with open_flight() as flight:
         flight.wire.forget()
         with pytest.raises(InvalidArgument, match=text):
@@ -271,20 +267,20 @@ async def test_nonsense_is_not_sent(plan: Any, options: dict[str, Any], text: st
         assert sent_for_plans(flight.wire) == []
 
 
-async def test_nonsense_is_refused_before_it_waits_for_its_turn() -> None:
+async def test_invalid_plan_is_refused_without_waiting() -> None:
     async with open_flight(latency_s=0.2) as flight, anyio.create_task_group() as tasks:
         tasks.start_soon(flight.vehicle.mission.upload, long_mission(40))
         await anyio.sleep(1.0)
         begin = now()
-        with pytest.raises(InvalidArgument, match="patience_s = -1 is not allowed"):
-            await flight.vehicle.mission.upload(long_mission(2), patience_s=-1)
+        with pytest.raises(InvalidArgument, match="idle_timeout_s = -1 is not allowed"):
+            await flight.vehicle.mission.upload(long_mission(2), idle_timeout_s=-1)
         assert now() == begin
 
 
-# --------------------------------------------------------------------------- one at a time, given up
+# --------------------------------------------------------------------------- concurrency and cancellation
 
 
-async def test_transfers_wait_for_their_turn() -> None:
+async def test_transfers_are_serialized() -> None:
     async with open_px4() as flight:
         vehicle = flight.vehicle
         fence = Fence(circles=[FenceCircle(Position(*near_home(0)), 300.0)])
@@ -303,7 +299,7 @@ async def test_transfers_wait_for_their_turn() -> None:
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 @pytest.mark.parametrize("after_s", [0.0, 0.05, 0.13, 0.2])
-async def test_given_up_half_way(opened: Any, after_s: float) -> None:
+async def test_upload_cancelled_half_way(opened: Any, after_s: float) -> None:
     async with opened(latency_s=0.02) if opened is open_flight else opened() as flight:
         with anyio.move_on_after(after_s):
             await flight.vehicle.mission.upload(long_mission(100), method="items")
@@ -316,26 +312,28 @@ async def test_given_up_half_way(opened: Any, after_s: float) -> None:
         assert not vehicle.missions.transfer_is_open
 
 
-async def test_the_vehicle_is_told_when_an_upload_is_given_up() -> None:
+async def test_cancelled_upload_is_cancelled_on_the_vehicle() -> None:
     async with open_flight(latency_s=0.05) as flight:
         with pytest.raises(OperationTimeout, match=r"not done within 0\.4 s"):
             await flight.vehicle.mission.upload(long_mission(100), method="items", timeout=0.4)
         assert flight.wire.last(m.MissionAck).type == Result.OPERATION_CANCELLED
 
 
-async def test_silence() -> None:
+async def test_silent_vehicle_times_out() -> None:
     async with open_flight() as flight:
         await flight.vehicle.mission.upload(long_mission(5))
         flight.copter.faults.silent = True
-        with pytest.raises(MissionTimeout, match=r"never asked.*last heartbeat.*if the vehicle heard of it"):
-            await flight.vehicle.mission.upload(long_mission(9), method="items", patience_s=4)
+        with pytest.raises(
+            MissionTimeout, match=r"never requested.*last heartbeat.*if the vehicle received the request"
+        ):
+            await flight.vehicle.mission.upload(long_mission(9), method="items", idle_timeout_s=4)
         with pytest.raises(MissionTimeout, match="did not say how many"):
-            await flight.vehicle.mission.download(method="items", patience_s=4)
-        with pytest.raises(MissionTimeout, match="not known"):
-            await flight.vehicle.mission.clear(patience_s=4)
+            await flight.vehicle.mission.download(method="items", idle_timeout_s=4)
+        with pytest.raises(MissionTimeout, match="may or may not have cleared"):
+            await flight.vehicle.mission.clear(idle_timeout_s=4)
 
 
-async def test_the_block_is_left() -> None:
+async def test_block_exit_ends_transfers() -> None:
     async with open_flight() as flight:
         mission = flight.vehicle.mission
     with pytest.raises(ConnectionClosed):

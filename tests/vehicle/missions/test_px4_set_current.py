@@ -1,4 +1,4 @@
-"""PX4 knows MISSION_SET_CURRENT alone, which has no answer: the rules of all orders hold for it, too."""
+"""PX4's MISSION_SET_CURRENT, which is not acknowledged, follows the rules of all orders."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aerokit import messages as m
 from aerokit import missions
 from aerokit.errors import OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
-from aerokit.protocols.missions import MissionSetCurrent
+from aerokit.protocols.missions import SetCurrentItem
 from aerokit.sim.px4.modes import POSITION
 
 pytestmark = pytest.mark.anyio
@@ -20,9 +20,7 @@ async def _start_mission(flight: Px4Flight) -> None:
     await flight.take_off()
     here = flight.vehicle.position.value
     places = [here.offset(north_m=50.0 * number) for number in (1, 2, 3)]
-    items = [
-        missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=10) for each in places
-    ]
+    items = [missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=10) for each in places]
     await flight.vehicle.mission.upload(missions.Mission(items))
     await flight.vehicle.mission.start()
     await anyio.sleep(1.5)
@@ -30,10 +28,10 @@ async def _start_mission(flight: Px4Flight) -> None:
 
 
 @pytest.mark.parametrize("who", ["a pilot", "the program"])
-async def test_it_is_not_sent_again_against_who_steers_now(who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_set_current_is_not_resent_after_takeover(who: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async with open_px4() as flight:
         await _start_mission(flight)
-        monkeypatch.setattr(MissionSetCurrent, "receive", lambda *_: None)  # it is never confirmed
+        monkeypatch.setattr(SetCurrentItem, "receive", lambda *_: None)  # it is never confirmed
         async with anyio.create_task_group() as tasks:
 
             async def interfere() -> None:
@@ -49,7 +47,7 @@ async def test_it_is_not_sent_again_against_who_steers_now(who: str, monkeypatch
         assert len(flight.wire.all(m.MissionSetCurrent)) == 1
 
 
-async def test_it_is_not_sent_again_into_a_silence() -> None:
+async def test_set_current_is_not_resent_into_silence() -> None:
     async with open_px4() as flight:
         await _start_mission(flight)
         flight.px4.faults.silent = True

@@ -1,4 +1,4 @@
-"""vehicle.rally: up, down, cleared."""
+"""vehicle.rally: upload, download, clear."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POINTS = RallyPoints([rally_point(*near_home(north, 10), altitude_relative_m=30)
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])
 @pytest.mark.parametrize("method", ["auto", "items"])
-async def test_there_and_back(opened: Any, method: Any) -> None:
+async def test_upload_download_round_trip(opened: Any, method: Any) -> None:
     async with opened() as flight:
         rally = flight.vehicle.rally
         await rally.upload(POINTS, method=method)

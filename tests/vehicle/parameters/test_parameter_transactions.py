@@ -1,4 +1,4 @@
-"""Parameters that are put back: `temporarily` and `transaction`, whatever ends them."""
+"""Restored parameters: `temporarily` and `transaction`, with every kind of end."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BEFORE: tuple[float, float] = (1500.0, 50.0)
 # ---------------------------------------------------------------------------------- temporarily
 
 
-async def test_values_for_the_time_of_a_block() -> None:
+async def test_temporary_values_are_restored() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}) as results:
@@ -46,23 +46,21 @@ async def test_values_for_the_time_of_a_block() -> None:
         assert parameters.table["RTL_ALT"].value == 1500
 
 
-@pytest.mark.parametrize("heard", [True, False])
-async def test_value_changed_by_another_station_is_left(
-    heard: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Whether the program has heard of it, or the vehicle tells it only when it is asked."""
+@pytest.mark.parametrize("is_received", [True, False])
+async def test_value_changed_by_another_station_stays(is_received: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """The program has received the change, or must read it from the vehicle."""
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}):
             flight.copter.parameters["RTL_ALT"] = 2500.0
-            if heard:
+            if is_received:
                 await parameters.get("RTL_ALT")
         assert values(flight) == (2500.0, 50.0)
-        assert "RTL_ALT is not put back: another station has changed it from 2000 to 2500" in caplog.text
+        assert "RTL_ALT is not restored: another station has changed it from 2000 to 2500" in caplog.text
         assert "LAND_SPEED" not in caplog.text
 
 
-async def test_value_that_the_program_changed_itself_is_put_back() -> None:
+async def test_value_changed_by_program_is_restored() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000}):
@@ -70,7 +68,7 @@ async def test_value_that_the_program_changed_itself_is_put_back() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_transaction_that_fails_leaves_what_another_station_changed() -> None:
+async def test_failed_transaction_keeps_changes_of_another_station() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(ZeroDivisionError):
             async with flight.vehicle.parameters.transaction() as transaction:
@@ -81,7 +79,7 @@ async def test_transaction_that_fails_leaves_what_another_station_changed() -> N
         assert values(flight) == (2500.0, 50.0)
 
 
-async def test_px4_too() -> None:
+async def test_temporary_values_on_px4() -> None:
     px4 = SimulatedPx4(boot_time_s=0.0, parameter_count=100)
     async with open_px4(px4) as flight:
         before = px4.parameters["COM_RC_IN_MODE"]
@@ -90,7 +88,7 @@ async def test_px4_too() -> None:
         assert px4.parameters["COM_RC_IN_MODE"] == before
 
 
-async def test_an_exception_puts_them_back_and_goes_on() -> None:
+async def test_exception_restores_values_and_propagates() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(ZeroDivisionError):
             async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}):
@@ -99,7 +97,7 @@ async def test_an_exception_puts_them_back_and_goes_on() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.06, 0.11, 0.16, 0.21, 0.5])
-async def test_cancelled_at_any_moment_they_are_put_back(delay_s: float) -> None:
+async def test_cancellation_at_any_time_restores_values(delay_s: float) -> None:
     async with open_flight(copter(), latency_s=0.05) as flight:
 
         async def block() -> None:
@@ -115,7 +113,7 @@ async def test_cancelled_at_any_moment_they_are_put_back(delay_s: float) -> None
         assert values(flight) == BEFORE
 
 
-async def test_a_cancelled_scope_puts_them_back() -> None:
+async def test_cancelled_scope_restores_values() -> None:
     async with open_flight(copter(), latency_s=0.05) as flight:
         with anyio.move_on_after(1.0):
             async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}):
@@ -123,7 +121,7 @@ async def test_a_cancelled_scope_puts_them_back() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_when_one_cannot_be_set_none_is() -> None:
+async def test_failed_write_restores_the_others() -> None:
     simulated = copter()
     simulated.faults.read_only_parameters = {"LAND_SPEED"}
     async with open_flight(simulated) as flight:
@@ -134,7 +132,7 @@ async def test_when_one_cannot_be_set_none_is() -> None:
             assert values(flight) == BEFORE
 
 
-async def test_impossible_values_are_refused_before_anything_is_set() -> None:
+async def test_invalid_temporary_values_are_refused() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(InvalidArgument):
             async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 1e9}):
@@ -143,7 +141,7 @@ async def test_impossible_values_are_refused_before_anything_is_set() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_nested_and_overlapping_blocks_end_with_the_first_value() -> None:
+async def test_nested_and_overlapping_blocks_restore_first_value() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000}):
@@ -160,27 +158,27 @@ async def test_nested_and_overlapping_blocks_end_with_the_first_value() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_what_cannot_be_put_back_is_named() -> None:
+async def test_rollback_failed_names_parameters() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(RollbackFailed, match="RTL_ALT = 1500") as failed:
-            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=1.0):
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=1.0):
                 flight.copter.faults.read_only_parameters = {"RTL_ALT"}
         assert failed.value.not_restored == {"RTL_ALT": 1500}
 
 
-async def test_the_end_of_a_block_is_bounded_when_the_vehicle_is_silent() -> None:
+async def test_block_end_is_bounded_for_silent_vehicle() -> None:
     async with open_flight(copter()) as flight:
         loop = asyncio.get_running_loop()
         ended = loop.time()
         with pytest.raises(RollbackFailed) as failed:
-            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}, patience_s=2.0):
+            async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000}, idle_timeout_s=2.0):
                 flight.copter.faults.silent = True
                 ended = loop.time()
         assert failed.value.not_restored == {"RTL_ALT": 1500}
         assert loop.time() - ended == pytest.approx(2.0, abs=0.1)
 
 
-async def test_a_block_is_entered_once() -> None:
+async def test_temporary_block_is_entered_once() -> None:
     async with open_flight(copter()) as flight:
         block = flight.vehicle.parameters.temporarily({"RTL_ALT": 2000})
         async with block:
@@ -193,7 +191,7 @@ async def test_a_block_is_entered_once() -> None:
 # ---------------------------------------------------------------------------------- transaction
 
 
-async def test_a_transaction_that_succeeds_stays() -> None:
+async def test_successful_transaction_keeps_values() -> None:
     async with open_flight(copter()) as flight:
         async with flight.vehicle.parameters.transaction() as transaction:
             assert (await transaction.set("RTL_ALT", 2000)).outcome == "set"
@@ -215,14 +213,14 @@ async def fail_after_writing(parameters: Parameters, error: Exception) -> None:
         raise error
 
 
-async def test_an_exception_rolls_back() -> None:
+async def test_transaction_exception_rolls_back() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(KeyError, match="mine"):
             await fail_after_writing(flight.vehicle.parameters, KeyError("mine"))
         assert values(flight) == BEFORE
 
 
-async def test_a_cancelled_transaction_rolls_back() -> None:
+async def test_transaction_cancelled_rolls_back() -> None:
     async with open_flight(copter(), latency_s=0.05) as flight:
         with anyio.move_on_after(1.0):
             async with flight.vehicle.parameters.transaction() as transaction:
@@ -231,7 +229,7 @@ async def test_a_cancelled_transaction_rolls_back() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_a_refused_write_rolls_back() -> None:
+async def test_transaction_refused_write_rolls_back() -> None:
     simulated = copter()
     simulated.faults.read_only_parameters = {"LAND_SPEED"}
     async with open_flight(simulated) as flight:
@@ -242,17 +240,17 @@ async def test_a_refused_write_rolls_back() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_a_clamped_write_rolls_back() -> None:
+async def test_transaction_clamped_write_rolls_back() -> None:
     simulated = copter()
     simulated.faults.parameter_limits = {"LAND_SPEED": (0, 55)}
     async with open_flight(simulated) as flight:
-        with pytest.raises(VerificationFailed, match="asked for 60, is 55"):
+        with pytest.raises(VerificationFailed, match="requested 60, is 55"):
             async with flight.vehicle.parameters.transaction() as transaction:
                 await transaction.set_many({"RTL_ALT": 2000, "LAND_SPEED": 60})
         assert values(flight) == BEFORE
 
 
-async def test_a_write_that_the_program_can_do_without() -> None:
+async def test_transaction_continues_after_caught_error() -> None:
     async with open_flight(copter()) as flight:
         async with flight.vehicle.parameters.transaction() as transaction:
             await transaction.set("RTL_ALT", 2000)
@@ -261,7 +259,7 @@ async def test_a_write_that_the_program_can_do_without() -> None:
         assert values(flight) == (2000, 50)
 
 
-async def test_a_lost_link_names_what_was_written() -> None:
+async def test_lost_link_names_written_parameters() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(RollbackFailed) as failed:
             async with flight.vehicle.parameters.transaction() as transaction:
@@ -273,7 +271,7 @@ async def test_a_lost_link_names_what_was_written() -> None:
         assert values(flight) == (2000, 50)
 
 
-async def test_an_inner_transaction_is_undone_by_the_outer_one() -> None:
+async def test_outer_transaction_undoes_inner_one() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         with pytest.raises(ZeroDivisionError):
@@ -286,7 +284,7 @@ async def test_an_inner_transaction_is_undone_by_the_outer_one() -> None:
         assert values(flight) == BEFORE
 
 
-async def test_a_transaction_is_entered_once() -> None:
+async def test_transaction_is_entered_once() -> None:
     async with open_flight(copter()) as flight:
         transaction = flight.vehicle.parameters.transaction()
         async with transaction:
@@ -294,8 +292,8 @@ async def test_a_transaction_is_entered_once() -> None:
                 await transaction.__aenter__()
 
 
-async def test_values_are_read_before_they_are_written() -> None:
-    """What is known may be old: somebody else has written it, and the message was lost."""
+async def test_transaction_reads_before_writing() -> None:
+    """The table may be outdated: another station has written the parameter, and the message was lost."""
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         await parameters.download()

@@ -26,15 +26,15 @@ from aerokit.errors import (
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterType
-from aerokit.protocols.exchange import Progress
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
-from aerokit.vehicle.parameters.access import LEAST_TO_PACK, MOST_TO_READ_BACK
+from aerokit.vehicle.parameters.access import MAX_READ_BACK, MIN_PACK_SIZE
 from aerokit.vehicle.parameters.parameters import Parameters
 from aerokit.vehicle.parameters.store import default_directory
-from aerokit.vehicle.parameters.writing import Found, found_among
+from aerokit.vehicle.parameters.writing import ResolvedParameter, resolve_known
 
 pytestmark = pytest.mark.anyio
 
@@ -64,7 +64,7 @@ def files_in(directory: Path) -> list[str]:
     return [each.name for each in directory.iterdir()]
 
 
-class Heard:
+class ParameterEvents:
     """The ParameterChanged events of a vehicle."""
 
     def __init__(self, flight: Flight | Px4Flight) -> None:
@@ -79,7 +79,7 @@ class Heard:
 
 
 @pytest.mark.parametrize("method", ["auto", "ftp", "list"])
-async def test_every_way_brings_the_same(method: Any) -> None:
+async def test_download_methods_return_equal_tables(method: Any) -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
@@ -94,19 +94,19 @@ async def test_every_way_brings_the_same(method: Any) -> None:
         assert bool(flight.wire.all(messages.ParamRequestList)) == (method == "list")
 
 
-async def test_what_is_known_is_not_downloaded_again_unless_asked_for() -> None:
+async def test_download_is_cached_until_refresh() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
         await parameters.download(method="list")
-        simulated.parameters["RTL_ALT"] = 2000  # without telling anybody
+        simulated.parameters["RTL_ALT"] = 2000  # without sending PARAM_VALUE
         assert (await parameters.download())["RTL_ALT"].value == 1500
-        heard = Heard(flight)
+        received = ParameterEvents(flight)
         assert (await parameters.download(method="list", refresh=True))["RTL_ALT"].value == 2000
-        assert heard.events == [("RTL_ALT", 1500, 2000)]
+        assert received.events == [("RTL_ALT", 1500, 2000)]
 
 
-async def test_without_mavftp_the_list_is_taken() -> None:
+async def test_download_without_mavftp_uses_the_list() -> None:
     simulated = copter()
     simulated.faults.no_ftp = True
     async with open_flight(simulated) as flight:
@@ -115,11 +115,11 @@ async def test_without_mavftp_the_list_is_taken() -> None:
         assert not flight.wire.all(messages.FileTransferProtocol)
 
 
-async def test_where_mavftp_is_swallowed_the_list_is_taken_soon() -> None:
+async def test_download_with_dropped_mavftp_soon_uses_the_list() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         await flight.vehicle.version.wait_until(lambda _: True)
-        simulated.faults.no_ftp = True  # it has told before that it has it
+        simulated.faults.no_ftp = True  # after it has reported MAVFTP
         began = anyio.current_time()
         assert len(await flight.vehicle.parameters.download()) == 120
         assert anyio.current_time() - began < 5
@@ -128,7 +128,7 @@ async def test_where_mavftp_is_swallowed_the_list_is_taken_soon() -> None:
             await flight.vehicle.parameters.download(method="ftp", refresh=True)
 
 
-async def test_a_vehicle_without_the_file_is_asked_for_it_once_until_it_reboots() -> None:
+async def test_missing_file_is_tried_once_until_reboot() -> None:
     async with open_px4(px4()) as flight:
         parameters = flight.vehicle.parameters
         assert len(await parameters.download()) == 120
@@ -143,7 +143,7 @@ async def test_a_vehicle_without_the_file_is_asked_for_it_once_until_it_reboots(
             await parameters.download(method="ftp", refresh=True)
 
 
-async def test_defaults_of_an_earlier_file_are_kept_by_a_list() -> None:
+async def test_list_keeps_defaults_of_earlier_file() -> None:
     async with open_flight(copter()) as flight:
         await flight.vehicle.parameters.download(method="ftp")
         table = await flight.vehicle.parameters.download(method="list", refresh=True)
@@ -151,9 +151,7 @@ async def test_defaults_of_an_earlier_file_are_kept_by_a_list() -> None:
 
 
 @pytest.mark.parametrize(("damaged", "reads"), [(1, 2), (2, 3), (3, 3)])
-async def test_a_file_that_does_not_hold_together_is_read_again(
-    monkeypatch: pytest.MonkeyPatch, damaged: int, reads: int
-) -> None:
+async def test_inconsistent_file_is_read_again(monkeypatch: pytest.MonkeyPatch, damaged: int, reads: int) -> None:
     """A parameter has come to differ from its default while holes were filled."""
     read, paths = Files.read, []
 
@@ -171,15 +169,15 @@ async def test_a_file_that_does_not_hold_together_is_read_again(
         assert bool(flight.wire.all(messages.ParamRequestList)) == (damaged == 3)
 
 
-async def test_two_downloads_at_once_are_one() -> None:
+async def test_concurrent_downloads_are_one() -> None:
     async with open_flight(copter()) as flight, anyio.create_task_group() as tasks:
         for _ in range(3):
             tasks.start_soon(flight.vehicle.parameters.download)
     assert len(flight.wire.all(messages.ParamRequestList)) <= 1
 
 
-async def test_progress_ends_with_all_of_it() -> None:
-    seen: list[Progress] = []
+async def test_download_progress_ends_with_the_total() -> None:
+    seen: list[TransferProgress] = []
     async with open_flight(copter()) as flight:
         await flight.vehicle.parameters.download(method="list", on_progress=seen.append)
         assert (seen[-1].done, seen[-1].total) == (120, 120)
@@ -187,27 +185,27 @@ async def test_progress_ends_with_all_of_it() -> None:
         assert seen[-1].done == seen[-1].total or seen[-1].total is None
 
 
-async def test_what_does_not_come_is_named_and_the_rest_is_known() -> None:
+async def test_incomplete_list_names_missing_indices() -> None:
     simulated = copter()
     simulated.faults.mute_parameters = {"RTL_ALT", "LAND_SPEED"}
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
         with pytest.raises(ParameterTimeout, match="last heartbeat") as timeout:
-            await parameters.download(method="list", patience_s=3.0)
+            await parameters.download(method="list", idle_timeout_s=3.0)
         names = list(simulated.parameters)
         assert {names[int(index)] for index in timeout.value.missing} == {"RTL_ALT", "LAND_SPEED"}
         assert len(parameters.table) == 118
         assert not parameters.is_complete
 
 
-async def test_a_limit_for_all_of_it() -> None:
+async def test_download_timeout() -> None:
     async with open_flight(copter(None)) as flight:
         with pytest.raises(OperationTimeout, match=r"not done within 0.1 s"):
             await flight.vehicle.parameters.download(method="list", timeout=0.1)
         assert len(await flight.vehicle.parameters.download(method="list")) == 1349
 
 
-async def test_wrong_methods() -> None:
+async def test_download_unknown_method_is_refused() -> None:
     async with open_flight(copter()) as flight:
         with pytest.raises(InvalidArgument, match="auto, ftp, list"):
             await flight.vehicle.parameters.download(method="fast")  # type: ignore[arg-type]
@@ -215,7 +213,7 @@ async def test_wrong_methods() -> None:
             await flight.vehicle.parameters.upload({"RTL_ALT": 1}, method="fast")  # type: ignore[arg-type]
 
 
-async def test_a_list_over_a_bad_radio_is_exact() -> None:
+async def test_list_over_bad_radio_is_complete() -> None:
     simulated = copter()
     async with simulated_link(simulated) as link:
         radio = FaultyLink(link, FaultModel(delay_s=0.05), seed=5)
@@ -230,7 +228,7 @@ async def test_a_list_over_a_bad_radio_is_exact() -> None:
 # ------------------------------------------------------------------------------ reboots, events
 
 
-async def test_a_reboot_forgets_all() -> None:
+async def test_reboot_clears_the_table() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         await parameters.download()
@@ -239,30 +237,30 @@ async def test_a_reboot_forgets_all() -> None:
         assert len(await parameters.download()) == 120
 
 
-async def test_what_others_change_is_told_and_known() -> None:
+async def test_changes_by_others_update_the_table() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
-        heard, parameters = Heard(flight), flight.vehicle.parameters
+        received, parameters = ParameterEvents(flight), flight.vehicle.parameters
         await parameters.download()
         other = FrameEncoder(254, 190)
         simulated.receive(other.encode(messages.ParamSet(1, 1, "RTL_ALT", 2500.0, 6)), simulated.now)
         await anyio.sleep(0.5)
-        assert heard.events == [("RTL_ALT", 1500, 2500)]
+        assert received.events == [("RTL_ALT", 1500, 2500)]
         changed = parameters.table["RTL_ALT"]
         assert (changed.value, changed.type, changed.default) == (2500, ParameterType.INT32, 1500)
 
 
-async def test_values_of_other_components_change_nothing() -> None:
+async def test_values_of_other_components_are_ignored() -> None:
     async with open_flight(copter()) as flight:
-        heard, parameters = Heard(flight), flight.vehicle.parameters
+        received, parameters = ParameterEvents(flight), flight.vehicle.parameters
         await parameters.download()
         camera = FrameEncoder(1, 100)
         flight.wire.deliver(camera.encode(messages.ParamValue("RTL_ALT", 7.0, 6, 1, 0)))
         assert parameters.table["RTL_ALT"].value == 1500
-        assert not heard.events
+        assert not received.events
 
 
-async def test_a_value_that_has_just_been_replaced_is_a_late_message() -> None:
+async def test_late_message_with_replaced_value_is_ignored() -> None:
     """ArduPilot answers reads later than writes."""
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
@@ -276,7 +274,7 @@ async def test_a_value_that_has_just_been_replaced_is_a_late_message() -> None:
         assert parameters.table["RTL_ALT"].value == 1500
 
 
-async def test_leaving_the_vehicle_stops_listening() -> None:
+async def test_block_exit_unsubscribes() -> None:
     async with open_flight(copter()) as flight:
         kept: Parameters = flight.vehicle.parameters
         await kept.download()
@@ -288,7 +286,7 @@ async def test_leaving_the_vehicle_stops_listening() -> None:
 # -------------------------------------------------------------------------------------- reading
 
 
-async def test_single_reads() -> None:
+async def test_read_returns_one_parameter() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         assert await parameters.get("RTL_ALT") == 1500
@@ -299,8 +297,8 @@ async def test_single_reads() -> None:
 
 
 @pytest.mark.parametrize("errors", [False, True])
-async def test_unknown_names(errors: bool) -> None:
-    """Released ArduPilot says so, the version before it said nothing."""
+async def test_read_unknown_name_is_rejected(errors: bool) -> None:
+    """Current ArduPilot answers with an error, older versions do not answer."""
     async with open_flight(copter(parameter_errors=errors)) as flight:
         with pytest.raises(ParameterRejected, match="NO_SUCH_ONE") as rejected:
             await flight.vehicle.parameters.get("NO_SUCH_ONE")
@@ -311,32 +309,32 @@ async def test_unknown_names(errors: bool) -> None:
 
 
 @pytest.mark.parametrize("errors", [False, True])
-async def test_several_are_asked_for_by_exactly_these_names(errors: bool) -> None:
+async def test_probe_uses_exact_names(errors: bool) -> None:
     simulated = copter(parameter_errors=errors)
     async with open_flight(simulated) as flight:
         answers = await flight.vehicle.parameters.probe("RTL_ALT", "NO_SUCH_ONE", "WPNAV_SPEED")
-        told = {name: getattr(answer, "value", None) for name, answer in answers.items()}
-        assert told == {"RTL_ALT": 1500, "NO_SUCH_ONE": None, "WPNAV_SPEED": 1000.0}
+        reported = {name: getattr(answer, "value", None) for name, answer in answers.items()}
+        assert reported == {"RTL_ALT": 1500, "NO_SUCH_ONE": None, "WPNAV_SPEED": 1000.0}
         missing = answers["NO_SUCH_ONE"]
         assert isinstance(missing, ParameterRejected)
         assert (missing.name, missing.code) == ("NO_SUCH_ONE", 1 if errors else None)
         assert await flight.vehicle.parameters.probe() == {}
         simulated.faults.silent = True
-        silent = (await flight.vehicle.parameters.probe("RTL_ALT", patience_s=2.0))["RTL_ALT"]
+        silent = (await flight.vehicle.parameters.probe("RTL_ALT", idle_timeout_s=2.0))["RTL_ALT"]
         assert isinstance(silent, ParameterTimeout)
 
 
-async def test_a_silent_vehicle_is_a_timeout() -> None:
+async def test_read_silent_vehicle_times_out() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         simulated.faults.silent = True
         with pytest.raises(ParameterTimeout) as timeout:
-            await flight.vehicle.parameters.get("RTL_ALT", patience_s=2.0)
+            await flight.vehicle.parameters.get("RTL_ALT", idle_timeout_s=2.0)
         assert timeout.value.missing == ("RTL_ALT",)
 
 
 @pytest.mark.parametrize("name", ["", "A" * 17, "Ä", "A B"])
-async def test_impossible_names_are_refused_before_anything_is_sent(name: str) -> None:
+async def test_invalid_names_are_refused(name: str) -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         for attempt in (
@@ -354,7 +352,7 @@ async def test_impossible_names_are_refused_before_anything_is_sent(name: str) -
 # -------------------------------------------------------------------------------------- writing
 
 
-async def test_a_write_says_what_came_of_it() -> None:
+async def test_set_returns_the_outcome() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         result = await flight.vehicle.parameters.set("RTL_ALT", 2000)
@@ -370,7 +368,7 @@ async def test_a_write_says_what_came_of_it() -> None:
         assert (await flight.vehicle.parameters.set("WPNAV_SPEED", 700.1)).outcome == "set"
 
 
-async def test_clamped_rounded_and_refused() -> None:
+async def test_set_clamped_rounded_and_refused() -> None:
     simulated = copter()
     simulated.faults.parameter_limits = {"RTL_ALT": (0, 3000)}
     simulated.faults.read_only_parameters = {"LAND_SPEED"}
@@ -385,7 +383,7 @@ async def test_clamped_rounded_and_refused() -> None:
     assert len(sent_writes(flight)) < 20
 
 
-async def test_px4_takes_integers_to_the_last_bit() -> None:
+async def test_px4_integers_are_exact() -> None:
     simulated = px4()
     async with open_px4(simulated) as flight:
         for value in (16_777_217, -5_000_000, -1, 2**31 - 1, 0):
@@ -396,7 +394,7 @@ async def test_px4_takes_integers_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e39, "5", None])
-async def test_impossible_numbers_are_refused_before_anything_is_set(value: Any) -> None:
+async def test_invalid_numbers_are_refused(value: Any) -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         await parameters.download()
@@ -405,20 +403,18 @@ async def test_impossible_numbers_are_refused_before_anything_is_set(value: Any)
         assert not sent_writes(flight)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("RTL_ALT", 1.5), ("FRAME_CLASS", 300), ("RTL_ALT_FINAL", 40_000)]
-)
-async def test_what_a_type_cannot_hold_is_refused_before_anything_is_set(name: str, value: float) -> None:
+@pytest.mark.parametrize(("name", "value"), [("RTL_ALT", 1.5), ("FRAME_CLASS", 300), ("RTL_ALT_FINAL", 40_000)])
+async def test_value_beyond_type_is_refused(name: str, value: float) -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
-        for _ in range(2):  # without and with what the vehicle has being known
+        for _ in range(2):  # with an empty and with a complete table
             with pytest.raises(InvalidArgument, match=name):
                 await parameters.set_many({"LAND_SPEED": 60, name: value})
             assert not sent_writes(flight)
             await parameters.download()
 
 
-async def test_many_writes_with_one_result_each() -> None:
+async def test_set_many_returns_one_result_each() -> None:
     simulated = copter()
     simulated.faults.read_only_parameters = {"LAND_SPEED"}
     async with open_flight(simulated) as flight:
@@ -438,38 +434,38 @@ async def test_many_writes_with_one_result_each() -> None:
         assert await flight.vehicle.parameters.set_many({}) == {}
 
 
-async def test_an_unconfirmed_write_is_a_timeout() -> None:
+async def test_unconfirmed_write_times_out() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         await flight.vehicle.parameters.download()
         simulated.faults.mute_parameters = {"RTL_ALT"}
         with pytest.raises(ParameterTimeout, match="not confirmed"):
-            await flight.vehicle.parameters.set("RTL_ALT", 2000, patience_s=2.0)
+            await flight.vehicle.parameters.set("RTL_ALT", 2000, idle_timeout_s=2.0)
 
 
 # ------------------------------------------------------------------------------------ uploading
 
 
 @pytest.mark.parametrize("method", ["auto", "ftp", "set"])
-async def test_only_what_differs_is_uploaded(method: Any, tmp_path: Path) -> None:
+async def test_upload_sends_only_differences(method: Any, tmp_path: Path) -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
         table = await parameters.download()
         changed = [name for name, each in table.items() if each.type is ParameterType.REAL32][:15]
         values = table.values_by_name() | {name: table[name].value + 1.25 for name in changed}
-        heard = Heard(flight)
+        received = ParameterEvents(flight)
         results = await parameters.upload(values, method=method)
         assert {name for name, each in results.items() if each.outcome == "set"} == set(changed)
         assert {each.outcome for each in results.values()} == {"set", "unchanged"}
         assert {name: simulated.parameters[name] for name in changed} == pytest.approx(
             {name: values[name] for name in changed}
         )
-        assert {name for name, _, _ in heard.events} == set(changed)
+        assert {name for name, _, _ in received.events} == set(changed)
         assert set(sent_writes(flight)) == (set(changed) if method == "set" else set())
 
 
-async def test_a_file_is_uploaded_and_compared(tmp_path: Path) -> None:
+async def test_upload_by_file_is_verified(tmp_path: Path) -> None:
     path = tmp_path / "copter.param"
     path.write_text("RTL_ALT,2500\nLAND_SPEED,50\nNO_SUCH_ONE,1\n")
     simulated = copter()
@@ -486,8 +482,8 @@ async def test_a_file_is_uploaded_and_compared(tmp_path: Path) -> None:
         assert [each.name for each in await parameters.diff(path)] == ["NO_SUCH_ONE"]
 
 
-async def test_what_a_file_does_not_bring_about_is_set() -> None:
-    """The vehicle clamps: the file is taken without a word."""
+async def test_upload_by_file_sets_the_rest() -> None:
+    """The vehicle clamps values of a file without reporting it."""
     simulated = copter()
     simulated.faults.parameter_limits = {"LAND_SPEED": (0, 100)}
     async with open_flight(simulated) as flight:
@@ -499,17 +495,15 @@ async def test_what_a_file_does_not_bring_about_is_set() -> None:
 
 
 @pytest.mark.parametrize("method", ["ftp", "auto"])
-async def test_a_file_that_is_not_taken_is_an_error_or_set_one_by_one(
-    monkeypatch: pytest.MonkeyPatch, method: Any
-) -> None:
-    """As it was asked for."""
+async def test_refused_upload_file_raises_or_falls_back(monkeypatch: pytest.MonkeyPatch, method: Any) -> None:
+    """With the requested method."""
 
     async def refused(*_: Any, **__: Any) -> None:
         raise FileError("write: not today", path="@PARAM/param.pck", code=MavFtpErr.FAIL)
 
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
-        names = list(await parameters.download())[:LEAST_TO_PACK]
+        names = list(await parameters.download())[:MIN_PACK_SIZE]
         monkeypatch.setattr(Files, "write", refused)
         wanted = dict.fromkeys(names, 1)
         if method == "ftp":
@@ -523,22 +517,22 @@ async def test_a_file_that_is_not_taken_is_an_error_or_set_one_by_one(
 
 
 @pytest.mark.parametrize("more", [0, 1])
-async def test_up_to_a_hundred_are_read_back_one_by_one_and_more_as_a_list(more: int) -> None:
-    """What is read back is what the vehicle has, whichever way it comes."""
+async def test_upload_reads_back_singly_or_by_list(more: int) -> None:
+    """Both ways of reading back return the vehicle's values."""
     async with open_flight(copter(400)) as flight:
         parameters = flight.vehicle.parameters
         table = await parameters.download()
         wanted = {each.name: each.value + 1 for each in table.values() if each.type == ParameterType.REAL32}
-        wanted = dict(list(wanted.items())[: MOST_TO_READ_BACK + more])
-        assert len(wanted) == MOST_TO_READ_BACK + more
+        wanted = dict(list(wanted.items())[: MAX_READ_BACK + more])
+        assert len(wanted) == MAX_READ_BACK + more
         flight.wire.forget()
         results = await parameters.upload(wanted, method="ftp")
         assert {each.outcome for each in results.values()} == {"set"}
         assert {name: each.value for name, each in results.items()} == pytest.approx(wanted, rel=1e-6)
-        assert (reads_and_lists(flight) >= MOST_TO_READ_BACK) is not bool(more)
+        assert (reads_and_lists(flight) >= MAX_READ_BACK) is not bool(more)
 
 
-async def test_what_was_changed() -> None:
+async def test_changed_from_default() -> None:
     simulated = copter()
     simulated.parameters["RTL_ALT"] = 4000
     async with open_flight(simulated) as flight:
@@ -547,7 +541,7 @@ async def test_what_was_changed() -> None:
         assert "LAND_SPEED" not in changed
 
 
-async def test_what_was_changed_needs_defaults() -> None:
+async def test_changed_from_default_needs_defaults() -> None:
     async with open_px4(px4()) as flight:
         with pytest.raises(NotSupported, match="load_metadata"):
             await flight.vehicle.parameters.changed_from_default()
@@ -556,12 +550,12 @@ async def test_what_was_changed_needs_defaults() -> None:
 # ------------------------------------------------------------------------------------- old names
 
 
-async def test_old_and_new_names_read_and_written_with_a_warning() -> None:
+async def test_renamed_parameters_work_with_a_warning() -> None:
     """This copter is between the versions: it has MAV_SYSID and ARMING_CHECK, and WPNAV_SPEED."""
     simulated = copter()
     async with open_flight(simulated) as flight:
         parameters = flight.vehicle.parameters
-        for _ in range(2):  # without and with what the vehicle has being known
+        for _ in range(2):  # with an empty and with a complete table
             with pytest.warns(ParameterRenamedWarning, match="MAV_SYSID") as warned:
                 assert await parameters.get("SYSID_THISMAV") == 1
             assert warned[0].filename == __file__
@@ -578,7 +572,7 @@ async def test_old_and_new_names_read_and_written_with_a_warning() -> None:
         assert simulated.parameters["WPNAV_SPEED"] == 750
 
 
-async def test_renamed_parameter_is_set_without_any_command() -> None:
+async def test_renamed_parameter_is_set_without_commands() -> None:
     async with open_flight(copter()) as flight:
         with pytest.warns(ParameterRenamedWarning):
             await flight.vehicle.parameters.set("WP_SPD", 7.5)
@@ -587,20 +581,18 @@ async def test_renamed_parameter_is_set_without_any_command() -> None:
         assert messages.ParamValue.ID not in asked
 
 
-async def test_parameter_that_is_long_in_doubt_has_the_vehicle_asked_to_answer_more_often() -> None:
+async def test_doubtful_parameter_raises_the_parameter_rate() -> None:
     async with open_flight(copter(), latency_s=0.2) as flight:
         with pytest.raises(ParameterRejected):
             await flight.vehicle.parameters.get("NO_SUCH_ONE")
         await asyncio.sleep(1)
         asked = [
-            each
-            for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)
-            if each.param1 == messages.ParamValue.ID
+            each for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == messages.ParamValue.ID
         ]
         assert {each.param2 for each in asked} == {20_000, 0}
 
 
-async def test_renamed_names_in_files_and_blocks() -> None:
+async def test_renamed_parameters_in_files_and_blocks() -> None:
     simulated = copter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ParameterRenamedWarning)
@@ -610,9 +602,7 @@ async def test_renamed_names_in_files_and_blocks() -> None:
                 differences = await parameters.diff({"WP_SPD": 8.0, "SYSID_THISMAV": 1})
             assert [str(each.message).split()[0] for each in warned] == ["WP_SPD", "SYSID_THISMAV"]
             assert {each.filename for each in warned} == {__file__}
-            assert [(each.name, each.before, each.after) for each in differences] == [
-                ("WPNAV_SPEED", 1000, 800)
-            ]
+            assert [(each.name, each.before, each.after) for each in differences] == [("WPNAV_SPEED", 1000, 800)]
             assert (await parameters.upload({"WP_SPD": 8.0}))["WP_SPD"].outcome == "set"
             async with parameters.temporarily({"WP_SPD": 5.0}):
                 assert simulated.parameters["WPNAV_SPEED"] == 500
@@ -635,7 +625,7 @@ PDEF = """<?xml version="1.0"?><paramfile><vehicles><parameters name="ArduCopter
 </parameters></vehicles></paramfile>"""
 
 
-async def test_metadata_are_advice(tmp_path: Path) -> None:
+async def test_metadata_only_adds_notes(tmp_path: Path) -> None:
     path = tmp_path / "apm.pdef.xml"
     path.write_text(PDEF)
     simulated = copter()
@@ -662,7 +652,7 @@ def hash_requests(flight: Px4Flight) -> list[str]:
     return [each.param_id for each in flight.wire.all(messages.ParamRequestRead)]
 
 
-async def test_the_second_connect_takes_one_request(tmp_path: Path) -> None:
+async def test_cached_list_takes_one_request(tmp_path: Path) -> None:
     simulated = px4()
     async with open_px4(simulated) as flight:
         first = await flight.vehicle.parameters.download(cache=tmp_path)
@@ -675,7 +665,7 @@ async def test_the_second_connect_takes_one_request(tmp_path: Path) -> None:
         assert now() - begun < 0.05
 
 
-async def test_a_change_makes_the_cache_worthless(tmp_path: Path) -> None:
+async def test_changed_hash_invalidates_the_cache(tmp_path: Path) -> None:
     simulated = px4()
     async with open_px4(simulated) as flight:
         await flight.vehicle.parameters.download(cache=tmp_path)
@@ -705,7 +695,7 @@ async def test_a_change_makes_the_cache_worthless(tmp_path: Path) -> None:
         ("win32", {"LOCALAPPDATA": "/local", "XDG_CACHE_HOME": "/cache"}, "/cache"),
     ],
 )
-def test_where_caches_are_kept(
+def test_default_cache_directory(
     monkeypatch: pytest.MonkeyPatch, platform: str, environment: dict[str, str], folder: str
 ) -> None:
     for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
@@ -717,19 +707,17 @@ def test_where_caches_are_kept(
     assert default_directory() == Path(folder) / "aerokit" / "parameters"
 
 
-def test_a_parameter_is_found_under_its_names() -> None:
+def test_resolve_known_finds_all_names() -> None:
     old, new = (Parameter(name, 3, ParameterType.INT16) for name in ("SYSID_THISMAV", "MAV_SYSID"))
-    assert found_among("MAV_SYSID", {"MAV_SYSID": new}) == Found("MAV_SYSID", new, False)
-    renamed = found_among("SYSID_THISMAV", {"MAV_SYSID": new})
+    assert resolve_known("MAV_SYSID", {"MAV_SYSID": new}) == ResolvedParameter("MAV_SYSID", new, False)
+    renamed = resolve_known("SYSID_THISMAV", {"MAV_SYSID": new})
     assert renamed is not None
-    assert (renamed.asked, renamed.parameter, renamed.is_fresh) == ("SYSID_THISMAV", new, False)
+    assert (renamed.requested, renamed.parameter, renamed.is_fresh) == ("SYSID_THISMAV", new, False)
     assert renamed.note == "MAV_SYSID on this vehicle"
-    assert found_among("OTHER", {"SYSID_THISMAV": old}) is None
+    assert resolve_known("OTHER", {"SYSID_THISMAV": old}) is None
 
 
-async def test_nothing_is_written_to_disk_unless_asked_for(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+async def test_cache_is_off_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     async with open_px4(px4()) as flight:
         await flight.vehicle.parameters.download()
@@ -738,14 +726,14 @@ async def test_nothing_is_written_to_disk_unless_asked_for(
         assert len(files_in(tmp_path / "aerokit" / "parameters")) == 1
 
 
-async def test_ardupilot_has_no_hash_and_no_cache(tmp_path: Path) -> None:
+async def test_ardupilot_is_not_cached(tmp_path: Path) -> None:
     async with open_flight(copter()) as flight:
         await flight.vehicle.parameters.download(cache=tmp_path)
     assert files_in(tmp_path) == []
 
 
-def test_wire_bits_of_a_signalling_nan() -> None:
-    """What the tests with -5,000,000 are about."""
+def test_signalling_nan_bits_are_kept() -> None:
+    """Explains the tests with -5,000,000."""
     bits = struct.unpack("<I", struct.pack("<i", -5_000_000))[0]
     assert bits & 0x7F800000 == 0x7F800000
     assert bits & 0x007FFFFF

@@ -1,6 +1,7 @@
-"""What comes from the air fills no table without end: one test for each table that has names or numbers off the link.
+"""Received data fills no table without limit: one test for each table keyed by names or numbers from the link.
 
-Framers, senders, routes and peers are in ``connection/test_nobody_elses.py`` and ``mavlink/test_hostile_bytes.py``.
+Framers, senders, routes and peers are tested in ``connection/test_nobody_elses.py`` and
+``mavlink/test_hostile_bytes.py``.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import AvailableModes, Heartbeat, ParamRequestRead, ParamValue, Statustext
 from aerokit.parameters import Parameter, ParameterType
-from aerokit.parameters.parameter import MOST_PARAMETERS
+from aerokit.parameters.parameter import MAX_PARAMETERS
 from aerokit.protocols.exchange import RoundTrip
 from aerokit.protocols.parameter_list import ParameterList
-from aerokit.sim.channel import MOST_PEERS, Channel
-from aerokit.vehicle.state.status_text import MOST_OPEN, StatusTextAssembler
-from aerokit.vehicle.state.telemetry import MOST_MODE_NAMES
+from aerokit.sim.channel import MAX_PEERS, Channel
+from aerokit.vehicle.state.status_text import MAX_OPEN, StatusTextAssembler
+from aerokit.vehicle.state.telemetry import MAX_MODE_NAMES
 
 pytestmark = pytest.mark.anyio
 
@@ -32,24 +33,24 @@ def hear(flight: Flight, encoder: FrameEncoder, message: Message) -> None:
 async def test_parameter_names() -> None:
     async with open_flight() as flight:
         encoder = FrameEncoder(1, 1)
-        for number in range(MOST_PARAMETERS + 100):
+        for number in range(MAX_PARAMETERS + 100):
             hear(flight, encoder, ParamValue(f"P{number}", float(number), 9, 65535, 65535))
-        assert len(flight.vehicle.parameters.table) == MOST_PARAMETERS
+        assert len(flight.vehicle.parameters.table) == MAX_PARAMETERS
         hear(flight, encoder, ParamValue("P7", 8.5, 9, 65535, 65535))
         assert flight.vehicle.parameters.table["P7"].value == 8.5
 
 
-def test_names_of_one_list() -> None:
+def test_subject_names_match() -> None:
     """A vehicle that gives an index another name each time."""
     exchange = ParameterList(1, 1, bytewise=False)
     exchange.start(0.0)
-    for number in range(MOST_PARAMETERS + 100):
+    for number in range(MAX_PARAMETERS + 100):
         exchange.receive(ParamValue(f"P{number}", 1.0, 9, 65535, number % 10), 0.0)
-    assert len(exchange._names) == MOST_PARAMETERS
+    assert len(exchange._names) == MAX_PARAMETERS
 
 
-def test_a_parameter_there_is_no_room_for_is_not_asked_for_again_and_again() -> None:
-    exchange, count = ParameterList(1, 1, bytewise=False, round_trip=RoundTrip(0.1)), MOST_PARAMETERS + 1
+def test_parameter_beyond_table_limit_is_not_requested_repeatedly() -> None:
+    exchange, count = ParameterList(1, 1, bytewise=False, round_trip=RoundTrip(0.1)), MAX_PARAMETERS + 1
     exchange.start(0.0)
     for number in range(count):
         exchange.receive(ParamValue(f"P{number}", 1.0, 9, count, number), 0.0)
@@ -62,36 +63,36 @@ def test_a_parameter_there_is_no_room_for_is_not_asked_for_again_and_again() -> 
 async def test_mode_names() -> None:
     async with open_flight() as flight:
         encoder = FrameEncoder(1, 1)
-        for number in range(MOST_MODE_NAMES + 50):
+        for number in range(MAX_MODE_NAMES + 50):
             hear(flight, encoder, AvailableModes(255, number % 256, 0, 10_000 + number, 0, f"NEW {number}"))
-        assert len(flight.vehicle.telemetry.mode_names) <= MOST_MODE_NAMES
+        assert len(flight.vehicle.telemetry.mode_names) <= MAX_MODE_NAMES
 
 
 def test_classic_parameters() -> None:
     values = ParameterValues()
-    for number in range(MOST_PARAMETERS + 100):
+    for number in range(MAX_PARAMETERS + 100):
         values.take(Parameter(f"p{number}", 1.0, ParameterType.REAL32))
-    assert len(values) == MOST_PARAMETERS
+    assert len(values) == MAX_PARAMETERS
     assert values.take(Parameter("p5", 2.0, ParameterType.REAL32))
 
 
-def test_texts_under_way() -> None:
+def test_status_text_open_table_is_bounded() -> None:
     texts = StatusTextAssembler()
     for number in range(1, 5000):
         texts.receive(Statustext(6, "x" * 50, id=number, chunk_seq=0), 0.0)
-    assert len(texts._open) == MOST_OPEN
+    assert len(texts._open) == MAX_OPEN
 
 
 def test_peers_of_a_simulated_vehicle() -> None:
     channel = Channel(1, 1, (), version=2)
-    hearing = channel.hearing
-    for port in range(2 * MOST_PEERS):
+    reader = channel.reader
+    for port in range(2 * MAX_PEERS):
         channel.messages(b"\xfd", 0.0, ("10.0.0.9", port))
-    assert len(hearing._framers) == MOST_PEERS
+    assert len(reader._framers) == MAX_PEERS
 
 
-def test_plans_of_the_bus() -> None:
-    """One for each system and message that somebody wants, and none for others."""
+def test_bus_plans_are_bounded() -> None:
+    """One for each subscribed system and message, and none for others."""
     bus = Bus()
     bus.attach(Heartbeat, lambda _: None)
     for system_id in range(1, 256):

@@ -34,7 +34,7 @@ SERVO = MavCmd.DO_SET_SERVO
 # -------------------------------------------------------------------------------- LONG and INT
 
 
-async def test_a_long_command_and_its_ack(grounded: Flight) -> None:
+async def test_command_long_returns_ack(grounded: Flight) -> None:
     ack = await grounded.vehicle.command(MavCmd.GET_MESSAGE_INTERVAL, m.Attitude.ID)
     assert ack.result == MavResult.ACCEPTED
     assert (ack.target_system, ack.target_component) == (255, 190)
@@ -44,7 +44,7 @@ async def test_a_long_command_and_its_ack(grounded: Flight) -> None:
     assert (sent.param1, sent.param2, sent.param7) == (m.Attitude.ID, 0.0, 0.0)
 
 
-async def test_an_int_command_and_its_ack(flying: Flight) -> None:
+async def test_command_int_returns_ack(flying: Flight) -> None:
     ack = await flying.vehicle.command_int(
         MavCmd.DO_REPOSITION, -1, 1, 0, math.nan, frame=6, x=-353632610, y=1491652299, z=12.5
     )
@@ -74,12 +74,12 @@ async def test_every_other_result_is_a_typed_error(grounded: Flight, result: Mav
     assert f"MAV_CMD_DO_SEND_BANNER was refused: {result.name}" in str(caught.value)
 
 
-async def test_unsupported_on_this_firmware(grounded: Flight) -> None:
+async def test_command_unsupported_raises(grounded: Flight) -> None:
     with pytest.raises(CommandRejected, match="does not know the command"):
         await grounded.vehicle.command(31_000)
 
 
-async def test_nonsense_is_not_sent(grounded: Flight) -> None:
+async def test_command_invalid_parameters_are_not_sent(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     with pytest.raises(InvalidArgument, match="at most 7"):
         await vehicle.command(BANNER, *range(8))
@@ -96,7 +96,7 @@ async def test_nonsense_is_not_sent(grounded: Flight) -> None:
 # ------------------------------------------------------------------------- retries and progress
 
 
-async def test_retries_count_their_confirmation(grounded: Flight) -> None:
+async def test_command_retries_increment_confirmation(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER, times=2)
     started = now()
     await grounded.vehicle.command(BANNER, retries=3)
@@ -105,13 +105,13 @@ async def test_retries_count_their_confirmation(grounded: Flight) -> None:
 
 
 async def while_it_talks(flight: Flight, call: Awaitable[object]) -> None:
-    """Await a call; half a second later the vehicle says something."""
+    """Await a call; half a second later the vehicle sends a status text."""
     loop = asyncio.get_running_loop()
     loop.call_later(0.5, flight.copter.send_text, 4, "Terrain data missing")
     await call
 
 
-async def test_no_answer_at_all_says_what_was_seen_meanwhile(grounded: Flight) -> None:
+async def test_command_timeout_lists_link_state(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     started = now()
     with pytest.raises(CommandTimeout) as caught:
@@ -121,7 +121,7 @@ async def test_no_answer_at_all_says_what_was_seen_meanwhile(grounded: Flight) -
     assert "no COMMAND_ACK for MAV_CMD_DO_SEND_BANNER, sent 3 times within" in text
     assert "last heartbeat 0." in text
     assert "0 % of its frames lost" in text
-    assert "it said: Terrain data missing" in text
+    assert "status texts: Terrain data missing" in text
 
 
 async def test_progress_extends_the_deadline_and_is_reported(grounded: Flight) -> None:
@@ -134,9 +134,9 @@ async def test_progress_extends_the_deadline_and_is_reported(grounded: Flight) -
     assert len(grounded.wire.commands(BANNER)) == 1
 
 
-async def test_a_slow_command_may_be_given_longer_between_its_reports(grounded: Flight) -> None:
+async def test_command_progress_timeout_is_configurable(grounded: Flight) -> None:
     grounded.copter.faults.report_progress(BANNER, (10, 50), interval_s=25.0)
-    with pytest.raises(CommandTimeout, match="nothing came for 10 s"):
+    with pytest.raises(CommandTimeout, match="no COMMAND_ACK for 10 s"):
         await grounded.vehicle.command(BANNER)
     grounded.copter.faults.report_progress(BANNER, (10, 50), interval_s=25.0)
     assert (await grounded.vehicle.command(BANNER, progress_timeout=30.0)).result == MavResult.ACCEPTED
@@ -151,11 +151,11 @@ async def test_progress_that_stops_is_a_timeout(grounded: Flight) -> None:
             grounded.copter.faults.silent = True
 
         tasks.start_soon(radio_fails)
-        with pytest.raises(CommandTimeout, match="was in progress, then nothing came for 10 s"):
+        with pytest.raises(CommandTimeout, match="was in progress, then no COMMAND_ACK for 10 s"):
             await grounded.vehicle.command(BANNER)
 
 
-async def test_a_callback_that_raises_does_not_stop_the_command(grounded: Flight) -> None:
+async def test_command_progress_callback_raises_command_continues(grounded: Flight) -> None:
     grounded.copter.faults.report_progress(BANNER, (10,), interval_s=0.5)
 
     def fail(percent: int | None) -> None:
@@ -167,7 +167,7 @@ async def test_a_callback_that_raises_does_not_stop_the_command(grounded: Flight
 # ----------------------------------------------------------------------------- two at a time
 
 
-async def test_equal_commands_follow_each_other_and_each_gets_its_own_answer(grounded: Flight) -> None:
+async def test_equal_commands_are_serialized_with_own_acks(grounded: Flight) -> None:
     grounded.copter.faults.delay_ack(MavCmd.GET_MESSAGE_INTERVAL, 0.5)
     finished: list[float] = []
 
@@ -183,7 +183,7 @@ async def test_equal_commands_follow_each_other_and_each_gets_its_own_answer(gro
     assert len(grounded.wire.commands(MavCmd.GET_MESSAGE_INTERVAL)) == 3
 
 
-async def test_the_same_command_to_two_components_does_not_mix_its_answers() -> None:
+async def test_equal_commands_to_two_components_keep_own_acks() -> None:
     """A camera does not answer; the autopilot's answer to the same command is not the camera's."""
     camera = ExtraComponent(100, type=30)
     async with open_flight(SimulatedCopter(boot_time_s=0.0, components=[camera])) as flight:
@@ -197,12 +197,10 @@ async def test_the_same_command_to_two_components_does_not_mix_its_answers() -> 
 
             tasks.start_soon(ask_the_autopilot)
             with pytest.raises(CommandTimeout):
-                await vehicle.command(
-                    MavCmd.REQUEST_MESSAGE, m.CameraInformation.ID, component_id=100, retries=1
-                )
+                await vehicle.command(MavCmd.REQUEST_MESSAGE, m.CameraInformation.ID, component_id=100, retries=1)
 
 
-async def test_a_cancelled_command_leaves_the_lock_and_its_answer_behind(grounded: Flight) -> None:
+async def test_command_cancelled_releases_lock_and_ignores_late_ack(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER, times=1)
     with anyio.move_on_after(0.3):
         await grounded.vehicle.command(BANNER)
@@ -211,7 +209,7 @@ async def test_a_cancelled_command_leaves_the_lock_and_its_answer_behind(grounde
     assert now() - started < 2.1  # the first answer may be that to the cancelled one
 
 
-async def test_the_connection_ends_while_a_command_waits(grounded: Flight) -> None:
+async def test_command_connection_ends_raises(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     async with anyio.create_task_group() as tasks:
 
@@ -226,7 +224,7 @@ async def test_the_connection_ends_while_a_command_waits(grounded: Flight) -> No
         await grounded.vehicle.command(BANNER)
 
 
-async def test_a_vehicle_that_was_left_is_closed() -> None:
+async def test_vehicle_after_block_raises_connection_closed() -> None:
     async with open_flight() as flight:
         vehicle = flight.vehicle
     with pytest.raises(ConnectionClosed):
@@ -238,7 +236,7 @@ async def test_a_vehicle_that_was_left_is_closed() -> None:
 # -------------------------------------------------------------------------------------- reboot
 
 
-async def test_reboot_waits_until_it_is_back_and_forgets_what_was(grounded: Flight) -> None:
+async def test_reboot_waits_for_return_and_resets_state(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     with vehicle.subscribe(VehicleRebooted, capacity=10) as events:
         started = now()
@@ -251,14 +249,12 @@ async def test_reboot_waits_until_it_is_back_and_forgets_what_was(grounded: Flig
     assert grounded.copter.uptime < 10.0
     await vehicle.wait_ready(timeout=30.0)
     assert vehicle.version.is_known
-    rates = [
-        each for each in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == m.Attitude.ID
-    ]
+    rates = [each for each in grounded.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param1 == m.Attitude.ID]
     assert len(rates) >= 1  # streams are asked for again
     assert vehicle.attitude.fresh(within=0.5)
 
 
-async def test_the_time_of_a_vehicle_that_reboots_is_asked_for_as_soon_as_it_has_answered(
+async def test_reboot_time_is_requested_after_ack(
     grounded: Flight,
 ) -> None:
     answered_at: list[float] = []
@@ -269,18 +265,18 @@ async def test_the_time_of_a_vehicle_that_reboots_is_asked_for_as_soon_as_it_has
     detach()
     sent = grounded.wire.sent
     ordered = next(i for i, (_, each) in enumerate(sent) if getattr(each, "command", 0) == REBOOT)
-    asked_at = [at for at, each in sent[ordered:] if isinstance(each, m.Timesync)]
-    assert asked_at[:1] == answered_at
+    requested_at = [at for at, each in sent[ordered:] if isinstance(each, m.Timesync)]
+    assert requested_at[:1] == answered_at
 
 
-async def test_reboot_is_noticed_without_any_stream() -> None:
+async def test_reboot_without_streams_is_detected() -> None:
     async with open_flight(rates={}) as flight:
         await anyio.sleep(3.5)
         await flight.vehicle.reboot(timeout=10.0)
         assert flight.copter.uptime < 10.0
 
 
-async def test_state_of_before_the_reboot_is_unknown_after_it() -> None:
+async def test_state_before_reboot_is_reset() -> None:
     async with open_flight(SimulatedCopter(boot_time_s=0.0)) as flight:
         await flight.vehicle.wait_ready()
         flight.copter.timeline = BootTimeline().scaled(60.0)
@@ -307,7 +303,7 @@ async def test_reboot_of_an_armed_vehicle_sends_nothing(flying: Flight) -> None:
     assert not flying.wire.commands(REBOOT)
 
 
-async def test_a_forced_reboot_is_one(flying: Flight) -> None:
+async def test_reboot_forced_while_armed_reboots(flying: Flight) -> None:
     await flying.vehicle.reboot(force=True)
     assert flying.copter.motion.is_on_ground
 
@@ -318,7 +314,7 @@ async def test_reboot_refused(grounded: Flight) -> None:
         await grounded.vehicle.reboot()
 
 
-async def test_a_vehicle_that_does_not_come_back(grounded: Flight) -> None:
+async def test_reboot_vehicle_does_not_return_times_out(grounded: Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
         async def dies() -> None:
@@ -330,7 +326,7 @@ async def test_a_vehicle_that_does_not_come_back(grounded: Flight) -> None:
             await grounded.vehicle.reboot(timeout=8.0)
 
 
-async def test_the_link_goes_down_with_the_vehicle(grounded: Flight) -> None:
+async def test_reboot_link_lost_raises(grounded: Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
         async def unplug() -> None:
@@ -346,7 +342,7 @@ async def test_the_link_goes_down_with_the_vehicle(grounded: Flight) -> None:
 
 
 @pytest.mark.parametrize("is_int", [False, True])
-async def test_raw_command_answer_is_lost_is_sent_once(grounded: Flight, is_int: bool) -> None:
+async def test_raw_command_ack_lost_is_sent_once(grounded: Flight, is_int: bool) -> None:
     vehicle, command = grounded.vehicle, MavCmd.DO_GRIPPER
     grounded.copter.faults.lose_ack(command)
     with pytest.raises(CommandTimeout, match=r"sent once within 4\.0 s"):
@@ -354,7 +350,7 @@ async def test_raw_command_answer_is_lost_is_sent_once(grounded: Flight, is_int:
     assert len(grounded.wire.commands(command)) == 1
 
 
-async def test_raw_question_answer_is_lost_is_asked_again(grounded: Flight) -> None:
+async def test_raw_question_ack_lost_is_repeated(grounded: Flight) -> None:
     grounded.copter.faults.ignore(MavCmd.REQUEST_MESSAGE, times=3)
     grounded.wire.forget()
     await grounded.vehicle.command(MavCmd.REQUEST_MESSAGE, m.HomePosition.ID)
@@ -370,7 +366,7 @@ async def test_raw_question_answer_is_lost_is_asked_again(grounded: Flight) -> N
         (MavCmd.DO_SET_MODE, (1, CopterMode.ALT_HOLD), "ALT_HOLD"),
     ],
 )
-async def test_raw_command_own_mode_is_nobody_elses(
+async def test_raw_command_own_mode_is_no_takeover(
     flying: Flight, command: int, params: tuple[float, ...], mode: str
 ) -> None:
     await flying.vehicle.command(command, *params)
@@ -382,7 +378,7 @@ async def test_raw_command_own_mode_is_nobody_elses(
     assert "STABILIZE" in flying.vehicle.taken_over
 
 
-async def test_pilots_mode_after_a_raw_command_is_told_at_once(flying: Flight) -> None:
+async def test_takeover_after_raw_command_is_reported(flying: Flight) -> None:
     await flying.vehicle.command(MavCmd.NAV_RETURN_TO_LAUNCH)
     await flying.vehicle.mode.wait_until(lambda told: told.name == "RTL", timeout=3)
     flying.pilot_takes_over(CopterMode.STABILIZE)
@@ -390,7 +386,7 @@ async def test_pilots_mode_after_a_raw_command_is_told_at_once(flying: Flight) -
     assert "STABILIZE" in flying.vehicle.taken_over
 
 
-async def test_raw_arm_does_not_explain_a_pilots_mode(grounded: Flight) -> None:
+async def test_raw_arm_does_not_explain_takeover(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.command(MavCmd.COMPONENT_ARM_DISARM, 1)
     await grounded.vehicle.armed.wait_until(bool, timeout=3)
@@ -402,7 +398,7 @@ async def test_raw_arm_does_not_explain_a_pilots_mode(grounded: Flight) -> None:
 
 
 @pytest.mark.parametrize("name", ["land", "return_to_launch"])
-async def test_landing_lost_under_a_failsafe_is_ordered_again(flying: Flight, name: str) -> None:
+async def test_land_lost_during_failsafe_is_repeated(flying: Flight, name: str) -> None:
     """ArduCopter only warns: without a second order it hovers until the battery is empty."""
     flying.copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
     flying.copter.parameters["BATT_LOW_MAH"] = flying.copter.parameters["BATT_CAPACITY"]

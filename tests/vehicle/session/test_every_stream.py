@@ -28,7 +28,7 @@ def requests(flight: Flight | Px4Flight) -> list[tuple[int, int, int, int]]:
     ]
 
 
-async def test_all_streams_come_at_the_rate() -> None:
+async def test_streams_arrive_at_requested_rate() -> None:
     async with open_flight(rates={}) as flight:
         with flight.vehicle.streams(8):
             await anyio.sleep(30.0)
@@ -37,7 +37,7 @@ async def test_all_streams_come_at_the_rate() -> None:
             assert interval(flight, m.ServoOutputRaw) == pytest.approx(1 / 8, rel=0.1)
 
 
-async def test_after_a_reboot_they_are_asked_for_again() -> None:
+async def test_reboot_requests_streams_again() -> None:
     async with open_flight(rates={}) as flight:
         with flight.vehicle.streams(0.2):
             await anyio.sleep(5.0)
@@ -51,7 +51,7 @@ async def test_after_a_reboot_they_are_asked_for_again() -> None:
         assert not requests(flight), "nobody wants them any more"
 
 
-async def test_what_does_not_come_is_asked_for_ever_more_rarely() -> None:
+async def test_missing_stream_request_interval_grows() -> None:
     async with open_flight(rates={}) as flight:
         flight.copter.faults.loss_incoming = 1.0
         with flight.vehicle.streams(4):
@@ -60,19 +60,15 @@ async def test_what_does_not_come_is_asked_for_ever_more_rarely() -> None:
         assert [round(later - at) for at, later in itertools.pairwise(times)] == [3, 6, 12, 24, 48]
 
 
-async def test_a_vehicle_that_streams_by_itself_is_asked_for_what_is_missing() -> None:
+async def test_streams_of_px4_requests_missing_states() -> None:
     async with open_px4(rates={}) as flight:
         with flight.vehicle.streams(2):
             await anyio.sleep(10.0)
             assert not requests(flight)
             missing = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL)]
-            assert all(
-                flight.vehicle.telemetry.cells[name].is_known for name in ("attitude", "position", "gps")
-            )
+            assert all(flight.vehicle.telemetry.cells[name].is_known for name in ("attitude", "position", "gps"))
         await anyio.sleep(5.0)
-        given_back = [
-            each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param2 == 0
-        ]
+        given_back = [each.param1 for each in flight.wire.commands(MavCmd.SET_MESSAGE_INTERVAL) if each.param2 == 0]
         assert sorted(given_back) == sorted(set(missing))
 
 

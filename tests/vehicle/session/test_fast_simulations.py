@@ -14,7 +14,7 @@ from aerokit import messages as m
 from aerokit.errors import SetpointStreamStopped
 from aerokit.events import VehicleRebooted
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
-from aerokit.sim.kinds import wait_longer
+from aerokit.sim.kinds import scale_timeouts
 
 pytestmark = pytest.mark.anyio
 
@@ -30,10 +30,10 @@ async def served(vehicle: SimulatedVehicle, speedup: float) -> AsyncIterator[Veh
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("speedup", [1.0, 10.0, 40.0])
-async def test_a_reboot_is_noticed_before_the_vehicle_is_older_than_it_was(kind: str, speedup: float) -> None:
+async def test_fast_simulation_reboot_is_detected(kind: str, speedup: float) -> None:
     simulated = KINDS[kind](boot_time_s=1.0)
     async with served(simulated, speedup) as vehicle:
-        await anyio.sleep(0.3)  # its first time was told, and is long ago
+        await anyio.sleep(0.3)  # Its first time was reported long ago.
         with vehicle.subscribe(VehicleRebooted, capacity=5) as events:
             await vehicle.reboot(timeout=10.0)
             assert simulated.uptime < 12.0
@@ -42,8 +42,8 @@ async def test_a_reboot_is_noticed_before_the_vehicle_is_older_than_it_was(kind:
             assert len(list(iter(events.get_nowait, None))) == 1
 
 
-async def test_what_was_asked_of_a_rebooting_vehicle_is_asked_again_at_once() -> None:
-    """A request that went down with it does not count as one that it does not obey."""
+async def test_rates_requested_during_reboot_are_repeated_immediately() -> None:
+    """A request lost in the reboot is not counted as ignored."""
     async with served(SimulatedCopter(boot_time_s=0.0), 20.0) as vehicle, anyio.create_task_group() as tasks:
         tasks.start_soon(vehicle.reboot)
         await anyio.sleep(0.05)  # it is off
@@ -51,11 +51,11 @@ async def test_what_was_asked_of_a_rebooting_vehicle_is_asked_again_at_once() ->
             await asked_meanwhile.get(timeout=2.0)
 
 
-async def test_px4_twenty_times_as_fast_obeys_set_points_that_come_ten_times_a_second() -> None:
+async def test_px4_fast_simulation_obeys_10_hz_setpoints() -> None:
     for is_patient in (True, False):
         px4 = SimulatedPx4(boot_time_s=1.0)
         if is_patient:
-            wait_longer([px4], 20.0)
+            scale_timeouts([px4], 20.0)
         async with served(px4, 20.0) as vehicle:
             await vehicle.arm()
             await vehicle.take_off(10)
@@ -70,9 +70,9 @@ async def test_px4_twenty_times_as_fast_obeys_set_points_that_come_ten_times_a_s
                         await stream.fly(VelocitySetpoint(north_m_s=1), 2.0)
 
 
-async def test_a_vehicle_waits_longer_for_its_clients() -> None:
+async def test_message_stream_limits_scale_with_clients() -> None:
     copter, px4 = SimulatedCopter(), SimulatedPx4()
-    wait_longer([copter, px4], 10.0, leave=["GUID_TIMEOUT"])
+    scale_timeouts([copter, px4], 10.0, leave=["GUID_TIMEOUT"])
     names = ("FS_GCS_TIMEOUT", "GUID_TIMEOUT", "DISARM_DELAY", "RC_OVERRIDE_TIME")
     assert [copter.parameters[name] for name in names] == [50.0, 3.0, 100.0, 30.0]
     assert [px4.parameters[name] for name in ("COM_DL_LOSS_T", "COM_OF_LOSS_T", "COM_RC_LOSS_T")] == [
@@ -82,14 +82,14 @@ async def test_a_vehicle_waits_longer_for_its_clients() -> None:
     ]
 
 
-async def test_in_real_time_and_slower_nothing_is_changed() -> None:
+async def test_real_time_simulation_keeps_limits() -> None:
     copter = SimulatedCopter()
-    wait_longer([copter], 0.5)
+    scale_timeouts([copter], 0.5)
     assert (copter.parameters["DISARM_DELAY"], copter.parameters["GUID_TIMEOUT"]) == (10.0, 3.0)
 
 
 @pytest.mark.parametrize(("speedup", "passed"), [(1.0, 3.0), (20.0, 0.5)])
-async def test_time_in_which_the_program_was_blocked(speedup: float, passed: float) -> None:
+async def test_blocked_time_is_no_silence(speedup: float, passed: float) -> None:
     """In real time it is caught up; faster, all but half a simulated second of it is left out."""
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter, speedup=speedup):

@@ -1,4 +1,4 @@
-"""Whatever is done and wherever it is cancelled: no task, timer, subscription or attached sink is left behind."""
+"""Every operation, cancelled anywhere, leaves no task, timer, subscription or sink behind."""
 
 from __future__ import annotations
 
@@ -103,9 +103,7 @@ ACTIONS: list[Action] = [
     lambda flight: flight.vehicle.disarm(),
     lambda flight: flight.vehicle.take_off(15.0),
     lambda flight: flight.vehicle.go_to(place(flight, 20.0, 0.0)),
-    lambda flight: flight.vehicle.go_to(
-        place(flight, 0.0, 30.0), speed_m_s=4.0, heading_deg=90.0, timeout=8.0
-    ),
+    lambda flight: flight.vehicle.go_to(place(flight, 0.0, 30.0), speed_m_s=4.0, heading_deg=90.0, timeout=8.0),
     lambda flight: flight.vehicle.set_heading(45.0, relative=True),
     lambda flight: flight.vehicle.set_speed(3.0),
     lambda flight: flight.vehicle.look_at(place(flight, 5.0, 5.0)),
@@ -129,7 +127,7 @@ ACTIONS: list[Action] = [
 ]
 
 NEW_STREAMS = 1
-"""What counts the messages of a stream stays when nobody wants it any more: of the raw IMU here."""
+"""The frame counter of a stream stays after its last subscription: here of the raw IMU."""
 
 moments = st.one_of(st.none(), st.sampled_from([0.0, 0.001, 0.04, 0.1, 0.35]), st.floats(0.0, 8.0))
 steps = st.lists(st.tuples(st.sampled_from(range(len(ACTIONS))), moments), min_size=1, max_size=5)
@@ -143,17 +141,17 @@ async def attempt(flight: Flight, action: Action, cancelled_after: float | None)
 
 
 async def after_the_dust_has_settled(flight: Flight) -> None:
-    """Holds are confirmed, rates given back; then the same as at first is there."""
+    """Holds are confirmed and rates released; then the state equals the initial one."""
     flight.copter.faults.clear()
-    await anyio.sleep(18.0)  # an order to arm that was given up is watched for 15 s
+    await anyio.sleep(18.0)  # An abandoned arm command is monitored for 15 s.
     with anyio.fail_after(5.0):
         while is_asking(flight.vehicle):  # noqa: ASYNC110
             await anyio.sleep(0.05)
 
 
 def is_asking(vehicle: Vehicle) -> bool:
-    """Whether a command waits for its answer; now and then the vehicle object asks for a stream again."""
-    return any(lock.locked() for lock in vehicle._talk.commands._locks.values())
+    """Return True while a command waits for its ack; the vehicle object requests streams again from time to time."""
+    return any(lock.locked() for lock in vehicle._session.commands._locks.values())
 
 
 def tasks() -> int:
@@ -176,7 +174,7 @@ async def nothing_is_left_of(steps: list[tuple[int, float | None]], airborne: bo
         assert attached_sinks(connection) <= sinks + NEW_STREAMS
         flight.wire.forget()
         await anyio.sleep(3.0)
-        assert not flight.wire.setpoints()  # nobody feeds any, so none is sent
+        assert not flight.wire.setpoints()  # No set-point is supplied, so none is sent.
     assert attached_sinks(connection) <= 1  # the connection's own
     assert tasks() == alone
 
@@ -192,8 +190,8 @@ def test_any_sequence_with_any_cancellation(
 
 @given(leave_after=st.floats(0.0, 12.0), how=st.sampled_from(["cancel", "raise", "return", "unplug"]))
 @settings(max_examples=16)
-def test_leaving_in_the_middle_of_a_flight(leave_after: float, how: str) -> None:
-    """Connecting included: whatever was under way, the block ends at once and takes everything with it."""
+def test_setpoint_stream_exit_in_flight_holds(leave_after: float, how: str) -> None:
+    """Also while connecting: the block ends at once and takes all operations with it."""
 
     async def flying(flight: Flight) -> None:
         vehicle = flight.vehicle
@@ -225,7 +223,7 @@ def test_leaving_in_the_middle_of_a_flight(leave_after: float, how: str) -> None
 
 
 @pytest.mark.anyio
-async def test_a_thousand_calls_leave_as_little_as_one() -> None:
+async def test_thousand_calls_leak_nothing() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         await anyio.sleep(3.0)
@@ -244,4 +242,4 @@ async def test_a_thousand_calls_leave_as_little_as_one() -> None:
             waiting_on_cells(flight.vehicle),
             attached_sinks(flight.vehicle.connection),
         )
-        assert not flight.vehicle._talk.commands._under_way
+        assert not flight.vehicle._session.commands._under_way

@@ -1,4 +1,4 @@
-"""What is out of range is refused by name, with what is allowed, before anything is sent."""
+"""Values out of range are rejected by name, with the allowed range, before anything is sent."""
 
 from __future__ import annotations
 
@@ -30,9 +30,7 @@ async def entered(block: Any) -> None:
 
 REFUSED: dict[str, Callable[[Any], Awaitable[object]]] = {
     "altitude_m = -1 is not allowed: above 0 to 10000": lambda v: v.take_off(-1),
-    "altitude = 200000 is not allowed: -12000 to 100000": lambda v: v.go_to(
-        place(v, altitude_relative_m=200_000)
-    ),
+    "altitude = 200000 is not allowed: -12000 to 100000": lambda v: v.go_to(place(v, altitude_relative_m=200_000)),
     "speed_m_s = -1 is not allowed: above 0 to 1000": lambda v: v.set_speed(-1),
     "speed_m_s = -2 is not allowed: above 0 to 1000": lambda v: v.go_to(place(v), speed_m_s=-2),
     "heading_deg = -1 is not allowed: 0 to 360": lambda v: v.go_to(place(v), heading_deg=-1),
@@ -54,12 +52,12 @@ NOT_ALLOWED = [(0, True), (-1e-9, False), (1000.001, False), (math.nan, False), 
 
 
 @pytest.mark.parametrize(("value", "above"), ALLOWED)
-def test_the_ends_of_a_range_belong_to_it(value: float, above: bool) -> None:
+def test_range_limits_are_inclusive(value: float, above: bool) -> None:
     check_range("it", value, 0, 1000, above=above)
 
 
 @pytest.mark.parametrize(("value", "above"), NOT_ALLOWED)
-def test_what_is_beyond_the_ends_of_a_range_does_not(value: float, above: bool) -> None:
+def test_range_limits_exceeded_raise(value: float, above: bool) -> None:
     with pytest.raises(InvalidArgument, match=r"^it = .* is not allowed: .*0 to 1000$"):
         check_range("it", value, 0, 1000, above=above)
 

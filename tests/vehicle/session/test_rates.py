@@ -1,4 +1,4 @@
-"""Subscribing is the rate request: asked, kept, released, asked again, and told when it does not come."""
+"""Message rates: requested by subscriptions, kept, released, requested again, and reported when missing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def group_requests(flight: Flight) -> dict[int, list[tuple[int, int]]]:
     return requests
 
 
-async def test_the_default_rates_are_asked_for_at_once() -> None:
+async def test_default_rates_are_requested_immediately() -> None:
     async with open_flight() as flight:
         await anyio.sleep(1.0)
         for kind, hz in flight.vehicle.telemetry.default_rates.items():
@@ -48,7 +48,7 @@ async def test_the_default_rates_are_asked_for_at_once() -> None:
         assert interval(flight, m.GlobalPositionInt) == pytest.approx(0.1)
 
 
-async def test_rates_of_ones_own_and_none_at_all() -> None:
+async def test_connect_rates_custom_and_empty() -> None:
     async with open_flight(rates={m.Attitude: 25.0}) as flight:
         await anyio.sleep(2.0)
         assert asked(flight, m.Attitude) == [0.04]
@@ -59,7 +59,7 @@ async def test_rates_of_ones_own_and_none_at_all() -> None:
         assert not flight.wire.all(m.RequestDataStream)
 
 
-async def test_a_subscription_asks_for_its_rate_and_gives_it_back(grounded: Flight) -> None:
+async def test_subscription_requests_and_releases_rate(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     with vehicle.subscribe(m.Attitude, rate_hz=50.0, capacity=200) as attitudes:
         await anyio.sleep(1.0)
@@ -72,7 +72,7 @@ async def test_a_subscription_asks_for_its_rate_and_gives_it_back(grounded: Flig
     assert interval(grounded, m.Attitude) == pytest.approx(0.1)  # the default rate again
 
 
-async def test_a_message_without_a_default_rate_goes_back_to_the_autopilots_own(grounded: Flight) -> None:
+async def test_rate_released_without_default_restores_autopilot_rate(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(m.RawImu, rate_hz=20.0):
         await anyio.sleep(1.0)
         assert interval(grounded, m.RawImu) == pytest.approx(0.05)
@@ -81,7 +81,7 @@ async def test_a_message_without_a_default_rate_goes_back_to_the_autopilots_own(
     assert interval(grounded, m.RawImu) == 0.0
 
 
-async def test_the_fastest_of_several_wishes(grounded: Flight) -> None:
+async def test_highest_requested_rate_wins(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     with vehicle.rate(m.RawImu, 5.0):
         await anyio.sleep(1.0)
@@ -96,7 +96,7 @@ async def test_the_fastest_of_several_wishes(grounded: Flight) -> None:
         assert interval(grounded, m.RawImu) == pytest.approx(0.2)
 
 
-async def test_a_slower_wish_asks_for_nothing(grounded: Flight) -> None:
+async def test_slower_rate_request_sends_nothing(grounded: Flight) -> None:
     with grounded.vehicle.rate(m.Attitude, 2.0):
         await anyio.sleep(2.0)
     await anyio.sleep(2.0)
@@ -115,7 +115,7 @@ async def test_rates_out_of_range(grounded: Flight, hz: float) -> None:
     assert not asked(grounded, m.Attitude)
 
 
-async def test_a_lost_request_is_sent_again() -> None:
+async def test_rate_request_lost_is_sent_again() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.ignore(SET_INTERVAL, times=7)
     async with open_flight(copter) as flight:
@@ -125,7 +125,7 @@ async def test_a_lost_request_is_sent_again() -> None:
                 assert interval(flight, kind) == pytest.approx(1 / hz, rel=1e-5), kind
 
 
-async def test_after_a_reboot_everything_is_asked_for_again(grounded: Flight) -> None:
+async def test_reboot_requests_all_rates_again(grounded: Flight) -> None:
     with grounded.vehicle.rate(m.RawImu, 20.0):
         await anyio.sleep(10.0)
         grounded.wire.forget()
@@ -136,27 +136,27 @@ async def test_after_a_reboot_everything_is_asked_for_again(grounded: Flight) ->
         assert interval(grounded, m.RawImu) == pytest.approx(0.05)
 
 
-async def test_a_stream_that_somebody_else_switched_off_is_asked_for_again(grounded: Flight) -> None:
+async def test_stream_disabled_by_other_station_is_requested_again(grounded: Flight) -> None:
     grounded.copter.channels[0].streams.set_interval(m.Attitude.ID, 0.0, grounded.copter.now)
     await anyio.sleep(12.0)
     assert asked(grounded, m.Attitude) == pytest.approx([0.1])
     assert grounded.vehicle.attitude.fresh(within=0.5)
 
 
-async def test_a_sensor_that_is_not_there_is_not_asked_for_all_the_time() -> None:
+async def test_missing_sensor_is_not_requested_continuously() -> None:
     async with open_flight() as flight:
         await anyio.sleep(120.0)
         assert 2 <= len(asked(flight, m.DistanceSensor)) <= 7
 
 
-async def test_who_has_answered_is_asked_again_as_soon_as_ever() -> None:
+async def test_answered_timesync_is_requested_immediately_again() -> None:
     """Each question in vain doubles the pause, until one is answered."""
-    async with open_flight(rates={}) as flight, AsyncExitStack() as wishes:
+    async with open_flight(rates={}) as flight, AsyncExitStack() as requests:
         await anyio.sleep(3.0)
         for times, hz in ((3, 20.0), (1, 50.0)):
             flight.wire.forget()
             flight.copter.faults.ignore(SET_INTERVAL, times=times)
-            wishes.enter_context(flight.vehicle.rate(m.RawImu, hz))
+            requests.enter_context(flight.vehicle.rate(m.RawImu, hz))
             await anyio.sleep(40.0)
             at = [when for when, each in flight.wire.sent if isinstance(each, m.CommandLong)]
             gaps = [later - earlier for earlier, later in itertools.pairwise(at)]
@@ -166,19 +166,19 @@ async def test_who_has_answered_is_asked_again_as_soon_as_ever() -> None:
 # ------------------------------------------------------------------------------------- events
 
 
-async def test_a_stream_that_comes_too_slowly_is_an_event(grounded: Flight) -> None:
+async def test_slow_stream_publishes_event(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(StreamSlow, capacity=20) as events:
         grounded.copter.channels[0].streams.set_interval(m.Attitude.ID, 0.5, grounded.copter.now)
         event = await events.get(timeout=10.0)
-        assert (event.message, event.asked_hz) == ("ATTITUDE", 10.0)
+        assert (event.message, event.requested_hz) == ("ATTITUDE", 10.0)
         assert event.achieved_hz < 5.0
         await anyio.sleep(20.0)
-        assert events.get_nowait() is None  # told once, not every second
+        assert events.get_nowait() is None  # Reported once, not every second.
 
 
 @pytest.mark.parametrize("boot_time_s", [3.0, 7.6, 12.2])
-async def test_a_stream_that_begins_late_is_not_slow(boot_time_s: float) -> None:
-    """The copter has LOCAL_POSITION_NED from the moment on at which its estimator knows where it is."""
+async def test_late_starting_stream_is_not_slow(boot_time_s: float) -> None:
+    """The copter sends LOCAL_POSITION_NED once its estimator has a position."""
     async with open_flight(SimulatedCopter(boot_time_s=boot_time_s)) as flight:
         with flight.vehicle.subscribe(StreamSlow, capacity=20) as events:
             await flight.vehicle.wait_ready(timeout=60)
@@ -187,9 +187,7 @@ async def test_a_stream_that_begins_late_is_not_slow(boot_time_s: float) -> None
 
 
 @pytest.mark.parametrize(("interval_s", "is_slow"), [(0.54, False), (0.7, True)])
-async def test_half_the_rate_but_one_message_in_five_seconds_is_not_slow_yet(
-    interval_s: float, is_slow: bool
-) -> None:
+async def test_half_rate_minus_one_message_is_not_slow(interval_s: float, is_slow: bool) -> None:
     async with open_flight(rates={m.RawImu: 4.0}) as flight:
         with flight.vehicle.subscribe(StreamSlow, capacity=20) as events:
             await anyio.sleep(3.0)
@@ -198,7 +196,7 @@ async def test_half_the_rate_but_one_message_in_five_seconds_is_not_slow_yet(
             assert (events.get_nowait() is not None) is is_slow
 
 
-async def test_a_wanted_stream_that_does_not_come_at_all_is_an_event() -> None:
+async def test_missing_stream_publishes_event() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         with (
@@ -209,14 +207,14 @@ async def test_a_wanted_stream_that_does_not_come_at_all_is_an_event() -> None:
             assert (event.message, event.achieved_hz) == ("DISTANCE_SENSOR", 0.0)
 
 
-async def test_an_optional_stream_that_does_not_come_is_none() -> None:
+async def test_optional_stream_missing_publishes_nothing() -> None:
     async with open_flight() as flight:
         with flight.vehicle.subscribe(StreamSlow, StreamUnavailable, capacity=20) as events:
             await anyio.sleep(60.0)
             assert events.get_nowait() is None
 
 
-async def test_a_message_that_the_vehicle_does_not_have_is_an_event(grounded: Flight) -> None:
+async def test_unavailable_message_publishes_event(grounded: Flight) -> None:
     with (
         grounded.vehicle.subscribe(StreamUnavailable, capacity=5) as events,
         grounded.vehicle.rate(m.Odometry, 10.0),
@@ -228,7 +226,7 @@ async def test_a_message_that_the_vehicle_does_not_have_is_an_event(grounded: Fl
         assert len(asked(grounded, m.Odometry)) == 1
 
 
-async def test_a_rate_that_was_refused_is_asked_for_again_by_the_next_one_who_wants_it(
+async def test_refused_rate_is_requested_again_by_next_subscriber(
     grounded: Flight,
 ) -> None:
     grounded.copter.faults.refuse(SET_INTERVAL, MavResult.DENIED, times=1)
@@ -246,7 +244,7 @@ def old_copter() -> SimulatedCopter:
     return SimulatedCopter(boot_time_s=0.0, unsupported_commands=[SET_INTERVAL])
 
 
-async def test_old_firmware_gets_stream_requests() -> None:
+async def test_rates_old_firmware_gets_request_data_stream() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(2.0)
         assert len(flight.wire.commands(SET_INTERVAL)) == 1
@@ -258,7 +256,7 @@ async def test_old_firmware_gets_stream_requests() -> None:
         await flight.vehicle.wait_ready(timeout=10.0)
 
 
-async def test_old_firmware_takes_the_fastest_wish_of_a_group_and_gives_it_back() -> None:
+async def test_rates_old_firmware_group_uses_highest_rate() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(2.0)
         flight.wire.forget()
@@ -269,7 +267,7 @@ async def test_old_firmware_takes_the_fastest_wish_of_a_group_and_gives_it_back(
         assert group_requests(flight) == {MavDataStream.EXTRA1: [(30, 1), (10, 1)]}
 
 
-async def test_old_firmware_is_asked_again_after_a_reboot() -> None:
+async def test_rates_old_firmware_requested_again_after_reboot() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(10.0)
         flight.wire.forget()
@@ -279,7 +277,7 @@ async def test_old_firmware_is_asked_again_after_a_reboot() -> None:
         assert interval(flight, m.Attitude) == pytest.approx(0.1)
 
 
-async def test_old_firmware_has_no_group_for_some_messages() -> None:
+async def test_rates_old_firmware_message_without_group_is_unavailable() -> None:
     async with open_flight(old_copter()) as flight:
         await anyio.sleep(2.0)
         with (

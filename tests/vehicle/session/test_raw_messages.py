@@ -12,7 +12,7 @@ from aerokit.sim import SimulatedCopter, simulated_link
 pytestmark = pytest.mark.anyio
 
 
-async def test_the_latest_message_with_age_and_source() -> None:
+async def test_message_cell_has_age_and_source() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link, rates={}) as vehicle:
         cell = vehicle.message(Attitude, rate_hz=20)
         assert vehicle.message(Attitude) is cell
@@ -27,7 +27,7 @@ async def test_the_latest_message_with_age_and_source() -> None:
         assert first.received_frame is not None
 
 
-async def test_it_ends_with_the_connection() -> None:
+async def test_stream_ends_with_connection() -> None:
     kept: Vehicle
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
         kept = vehicle
@@ -38,7 +38,7 @@ async def test_it_ends_with_the_connection() -> None:
     assert heartbeats.value.type == 2
 
 
-async def test_a_rate_out_of_range_is_refused() -> None:
+async def test_rate_out_of_range_raises() -> None:
     async with simulated_link(SimulatedCopter(boot_time_s=0)) as link, connect(link) as vehicle:
         with pytest.raises(InvalidArgument, match="rate_hz"):
             vehicle.message(ScaledImu2, rate_hz=0)

@@ -1,4 +1,4 @@
-"""What orders say on the wire, number by number, and when calls return, to the turn of the loop."""
+"""Exact wire contents of orders, and the loop iteration in which calls return."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from aerokit.sim import SimulatedCopter, SimulatedRover, simulated_link
 from aerokit.sim.px4.modes import OFFBOARD
 from aerokit.vehicle.commanding.progress import await_progress
 from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint, LocalPositionSetpoint, PositionSetpoint
-from aerokit.vehicle.session.commands import UNDER_WAY_S, CommandSender
+from aerokit.vehicle.session.commands import PENDING_ACK_TIMEOUT_S, CommandSender
 
 pytestmark = pytest.mark.anyio
 
@@ -42,7 +42,7 @@ def params_of(command: m.CommandLong | m.CommandInt) -> list[float]:
 
 
 @pytest.mark.parametrize(("heading_deg", "yaw"), [(90.0, math.pi / 2), (270.0, -math.pi / 2)])
-async def test_px4_turns_where_it_is_and_keeps_its_speed(heading_deg: float, yaw: float) -> None:
+async def test_px4_set_heading_turns_and_keeps_speed(heading_deg: float, yaw: float) -> None:
     async with open_px4() as flight:
         await flight.take_off()
         await flight.vehicle.set_heading(heading_deg)
@@ -52,7 +52,7 @@ async def test_px4_turns_where_it_is_and_keeps_its_speed(heading_deg: float, yaw
         assert all(math.isnan(each) for each in params[4:])
 
 
-async def test_speed_and_what_is_looked_at(flying: Flight) -> None:
+async def test_speed_and_roi_are_raw_commands(flying: Flight) -> None:
     await flying.vehicle.set_speed(4.0)
     assert params_of(flying.wire.commands(MavCmd.DO_CHANGE_SPEED)[0]) == [1.0, 4.0, -1.0, 0.0, 0.0, 0.0, 0.0]
     here = flying.vehicle.position.value
@@ -64,7 +64,7 @@ async def test_speed_and_what_is_looked_at(flying: Flight) -> None:
     assert math.isnan(reposition[3])
 
 
-async def test_force_is_what_the_firmware_calls_it(grounded: Flight) -> None:
+async def test_force_uses_magic_number(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     await vehicle.arm(force=True)
     await vehicle.disarm(force=True)
@@ -93,9 +93,7 @@ async def test_force_is_what_the_firmware_calls_it(grounded: Flight) -> None:
         (lambda guided, here: guided.attitude(AttitudeSetpoint(0.0, 0.0, 0.0, 0.5)), 50.0),
     ],
 )
-async def test_set_points_come_at_their_default_rate(
-    flying: Flight, kind: Callable[[Any, Any], Any], rate_hz: float
-) -> None:
+async def test_setpoint_stream_default_rate(flying: Flight, kind: Callable[[Any, Any], Any], rate_hz: float) -> None:
     stream = kind(flying.vehicle.guided, flying.vehicle.position.value)
     async with stream:
         await anyio.sleep(0.28)
@@ -104,7 +102,7 @@ async def test_set_points_come_at_their_default_rate(
     assert gaps[:2] == pytest.approx([1 / rate_hz] * 2, abs=1e-6)
 
 
-async def test_a_set_point_is_valid_from_when_the_mode_is_told() -> None:
+async def test_setpoint_validity_starts_with_mode_report() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         flight.px4.faults.delay_ack(MavCmd.DO_SET_MODE, 0.5)
@@ -116,10 +114,10 @@ async def test_a_set_point_is_valid_from_when_the_mode_is_told() -> None:
 # ----------------------------------------------------------------------------------- returns
 
 
-async def test_what_is_done_already_is_not_waited_for(grounded: Flight) -> None:
+async def test_posted_order_already_in_effect_returns(grounded: Flight) -> None:
     started = now()
     await await_progress(
-        grounded.vehicle._talk,
+        grounded.vehicle._session,
         "nothing",
         is_done=lambda: True,
         trouble=lambda: None,
@@ -129,14 +127,14 @@ async def test_what_is_done_already_is_not_waited_for(grounded: Flight) -> None:
     assert now() == started
 
 
-async def test_silence_is_longer_than_what_is_put_up_with(grounded: Flight) -> None:
-    """Not as long: the instant of a heartbeat is no silence."""
+async def test_call_silence_exceeds_custom_limit_raises(grounded: Flight) -> None:
+    """The instant of a heartbeat is no silence yet."""
     with grounded.vehicle.subscribe(m.Heartbeat) as heartbeats:
         await anext(heartbeats)
     started = now()
     with pytest.raises(HeartbeatTimeout):
         await await_progress(
-            grounded.vehicle._talk,
+            grounded.vehicle._session,
             "nothing",
             is_done=lambda: False,
             trouble=lambda: None,
@@ -147,7 +145,7 @@ async def test_silence_is_longer_than_what_is_put_up_with(grounded: Flight) -> N
     assert now() > started
 
 
-async def test_a_px4_is_armed_as_soon_as_it_is_ready_in_its_new_mode() -> None:
+async def test_px4_arms_when_ready_in_new_mode() -> None:
     async with open_px4() as flight:
         await flight.vehicle.wait_ready()
         flight.px4.switch_to(OFFBOARD)
@@ -155,9 +153,7 @@ async def test_a_px4_is_armed_as_soon_as_it_is_ready_in_its_new_mode() -> None:
         await anyio.sleep(1.0)
         await flight.vehicle.arm()
         modes = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.DO_SET_MODE]
-        arms = [
-            at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.COMPONENT_ARM_DISARM
-        ]
+        arms = [at for at, each in flight.wire.sent if getattr(each, "command", 0) == MavCmd.COMPONENT_ARM_DISARM]
         assert arms[0] - modes[0] < 2.5
 
 
@@ -170,13 +166,11 @@ def sender(grounded: Flight) -> CommandSender:
 
 
 def awaits_answer(sender: CommandSender) -> bool:
-    oldest = anyio.current_time() - UNDER_WAY_S
+    oldest = anyio.current_time() - PENDING_ACK_TIMEOUT_S
     return any(at >= oldest for at in sender._under_way.get((1, BANNER), ()))
 
 
-async def test_an_answer_to_what_was_sent_in_passing_may_come_for_two_seconds(
-    grounded: Flight, sender: CommandSender
-) -> None:
+async def test_unconfirmed_command_ack_is_expected_for_two_seconds(grounded: Flight, sender: CommandSender) -> None:
     assert not awaits_answer(sender)
     sender.send_unconfirmed(BANNER)
     assert awaits_answer(sender)
@@ -184,15 +178,13 @@ async def test_an_answer_to_what_was_sent_in_passing_may_come_for_two_seconds(
     assert not awaits_answer(sender)  # it came
     grounded.copter.faults.ignore(BANNER)
     sender.send_unconfirmed(BANNER)
-    await anyio.sleep(UNDER_WAY_S - 0.01)
+    await anyio.sleep(PENDING_ACK_TIMEOUT_S - 0.01)
     assert awaits_answer(sender)
     await anyio.sleep(0.02)
     assert not awaits_answer(sender)
 
 
-async def test_expected_answers_after_lost_command_end_with_their_age(
-    grounded: Flight, sender: CommandSender
-) -> None:
+async def test_expected_answers_after_lost_command_end_with_their_age(grounded: Flight, sender: CommandSender) -> None:
     grounded.copter.faults.ignore(BANNER)
     for _ in range(4):
         sender.send_unconfirmed(BANNER)
@@ -201,12 +193,12 @@ async def test_expected_answers_after_lost_command_end_with_their_age(
     await sender.send_long(BANNER, attempts=2)  # its first answer may be one of the four
     assert awaits_answer(sender)
     await anyio.sleep(
-        UNDER_WAY_S - 1.1
+        PENDING_ACK_TIMEOUT_S - 1.1
     )  # sent again after a second; nothing is expected for longer than that
     assert not awaits_answer(sender)
 
 
-async def test_an_answer_is_to_the_oldest_of_those_under_way(grounded: Flight, sender: CommandSender) -> None:
+async def test_ack_is_matched_to_oldest_pending_command(grounded: Flight, sender: CommandSender) -> None:
     grounded.copter.faults.ignore(BANNER, times=1)
     sender.send_unconfirmed(BANNER)
     await anyio.sleep(1.5)
@@ -218,7 +210,7 @@ async def test_an_answer_is_to_the_oldest_of_those_under_way(grounded: Flight, s
 # ---------------------------------------------------------------------------------- go_to
 
 
-async def test_a_go_to_whose_heading_is_refused_on_the_way_holds(flying: Flight) -> None:
+async def test_go_to_heading_refused_holds(flying: Flight) -> None:
     flying.copter.faults.refuse(MavCmd.CONDITION_YAW, MavResult.FAILED)
     with pytest.raises(CommandRejected, match="CONDITION_YAW"):
         await flying.vehicle.go_to(flying.vehicle.position.value.offset(north_m=100), heading_deg=90.0)
@@ -226,7 +218,7 @@ async def test_a_go_to_whose_heading_is_refused_on_the_way_holds(flying: Flight)
     assert flying.wire.mode_orders() == [17]
 
 
-async def test_the_older_message_is_sent_once_a_second() -> None:
+async def test_go_to_legacy_message_is_repeated_each_second() -> None:
     copter = SimulatedCopter(boot_time_s=0.0, unsupported_commands=[MavCmd.DO_REPOSITION])
     async with in_the_air(copter=copter) as flight:
         await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=40))
@@ -236,11 +228,11 @@ async def test_the_older_message_is_sent_once_a_second() -> None:
     assert all(1.0 <= gap < 1.3 for gap in gaps)
 
 
-async def test_on_the_ground_it_goes_nowhere(grounded: Flight) -> None:
+async def test_go_to_on_ground_is_rejected(grounded: Flight) -> None:
     await grounded.vehicle.set_mode("GUIDED")
     await grounded.vehicle.arm()
     assert grounded.vehicle.landed_state.value == 1
-    with pytest.raises(OperationRejected, match=r"on the ground: take_off\(\) first; nothing was sent"):
+    with pytest.raises(OperationRejected, match=r"on the ground: call take_off\(\) first; nothing was sent"):
         await grounded.vehicle.go_to(grounded.vehicle.position.value.offset(north_m=10))
     assert not grounded.wire.commands(MavCmd.DO_REPOSITION)
 
@@ -248,27 +240,27 @@ async def test_on_the_ground_it_goes_nowhere(grounded: Flight) -> None:
 # ------------------------------------------------------------------------------- refusals
 
 
-async def test_a_rover_does_not_take_off() -> None:
+async def test_rover_take_off_is_not_supported() -> None:
     async with simulated_link(SimulatedRover(boot_time_s=1.0)) as link, connect(link) as vehicle:
         with pytest.raises(NotSupported, match="take_off: Rover cannot take off"):
             await vehicle.take_off(5.0)
 
 
-async def test_a_reboot_says_why_it_is_none(flying: Flight) -> None:
+async def test_reboot_not_executed_raises_reason(flying: Flight) -> None:
     with pytest.raises(OperationRejected, match="reboot: the vehicle is armed; nothing was sent"):
         await flying.vehicle.reboot()
 
 
-async def test_being_armed_is_waited_for_ten_seconds(grounded: Flight) -> None:
+async def test_arm_default_timeout_is_ten_seconds(grounded: Flight) -> None:
     grounded.copter.faults.refuse(MavCmd.COMPONENT_ARM_DISARM, MavResult.ACCEPTED)
     with pytest.raises(OperationTimeout, match=r"^arm\(\): not done within 10 s"):
         await grounded.vehicle.arm()
 
 
-async def test_px4_is_told_to_hold_when_no_set_point_comes_after_entering() -> None:
+async def test_px4_setpoint_stream_not_fed_after_entry_holds() -> None:
     async with open_px4() as flight:
         await flight.take_off()
-        with pytest.raises(SetpointStreamStopped, match="no new set-point came for"):
+        with pytest.raises(SetpointStreamStopped, match="no new set-point was supplied for"):
             async with flight.vehicle.guided.velocity(valid_for_s=1.0):
                 await anyio.sleep(5.0)
 
@@ -276,15 +268,15 @@ async def test_px4_is_told_to_hold_when_no_set_point_comes_after_entering() -> N
 # ---------------------------------------------------------------------- left in a silence
 
 
-async def test_a_hold_that_was_not_confirmed_is_told_at_the_end(caplog: pytest.LogCaptureFixture) -> None:
+async def test_block_left_with_unconfirmed_hold_warns(caplog: pytest.LogCaptureFixture) -> None:
     async with in_the_air() as flight:
         with anyio.move_on_after(2.0):
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
         flight.copter.faults.silent = True
-    assert "left before it confirmed that it holds" in caplog.text
+    assert "left before a hold was confirmed" in caplog.text
 
 
-async def test_a_hold_without_an_answer_is_told_and_given_again_when_it_is_heard(
+async def test_hold_unanswered_warns_and_is_repeated_after_silence(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with in_the_air() as flight:
@@ -294,10 +286,10 @@ async def test_a_hold_without_an_answer_is_told_and_given_again_when_it_is_heard
         flight.copter.faults.silent = True
         flight.copter.faults.frozen = True
         await anyio.sleep(12.0)
-        assert "told to hold and has not confirmed it yet" in caplog.text
+        assert "the hold after an abandoned flight is not confirmed yet" in caplog.text
 
 
-async def test_in_a_silence_nothing_is_sent_until_the_vehicle_is_heard() -> None:
+async def test_hold_in_silence_is_sent_after_heartbeat() -> None:
     async with in_the_air() as flight:
         with flight.vehicle.subscribe(VehicleSilent) as events, anyio.move_on_after(60.0):
             with anyio.CancelScope() as scope:
@@ -316,7 +308,7 @@ async def test_in_a_silence_nothing_is_sent_until_the_vehicle_is_heard() -> None
         assert flight.wire.mode_orders() == [17]
 
 
-async def test_who_took_it_in_a_silence_keeps_it() -> None:
+async def test_takeover_in_silence_keeps_vehicle() -> None:
     async with in_the_air() as flight:
         with anyio.CancelScope() as scope:
             async with anyio.create_task_group() as tasks:
@@ -333,16 +325,16 @@ async def test_who_took_it_in_a_silence_keeps_it() -> None:
         assert flight.vehicle.mode_name == "LOITER"
 
 
-async def test_an_order_to_arm_without_an_answer_is_told_at_the_end(caplog: pytest.LogCaptureFixture) -> None:
+async def test_block_left_with_unanswered_arm_warns(caplog: pytest.LogCaptureFixture) -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.ignore(MavCmd.COMPONENT_ARM_DISARM)
         with pytest.raises(CommandTimeout):
             await flight.vehicle.arm()
-    assert "left while an order to arm may still be carried out" in caplog.text
+    assert "left while an arm command may still be executed" in caplog.text
 
 
-async def test_the_end_of_a_block_says_nothing_of_arming_that_was_answered(
+async def test_block_left_with_answered_arm_is_silent(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with open_flight() as flight:
@@ -352,12 +344,8 @@ async def test_the_end_of_a_block_says_nothing_of_arming_that_was_answered(
     assert "order to arm" not in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("order", "longest_s"), [("land", 300.0), exhaustive(pytest.param("return_to_launch", 600.0))]
-)
-async def test_a_vehicle_that_stays_up_is_waited_for_five_or_ten_minutes(
-    flying: Flight, order: str, longest_s: float
-) -> None:
+@pytest.mark.parametrize(("order", "longest_s"), [("land", 300.0), exhaustive(pytest.param("return_to_launch", 600.0))])
+async def test_land_and_return_default_timeouts_apply(flying: Flight, order: str, longest_s: float) -> None:
     flying.copter.motion.step = lambda *_, **__: None  # type: ignore[method-assign]
     begin = now()
     with pytest.raises(OperationTimeout, match=f"{order}: not done within {longest_s:g} s; it is at 10.0 m"):

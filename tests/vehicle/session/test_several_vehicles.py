@@ -1,4 +1,4 @@
-"""Several vehicles, components and ground stations on one link: nobody touches anybody else's state."""
+"""Several vehicles, components and ground stations on one link never change each other's state."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ async def two_vehicles() -> AsyncIterator[Two]:
             yield Two(first, second, one, two, wire)
 
 
-async def test_states_do_not_mix() -> None:
+async def test_states_of_two_vehicles_are_separate() -> None:
     async with two_vehicles() as both:
         for vehicle, home in ((both.one, HERE), (both.two, THERE)):
             assert vehicle.position.value.latitude_deg == pytest.approx(home[0], abs=1e-4)
@@ -64,7 +64,7 @@ async def test_states_do_not_mix() -> None:
         assert (both.one.is_armed, both.two.is_armed) == (False, True)
 
 
-async def test_commands_reach_only_the_addressed_one() -> None:
+async def test_commands_reach_only_addressed_vehicle() -> None:
     async with two_vehicles() as both:
         await both.two.arm()
         assert not both.first.is_armed
@@ -75,7 +75,7 @@ async def test_commands_reach_only_the_addressed_one() -> None:
         assert {getattr(each, "target_system", None) for each in sent} == {None, 1, 2}  # no broadcasts
 
 
-async def test_both_fly_at_the_same_time() -> None:
+async def test_both_vehicles_fly_concurrently() -> None:
     async with two_vehicles() as both:
 
         async def fly(vehicle: aerokit.Vehicle, altitude_m: float) -> None:
@@ -91,7 +91,7 @@ async def test_both_fly_at_the_same_time() -> None:
         assert both.second.altitude_m == pytest.approx(20.0, abs=1.1)
 
 
-async def test_equal_commands_to_two_vehicles_do_not_wait_for_each_other() -> None:
+async def test_equal_commands_to_two_vehicles_are_concurrent() -> None:
     async with two_vehicles() as both:
         both.first.faults.ignore(MavCmd.DO_SEND_BANNER)
         async with anyio.create_task_group() as tasks:
@@ -109,7 +109,7 @@ async def test_equal_commands_to_two_vehicles_do_not_wait_for_each_other() -> No
             assert ack.received_frame.system_id == 2
 
 
-async def test_a_refusal_of_one_is_not_the_others() -> None:
+async def test_refusal_of_one_vehicle_does_not_affect_other() -> None:
     async with two_vehicles() as both:
         both.first.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
         async with anyio.create_task_group() as tasks:
@@ -123,12 +123,10 @@ async def test_a_refusal_of_one_is_not_the_others() -> None:
         assert (both.one.mode_name, both.two.mode_name) == ("STABILIZE", "GUIDED")
 
 
-async def test_events_and_messages_are_told_apart() -> None:
+async def test_subscription_separates_events_and_messages() -> None:
     async with two_vehicles() as both:
         with (
-            both.one.subscribe(
-                ModeChanged, ArmedChanged, StatusTextReceived, VehicleSilent, capacity=50
-            ) as of_one,
+            both.one.subscribe(ModeChanged, ArmedChanged, StatusTextReceived, VehicleSilent, capacity=50) as of_one,
             both.two.subscribe(ModeChanged, ArmedChanged, VehicleSilent, capacity=50) as of_two,
             both.two.subscribe(m.Attitude, capacity=100) as attitudes,
         ):
@@ -139,15 +137,13 @@ async def test_events_and_messages_are_told_apart() -> None:
             assert of_one.get_nowait() is None
             kinds = {type(event) for event in iter(of_two.get_nowait, None)}
             assert kinds == {ModeChanged, ArmedChanged, VehicleSilent}
-            systems = {
-                a.received_frame.system_id for a in iter(attitudes.get_nowait, None) if a.received_frame
-            }
+            systems = {a.received_frame.system_id for a in iter(attitudes.get_nowait, None) if a.received_frame}
             assert systems == {2}
         assert both.two.is_silent
         assert not both.one.is_silent
 
 
-async def test_a_reboot_of_one_leaves_the_other_alone() -> None:
+async def test_reboot_of_one_vehicle_keeps_other() -> None:
     async with two_vehicles() as both:
         await anyio.sleep(8.0)
         both.wire.forget()
@@ -160,7 +156,7 @@ async def test_a_reboot_of_one_leaves_the_other_alone() -> None:
         assert asked == {2}
 
 
-async def test_closing_one_leaves_the_other_alone() -> None:
+async def test_closing_one_vehicle_keeps_other() -> None:
     first = SimulatedCopter(system_id=1, boot_time_s=0.0)
     second = SimulatedCopter(system_id=2, boot_time_s=0.0)
     async with (
@@ -179,7 +175,7 @@ async def test_closing_one_leaves_the_other_alone() -> None:
             assert two.system_id == 2
 
 
-async def test_an_error_in_one_block_does_not_reach_the_other_as_a_group() -> None:
+async def test_error_in_one_block_is_no_exception_group_in_other() -> None:
     copters = [SimulatedCopter(system_id=1, boot_time_s=0.0), SimulatedCopter(system_id=2, boot_time_s=0.0)]
     with pytest.raises(ZeroDivisionError):
         async with (
@@ -191,7 +187,7 @@ async def test_an_error_in_one_block_does_not_reach_the_other_as_a_group() -> No
             _ = 1 / 0
 
 
-async def test_a_copter_and_a_px4() -> None:
+async def test_copter_and_px4_on_one_connection_both_connect() -> None:
     copter, px4 = SimulatedCopter(system_id=1, boot_time_s=0.0), SimulatedPx4(system_id=2, boot_time_s=1.0)
     async with (
         simulated_link([copter, px4]) as link,
@@ -210,9 +206,7 @@ async def test_a_copter_and_a_px4() -> None:
 # -------------------------------------------------------------- other components, ground stations
 
 GIMBAL = ExtraComponent(154, type=MavType.GIMBAL, base_mode=0x80, custom_mode=9)
-CAMERA = ExtraComponent(
-    100, type=MavType.CAMERA, autopilot=MavAutopilot.GENERIC, system_status=MavState.EMERGENCY
-)
+CAMERA = ExtraComponent(100, type=MavType.CAMERA, autopilot=MavAutopilot.GENERIC, system_status=MavState.EMERGENCY)
 ADSB = ExtraComponent(156, type=MavType.ADSB, base_mode=0xFF)
 COMPANION = ExtraComponent(191, type=MavType.ONBOARD_CONTROLLER, custom_mode=6)
 GROUND_STATION = ExtraComponent(190, type=MavType.GCS, system_id=254, base_mode=0xD9, custom_mode=4)
@@ -226,7 +220,7 @@ SECOND_AUTOPILOT = ExtraComponent(
     [GIMBAL, CAMERA, ADSB, COMPANION, GROUND_STATION, SECOND_AUTOPILOT],
     ids=lambda c: str(c.component_id),
 )
-async def test_heartbeats_of_others_change_nothing(component: ExtraComponent) -> None:
+async def test_heartbeats_of_others_are_ignored(component: ExtraComponent) -> None:
     copter = SimulatedCopter(boot_time_s=0.0, components=[component])
     async with simulated_link(copter) as link, aerokit.connect(link, system_id=1) as vehicle:
         assert (vehicle.system_id, vehicle.component_id) == (1, 1)
@@ -239,8 +233,8 @@ async def test_heartbeats_of_others_change_nothing(component: ExtraComponent) ->
         await anyio.sleep(6.0)
 
 
-async def test_an_autopilot_that_is_not_component_1() -> None:
-    """Nobody else is there: after its third heartbeat it is the vehicle."""
+async def test_autopilot_with_other_component_id_is_accepted() -> None:
+    """It is the only autopilot: after its third heartbeat it is the vehicle."""
     async with simulated_link([]) as link:
         wire = Wire(link)
         odd = FrameEncoder(5, 7)
@@ -257,7 +251,7 @@ async def test_an_autopilot_that_is_not_component_1() -> None:
                 tasks.cancel_scope.cancel()
 
 
-async def test_the_gimbal_goes_on_while_the_autopilot_is_silent() -> None:
+async def test_gimbal_works_while_autopilot_is_silent() -> None:
     """Its heartbeats come from the same system; the vehicle is silent all the same."""
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
@@ -273,7 +267,7 @@ async def test_the_gimbal_goes_on_while_the_autopilot_is_silent() -> None:
                 assert events.get_nowait() is not None
 
 
-async def test_telemetry_of_another_component_or_system_is_not_the_vehicles() -> None:
+async def test_telemetry_of_other_component_or_system_is_ignored() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         wire = Wire(link)
@@ -299,10 +293,10 @@ async def test_telemetry_of_another_component_or_system_is_not_the_vehicles() ->
             assert vehicle.mode_name == "GUIDED"
             assert not vehicle.is_armed
             assert "Crash!" not in vehicle.texts_since(0.0)
-            assert vehicle._talk.watch.reboots == 0
+            assert vehicle._session.watch.reboots == 0
 
 
-async def test_an_ack_of_another_system_is_not_taken() -> None:
+async def test_ack_of_other_system_is_ignored() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         wire = Wire(link)
@@ -320,7 +314,7 @@ async def test_an_ack_of_another_system_is_not_taken() -> None:
                     await vehicle.command(MavCmd.DO_SEND_BANNER, retries=1)
 
 
-async def test_each_autopilot_is_told_of_once_whether_it_is_connected_to_or_not() -> None:
+async def test_found_event_is_published_once_per_autopilot() -> None:
     first, second = SimulatedCopter(boot_time_s=0.0), SimulatedPx4(system_id=2, boot_time_s=0.0)
     async with simulated_link([first, second]) as link, open_connection(link) as connection:
         with connection.subscribe(VehicleFound, capacity=10) as found:
@@ -332,15 +326,13 @@ async def test_each_autopilot_is_told_of_once_whether_it_is_connected_to_or_not(
 
 
 @pytest.mark.parametrize(("silent_s", "is_found"), [(1.5, True), (2.5, False)])
-async def test_a_vehicle_that_was_heard_lately_is_there_one_heard_before_is_waited_for(
-    silent_s: float, is_found: bool
-) -> None:
+async def test_connect_uses_recent_heartbeat_only(silent_s: float, is_found: bool) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, open_connection(link) as connection:
         await anyio.sleep(3.2)
         copter.faults.silent = True
         heard_at = max(
-            each.received_frame.received_at for each in connection.heard.values() if each.received_frame
+            each.received_frame.received_at for each in connection.heartbeats.values() if each.received_frame
         )
         await anyio.sleep(heard_at + silent_s - now())
         try:

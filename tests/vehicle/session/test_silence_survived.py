@@ -44,12 +44,12 @@ async def fly(name: str, max_silence_s: float | None) -> None:
 
 
 @pytest.mark.parametrize("name", CALLS)
-async def test_a_call_survives_a_silence_if_it_is_asked_to(name: str) -> None:
+async def test_call_without_silence_limit_survives_silence(name: str) -> None:
     await fly(name, None)
 
 
 @pytest.mark.parametrize("name", CALLS)
-async def test_a_call_ends_when_the_silence_is_longer_than_it_may_be(name: str) -> None:
+async def test_call_silence_exceeds_limit_raises_heartbeat_timeout(name: str) -> None:
     with pytest.raises(BaseException) as caught:  # noqa: PT011 - a group on anyio's task group
         await fly(name, 5.0)
     assert caught.group_contains(HeartbeatTimeout)

@@ -1,7 +1,7 @@
 """Three failures of the best-known library, which must not be ours.
 
-One unanswered command delays other calls and cached reads; a slow consumer works through a backlog of old values;
-a call that was cancelled, or timed out, keeps the program from ending.
+One unanswered command delays other calls and cached reads; a slow consumer works through a backlog of old values; a
+call that was cancelled, or timed out, keeps the program from ending.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ async def test_twenty_unanswered_commands_delay_nothing_else(grounded: Flight) -
         assert now() - started < 2.0
 
 
-async def test_an_unanswered_rate_request_does_not_delay_the_others() -> None:
-    """Nor does a stream that the vehicle never acknowledges keep later wishes waiting for ever."""
+async def test_unanswered_rate_request_delays_no_other() -> None:
+    """A stream that the vehicle never acknowledges does not block later requests either."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.ignore(MavCmd.SET_MESSAGE_INTERVAL, times=4)
@@ -69,8 +69,8 @@ async def test_an_unanswered_rate_request_does_not_delay_the_others() -> None:
             await imu.get(timeout=6.0)
 
 
-async def test_a_silent_vehicle_delays_its_own_calls_only() -> None:
-    """What was read before can be read at once, its age says how old it is."""
+async def test_silent_vehicle_delays_only_its_own_calls() -> None:
+    """Earlier values can be read at once; their age shows how old they are."""
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         flight.copter.faults.silent = True
@@ -91,7 +91,7 @@ async def test_a_silent_vehicle_delays_its_own_calls_only() -> None:
 # -------------------------------------------------------------------------- 2: slow consumers
 
 
-async def test_a_slow_consumer_gets_the_latest_and_sees_how_many_it_missed(grounded: Flight) -> None:
+async def test_slow_subscriber_gets_latest_and_missed_count(grounded: Flight) -> None:
     ages: list[float] = []
     with grounded.vehicle.subscribe(m.Attitude, rate_hz=50.0) as attitudes:
         await anyio.sleep(1.0)
@@ -109,7 +109,7 @@ async def test_a_slow_consumer_gets_the_latest_and_sees_how_many_it_missed(groun
     assert read + missed == pytest.approx(755, abs=5)
 
 
-async def test_a_slow_follower_of_a_cell_gets_the_latest(grounded: Flight) -> None:
+async def test_slow_cell_iterator_gets_latest(grounded: Flight) -> None:
     with grounded.vehicle.rate(m.Attitude, 50.0):
         await anyio.sleep(1.0)
         updates = grounded.vehicle.attitude.updates()
@@ -124,7 +124,7 @@ async def anext_of(iterator: object) -> object:
     return await iterator.__anext__()  # type: ignore[attr-defined]
 
 
-async def test_who_wants_every_item_says_how_many_may_wait(grounded: Flight) -> None:
+async def test_subscription_capacity_is_explicit(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(StatusTextReceived, capacity=100) as texts:
         for number in range(50):
             grounded.copter.send_text(6, f"text {number}")
@@ -134,7 +134,7 @@ async def test_who_wants_every_item_says_how_many_may_wait(grounded: Flight) -> 
     assert texts.missed == 0
 
 
-async def test_one_slow_consumer_does_not_slow_another(grounded: Flight) -> None:
+async def test_slow_subscriber_does_not_delay_others(grounded: Flight) -> None:
     with (
         grounded.vehicle.subscribe(m.Attitude, rate_hz=50.0) as slow,
         grounded.vehicle.subscribe(m.Attitude, capacity=500) as quick,
@@ -144,7 +144,7 @@ async def test_one_slow_consumer_does_not_slow_another(grounded: Flight) -> None
         assert quick.missed == 0
 
 
-async def test_after_a_blocked_loop_the_latest_is_there(grounded: Flight) -> None:
+async def test_blocked_loop_then_latest_value_is_available(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(m.Attitude, rate_hz=50.0) as attitudes:
         await anyio.sleep(1.0)
         block_loop(5.0)
@@ -157,7 +157,7 @@ async def test_after_a_blocked_loop_the_latest_is_there(grounded: Flight) -> Non
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.2, 1.7])
-async def test_a_cancelled_call_ends_at_once(grounded: Flight, wait_s: float) -> None:
+async def test_call_cancelled_in_silence_ends_immediately(grounded: Flight, wait_s: float) -> None:
     grounded.copter.faults.silent = True
     started = now()
     with anyio.move_on_after(wait_s) as scope:
@@ -223,17 +223,17 @@ class SilentVehicle:
             self._socket.sendto(encoder.encode(heartbeat), ("127.0.0.1", self.port))
 
 
-def test_a_program_with_calls_that_timed_out_ends() -> None:
+def test_program_with_timed_out_calls_exits() -> None:
     """In a process of its own, on a real socket: the interpreter itself has to come to its end."""
     with SilentVehicle() as silent:
         finished = subprocess.run(
             [sys.executable, "-W", "error", "-c", textwrap.dedent(PROGRAM), f"udpin:127.0.0.1:{silent.port}"],
             capture_output=True,
             text=True,
-            timeout=30,  # it takes two seconds; the library of which this is told never ended
+            timeout=30,  # It takes two seconds; a comparable library was reported never to end.
             check=False,
         )
     told = ["connected", "timeout", "timeout", "timeout", "cancelled", "left", "done"]
     assert finished.stdout.split() == told, finished.stderr
-    assert "an order to arm may still be carried out" in finished.stderr  # it never was answered
+    assert "an arm command may still be executed" in finished.stderr  # it never was answered
     assert finished.returncode == 0

@@ -1,4 +1,4 @@
-"""All vehicles of a connection, and what is known of each as plain values."""
+"""All vehicles of a connection, and their state as plain values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from aerokit.vehicle.vehicle import overview
 pytestmark = pytest.mark.anyio
 
 
-async def test_each_is_connected_to_when_it_is_heard_and_let_go_at_the_end() -> None:
+async def test_vehicles_on_connects_each_and_closes_at_end() -> None:
     simulated = [SimulatedCopter(system_id=1, boot_time_s=0.0), SimulatedPx4(system_id=7, boot_time_s=0.0)]
     found: list[int] = []
     both = anyio.Event()
@@ -48,7 +48,7 @@ async def test_each_is_connected_to_when_it_is_heard_and_let_go_at_the_end() -> 
             assert again.system_id == 1
 
 
-async def test_one_that_the_program_has_already_is_left_out() -> None:
+async def test_vehicles_on_skips_connected_vehicle() -> None:
     simulated = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (1, 2)]
     async with (
         simulated_link(simulated) as link,
@@ -61,7 +61,7 @@ async def test_one_that_the_program_has_already_is_left_out() -> None:
         await own.mode.wait_until(lambda mode: True, timeout=5)
 
 
-async def test_of_a_closed_connection_there_are_none() -> None:
+async def test_vehicles_on_closed_connection_raises() -> None:
     async with simulated_link(SimulatedCopter()) as link:
         async with open_connection(link) as connection:
             pass

@@ -1,4 +1,4 @@
-"""What a program can see happening: modes, arming, texts, silence, reboots, the link's quality, a blocked loop."""
+"""Events that a program can observe: modes, arming, texts, silence, reboots, link quality, a blocked loop."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from aerokit.events import (
     LoopBlocked,
     ModeChanged,
     StatusTextReceived,
-    VehicleBack,
     VehicleRebooted,
+    VehicleRecovered,
     VehicleSilent,
 )
 from aerokit.mavlink.enums import CopterMode
@@ -65,13 +65,13 @@ async def test_modes_and_arming(grounded: Flight) -> None:
     assert all(earlier.at <= later.at <= now() for earlier, later in itertools.pairwise(found))
 
 
-async def test_nothing_happens_when_nothing_changes(grounded: Flight) -> None:
+async def test_unchanged_state_publishes_nothing(grounded: Flight) -> None:
     kinds = (
         ModeChanged,
         ArmedChanged,
         LandedStateChanged,
         VehicleSilent,
-        VehicleBack,
+        VehicleRecovered,
         VehicleRebooted,
         LoopBlocked,
     )
@@ -100,7 +100,7 @@ async def test_landed_state(grounded: Flight) -> None:
 # --------------------------------------------------------------------------------------- texts
 
 
-async def test_the_same_text_twice_is_two_events(grounded: Flight) -> None:
+async def test_repeated_status_text_is_two_events(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(StatusTextReceived, capacity=20) as events:
         for _ in range(2):
             grounded.copter.send_text(4, "Bad GPS signal")
@@ -110,7 +110,7 @@ async def test_the_same_text_twice_is_two_events(grounded: Flight) -> None:
     assert second.at - first.at == pytest.approx(1.0, abs=0.3)
 
 
-async def test_a_long_text_comes_in_one_piece(grounded: Flight) -> None:
+async def test_long_status_text_is_joined(grounded: Flight) -> None:
     text = "This text has more than fifty characters and therefore it travels in several chunks, joined here."
     with grounded.vehicle.subscribe(StatusTextReceived, capacity=20) as events:
         grounded.copter.send_text(6, text)
@@ -122,9 +122,9 @@ async def test_a_long_text_comes_in_one_piece(grounded: Flight) -> None:
 # ----------------------------------------------------------------------------- silence, reboot
 
 
-async def test_silence_and_return(grounded: Flight) -> None:
+async def test_silence_and_return_publish_events(grounded: Flight) -> None:
     vehicle = grounded.vehicle
-    with vehicle.subscribe(VehicleSilent, VehicleBack, capacity=20) as events:
+    with vehicle.subscribe(VehicleSilent, VehicleRecovered, capacity=20) as events:
         grounded.copter.faults.silent = True
         silent = await events.get(timeout=10.0)
         assert isinstance(silent, VehicleSilent)
@@ -132,22 +132,22 @@ async def test_silence_and_return(grounded: Flight) -> None:
         assert vehicle.is_silent
         assert vehicle.heartbeat_age > 3.5
         await anyio.sleep(10.0)
-        assert events.get_nowait() is None  # told once
+        assert events.get_nowait() is None  # Reported once.
         grounded.copter.faults.silent = False
         back = await events.get(timeout=3.0)
-        assert isinstance(back, VehicleBack)
+        assert isinstance(back, VehicleRecovered)
         assert back.silent_for_s > 13.0
         assert vehicle.is_silent is False
 
 
-async def test_other_traffic_does_not_hide_that_the_heartbeats_have_stopped(grounded: Flight) -> None:
+async def test_silence_is_detected_despite_other_traffic(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(VehicleSilent, capacity=5) as events:
         grounded.copter.faults.heartbeats_stopped = True
         assert await events.get(timeout=10.0)
         assert grounded.vehicle.attitude.fresh(within=0.5)
 
 
-async def test_a_reboot_that_nobody_ordered(grounded: Flight) -> None:
+async def test_unordered_reboot_is_detected(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     await anyio.sleep(10.0)
     with vehicle.subscribe(VehicleRebooted, capacity=20) as events:
@@ -159,20 +159,20 @@ async def test_a_reboot_that_nobody_ordered(grounded: Flight) -> None:
         assert events.get_nowait() is None  # one reboot is one event
 
 
-async def test_a_frozen_autopilot_is_a_silent_one_and_no_reboot(grounded: Flight) -> None:
+async def test_frozen_autopilot_is_silent_without_reboot(grounded: Flight) -> None:
     await anyio.sleep(10.0)
-    with grounded.vehicle.subscribe(VehicleSilent, VehicleBack, VehicleRebooted, capacity=20) as events:
+    with grounded.vehicle.subscribe(VehicleSilent, VehicleRecovered, VehicleRebooted, capacity=20) as events:
         grounded.copter.faults.frozen = True
         await anyio.sleep(10.0)
         grounded.copter.faults.frozen = False
         await anyio.sleep(5.0)
-        assert [type(event) for event in drained(events)] == [VehicleSilent, VehicleBack]
+        assert [type(event) for event in drained(events)] == [VehicleSilent, VehicleRecovered]
 
 
 # ------------------------------------------------------------------------------------- the link
 
 
-async def test_a_link_report_every_second(grounded: Flight) -> None:
+async def test_link_report_is_published_every_second(grounded: Flight) -> None:
     await anyio.sleep(1.5)
     with grounded.vehicle.subscribe(LinkReport, capacity=20) as events:
         await anyio.sleep(5.05)
@@ -197,7 +197,7 @@ async def test_loss_is_measured(grounded: Flight) -> None:
     assert sum(loss or 0.0 for loss in losses) / len(losses) == pytest.approx(30.0, abs=6.0)
 
 
-async def test_a_single_lost_frame_is_seen(grounded: Flight) -> None:
+async def test_single_lost_frame_is_counted(grounded: Flight) -> None:
     received, lost = grounded.vehicle.connection.counts(1)
     grounded.copter.faults.drop_outgoing = 1
     await anyio.sleep(2.0)
@@ -205,43 +205,43 @@ async def test_a_single_lost_frame_is_seen(grounded: Flight) -> None:
     assert grounded.vehicle.connection.counts(1)[0] > received
 
 
-async def test_a_link_on_which_nothing_comes_has_no_loss_to_tell(grounded: Flight) -> None:
+async def test_link_report_without_traffic_has_no_loss(grounded: Flight) -> None:
     grounded.copter.faults.silent = True
     await anyio.sleep(3.0)
     report = grounded.vehicle.link_quality.value
     assert (report.loss_percent, report.frames_per_s) == (None, 0.0)
 
 
-async def test_the_round_trip_is_measured() -> None:
+async def test_round_trip_is_measured() -> None:
     async with open_flight(latency_s=0.15) as flight:
         await anyio.sleep(6.0)
         assert flight.vehicle.link_quality.value.round_trip_s == pytest.approx(0.3, abs=0.001)
 
 
-async def test_answers_to_another_program_are_not_our_round_trip() -> None:
+async def test_timesync_answers_to_others_are_no_round_trip() -> None:
     async with open_flight(latency_s=0.15) as flight:
         await anyio.sleep(6.0)
-        flight.copter.send(m.Timesync(int(5e9), int((now() - 0.01) * 1e9)))  # asked by somebody else
+        flight.copter.send(m.Timesync(int(5e9), int((now() - 0.01) * 1e9)))  # Requested by another station.
         await anyio.sleep(1.2)
         assert flight.vehicle.link_quality.value.round_trip_s == pytest.approx(0.3, abs=0.001)
 
 
-async def test_a_companion_computer_that_answers_first_does_not_take_the_vehicles_answer_away() -> None:
+async def test_timesync_answer_of_companion_first_is_ignored() -> None:
     async with open_flight(latency_s=0.15) as flight:
 
         def answer_first(question: m.Timesync, _: object) -> None:
             flight.copter.send(m.Timesync(1, question.ts1), sender=(1, 191))
 
-        flight.copter.overhear(m.Timesync, answer_first)
+        flight.copter.observe(m.Timesync, answer_first)
         with flight.vehicle.subscribe(VehicleRebooted) as reboots:
             await anyio.sleep(6.0)
-            told_at, told_ms = flight.vehicle._talk.watch._last_answer
+            told_at, told_ms = flight.vehicle._session.watch._last_answer
             assert now() - told_at < 3.0
             assert told_ms > 1000
             assert reboots.get_nowait() is None
 
 
-async def test_the_link_goes_down(grounded: Flight) -> None:
+async def test_calls_link_lost_raise(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(LinkClosed, capacity=2) as events:
         grounded.wire.lose()
         event = await events.get(timeout=1.0)
@@ -253,7 +253,7 @@ async def test_the_link_goes_down(grounded: Flight) -> None:
 # -------------------------------------------------------------------------------- a blocked loop
 
 
-async def test_a_blocked_loop_is_an_event(grounded: Flight) -> None:
+async def test_blocked_loop_publishes_event(grounded: Flight) -> None:
     with grounded.vehicle.subscribe(LoopBlocked, capacity=5) as events:
         await anyio.sleep(1.0)
         block_loop(0.2)
@@ -265,9 +265,7 @@ async def test_a_blocked_loop_is_an_event(grounded: Flight) -> None:
         assert event.seconds == pytest.approx(1.5, abs=0.15)
 
 
-async def test_a_loop_blocked_for_long_is_a_warning(
-    grounded: Flight, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_loop_blocked_for_long_logs_warning(grounded: Flight, caplog: pytest.LogCaptureFixture) -> None:
     await anyio.sleep(1.0)
     block_loop(0.5)
     await anyio.sleep(1.0)
@@ -281,7 +279,7 @@ async def test_a_loop_blocked_for_long_is_a_warning(
 
 
 class FakeShell:
-    """What IPython 9 has in its terminal."""
+    """The interface of IPython 9's terminal."""
 
     active_eventloop: str | None = None
 
@@ -302,8 +300,8 @@ async def test_terminal_ipython_without_gui_asyncio_is_named(
     assert named == ([True, True] if gui is None else [False])
 
 
-async def test_a_blocked_loop_does_not_make_the_vehicle_silent(grounded: Flight) -> None:
-    """What came meanwhile waits in the socket's buffer: it is read before anybody calls the vehicle silent."""
+async def test_blocked_loop_is_not_vehicle_silence(grounded: Flight) -> None:
+    """Messages received meanwhile wait in the socket's buffer and are read before the vehicle counts as silent."""
     with grounded.vehicle.subscribe(VehicleSilent, VehicleRebooted, capacity=5) as events:
         block_loop(10.0)
         await anyio.sleep(3.0)
@@ -313,7 +311,7 @@ async def test_a_blocked_loop_does_not_make_the_vehicle_silent(grounded: Flight)
 # --------------------------------------------------------------------------- ages and sources
 
 
-async def test_every_value_knows_when_and_from_whom_it_came(grounded: Flight) -> None:
+async def test_values_have_time_and_source(grounded: Flight) -> None:
     vehicle = grounded.vehicle
     assert vehicle.attitude.source == Source(1, 1, "ATTITUDE")
     assert vehicle.mode.source == Source(1, 1, "HEARTBEAT")
@@ -321,13 +319,13 @@ async def test_every_value_knows_when_and_from_whom_it_came(grounded: Flight) ->
     grounded.copter.faults.silent = True
     await anyio.sleep(2.5)
     assert vehicle.attitude.age == pytest.approx(2.5, abs=0.15)
-    assert vehicle.attitude.value is vehicle.attitude.latest  # old, and says so
+    assert vehicle.attitude.value is vehicle.attitude.latest  # Old, with the age to show it.
     with pytest.raises(StaleValueError, match=r"attitude is 2\.\d s old.*no ATTITUDE since"):
         vehicle.attitude.fresh(within=1.0)
     assert vehicle.attitude.fresh(within=5.0)
 
 
-async def test_what_has_not_come_is_unknown(grounded: Flight) -> None:
+async def test_missing_state_is_unknown(grounded: Flight) -> None:
     with pytest.raises(ValueUnknownError, match="range_finders is not known yet: no DISTANCE_SENSOR"):
         _ = grounded.vehicle.range_finders.value
     assert grounded.vehicle.range_finders.latest is None
@@ -335,7 +333,7 @@ async def test_what_has_not_come_is_unknown(grounded: Flight) -> None:
         await grounded.vehicle.range_finders.wait_until(lambda _: True, timeout=2.0)
 
 
-async def test_wait_until_something_has_held_for_a_while() -> None:
+async def test_wait_until_held_for() -> None:
     async with in_the_air() as flight:
         started = now()
         position = await flight.vehicle.position.wait_until(
@@ -345,7 +343,7 @@ async def test_wait_until_something_has_held_for_a_while() -> None:
         assert position.altitude_relative_m == pytest.approx(10.0, abs=0.5)
 
 
-async def test_waiting_ends_with_the_connection(grounded: Flight) -> None:
+async def test_wait_until_ends_with_connection(grounded: Flight) -> None:
     async with anyio.create_task_group() as tasks:
 
         async def unplug() -> None:
@@ -357,7 +355,7 @@ async def test_waiting_ends_with_the_connection(grounded: Flight) -> None:
             await grounded.vehicle.mode.wait_until(lambda mode: mode.name == "RTL")
 
 
-async def test_yesterdays_position_is_none_before_the_first_fix() -> None:
+async def test_stored_position_before_fix_is_ignored() -> None:
     async with open_flight(SimulatedCopter(boot_time_s=60.0)) as flight:
         await anyio.sleep(8.0)
         assert flight.vehicle.attitude.is_known

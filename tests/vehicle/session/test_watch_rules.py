@@ -1,4 +1,4 @@
-"""Reboots, silence, loss, round trips, standing still: the rules by themselves, on a clock of the test's own."""
+"""Reboots, silence, loss, round trips, order_status still: the rules by themselves, on a clock of the test's own."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import pytest
 from aerokit import Position
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.connection import Connection
-from aerokit.events import LinkReport, VehicleBack, VehicleRebooted, VehicleSilent
+from aerokit.events import LinkReport, VehicleRebooted, VehicleRecovered, VehicleSilent
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder, Framer, Message
 from aerokit.mavlink.messages import Attitude, Heartbeat, SystemTime, Timesync
-from aerokit.vehicle.commanding.context import Bridge
-from aerokit.vehicle.commanding.progress import Stillness
+from aerokit.vehicle.commanding.context import VehicleContext
+from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.setpoints import (
     FAR,
     SLOW_M_S,
@@ -27,7 +27,7 @@ from aerokit.vehicle.commanding.setpoints import (
     VelocitySetpoint,
     wants_motion,
 )
-from aerokit.vehicle.session.session import Talk
+from aerokit.vehicle.session.session import VehicleSession
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.movement import LocalPosition
 
@@ -35,7 +35,7 @@ HEARTBEAT = Heartbeat(2, 3, 81, 0, 3)
 
 
 class Bus:
-    """Gives frames and messages to who is attached, as the real one does."""
+    """Delivers frames and messages to attached sinks, as the real bus does."""
 
     def __init__(self) -> None:
         self.sinks: dict[type[Any], list[Callable[[Any], object]]] = {}
@@ -48,9 +48,7 @@ class Bus:
 
     attach_event = attach
 
-    def attach_frames(
-        self, kind: type[Any], taker: Callable[[Any], object], **_: object
-    ) -> Callable[[], None]:
+    def attach_frames(self, kind: type[Any], taker: Callable[[Any], object], **_: object) -> Callable[[], None]:
         self.takers.setdefault(kind, []).append(taker)
         return lambda: self.takers[kind].remove(taker)
 
@@ -59,7 +57,7 @@ class Bus:
 
 
 class Stage:
-    """A connection that is none, and what a vehicle says on it."""
+    """A fake connection, and the messages of a vehicle on it."""
 
     def __init__(self) -> None:
         self.at, self.counted, self.bytes = 0.0, (0, 0), 0
@@ -115,7 +113,7 @@ class Watched(Stage):
         return self.watch.reboots
 
 
-def test_an_earlier_time_that_runs_is_a_reboot() -> None:
+def test_decreased_running_time_is_reboot() -> None:
     stage = Watched()
     stage.clock(100_000)
     assert stage.clock(50) == 0
@@ -125,14 +123,14 @@ def test_an_earlier_time_that_runs_is_a_reboot() -> None:
     assert (stage.reboots_told, stage.told()[VehicleRebooted]) == (1, 1)
 
 
-def test_a_time_that_is_earlier_by_three_seconds_is_a_late_message() -> None:
+def test_time_three_seconds_earlier_is_late_message() -> None:
     stage = Watched()
     stage.clock(100_000)
     for boot_ms in (97_000, 97_100, 97_200, 97_400):
         assert stage.clock(boot_ms) == 0
 
 
-def test_late_messages_of_different_times_are_no_reboot() -> None:
+def test_late_messages_with_different_times_are_no_reboot() -> None:
     stage = Watched()
     for seconds in range(100, 130):
         stage.clock(seconds * 1000, after=1.0)
@@ -140,8 +138,8 @@ def test_late_messages_of_different_times_are_no_reboot() -> None:
             assert stage.clock(seconds * 1000 - 8000, after=0.0) == 0
 
 
-def test_of_several_earlier_times_the_earliest_has_to_run() -> None:
-    """Late messages may tell of another time than the rebooted vehicle does."""
+def test_several_decreased_times_earliest_must_persist() -> None:
+    """Late messages may have another time than those of the rebooted vehicle."""
     stage = Watched()
     stage.clock(100_000)
     assert stage.clock(90_000) == 0
@@ -150,7 +148,7 @@ def test_of_several_earlier_times_the_earliest_has_to_run() -> None:
     assert stage.clock(350, after=0.21) == 1
 
 
-def test_an_earlier_time_that_is_told_twice_runs_from_the_first_time_on() -> None:
+def test_decreased_time_repeated_counts_from_first() -> None:
     stage = Watched()
     stage.clock(100_000)
     assert stage.clock(50) == 0
@@ -158,14 +156,14 @@ def test_an_earlier_time_that_is_told_twice_runs_from_the_first_time_on() -> Non
     assert stage.clock(300, after=0.1) == 1
 
 
-def test_an_earlier_time_that_stands_still_is_no_reboot() -> None:
+def test_decreased_constant_time_is_no_reboot() -> None:
     stage = Watched()
     stage.clock(100_000)
     for _ in range(20):
         assert stage.clock(5000) == 0
 
 
-def test_other_components_tell_nothing_of_the_autopilot() -> None:
+def test_messages_of_other_components_are_ignored() -> None:
     stage = Watched()
     stage.clock(100_000)
     stage.hear(Timesync(100_000_000_000, 5))
@@ -177,7 +175,7 @@ def test_other_components_tell_nothing_of_the_autopilot() -> None:
     assert stage.watch.reboots == 0
 
 
-def test_the_boot_clock_goes_on_between_messages() -> None:
+def test_boot_time_is_extrapolated() -> None:
     stage = Watched()
     clock = stage.boot_clocks[1, 1]
     assert clock(0.0) is None
@@ -190,7 +188,7 @@ def test_the_boot_clock_goes_on_between_messages() -> None:
     assert stage.boot_clocks == {}
 
 
-def test_a_reboot_that_was_ordered_is_seen_at_once() -> None:
+def test_ordered_reboot_is_detected_immediately() -> None:
     stage = Watched()
     stage.clock(3000)
     with stage.watch.expecting_reboot():
@@ -200,7 +198,7 @@ def test_a_reboot_that_was_ordered_is_seen_at_once() -> None:
     assert stage.clock(7200, after=10.0) == 1
 
 
-def test_a_question_tells_no_time() -> None:
+def test_timesync_request_of_vehicle_is_ignored() -> None:
     stage = Watched()
     stage.hear(Timesync(100_000_000_000, 5))
     with stage.watch.expecting_reboot():
@@ -209,27 +207,27 @@ def test_a_question_tells_no_time() -> None:
     assert stage.watch.reboots == 0
 
 
-def test_an_answer_with_an_earlier_time_is_a_reboot_unless_it_was_asked_before() -> None:
+def test_timesync_earlier_time_is_reboot_if_requested_later() -> None:
     stage = Watched()
     stage.at = 10.0
-    stage.watch.note_answer(9.9, 5000)
+    stage.watch.on_time_answer(9.9, 5000)
     stage.at = 11.0
-    stage.watch.note_answer(10.0, 4000)  # asked when the other one had not come yet
+    stage.watch.on_time_answer(10.0, 4000)  # asked when the other one had not come yet
     assert stage.watch.reboots == 0
-    stage.watch.note_answer(10.5, 5000)
+    stage.watch.on_time_answer(10.5, 5000)
     assert stage.watch.reboots == 0
     stage.at = 12.0
-    stage.watch.note_answer(11.5, 4999)
+    stage.watch.on_time_answer(11.5, 4999)
     assert stage.watch.reboots == 1
     stage.at = 13.0
-    stage.watch.note_answer(12.5, 0)  # of its first millisecond: the same reboot
+    stage.watch.on_time_answer(12.5, 0)  # of its first millisecond: the same reboot
     assert stage.watch.reboots == 1
 
 
 # ----------------------------------------------------------------------------------- silence
 
 
-def test_silence_is_told_once_after_three_and_a_half_seconds_and_its_end() -> None:
+def test_silence_event_is_published_once_after_limit() -> None:
     stage = Watched()
     for at, silent in ((3.5, False), (3.6, True), (9.0, True)):
         stage.at = at
@@ -238,8 +236,8 @@ def test_silence_is_told_once_after_three_and_a_half_seconds_and_its_end() -> No
     for component_id, silent in ((154, True), (1, False)):
         stage.hear(HEARTBEAT, component_id=component_id)
         assert stage.watch.is_silent is silent
-    assert (stage.told()[VehicleSilent], stage.told()[VehicleBack]) == (1, 1)
-    (back,) = [each for each in stage.bus.published if isinstance(each, VehicleBack)]
+    assert (stage.told()[VehicleSilent], stage.told()[VehicleRecovered]) == (1, 1)
+    (back,) = [each for each in stage.bus.published if isinstance(each, VehicleRecovered)]
     assert back.silent_for_s == 9.0
 
 
@@ -250,12 +248,10 @@ class Measured(Stage):
     def __init__(self) -> None:
         super().__init__()
         self.reports, self.answers = list[LinkReport](), list[tuple[float, int]]()
-        self.watch = LinkWatch(
-            self.connection, 1, 1, self.reports.append, lambda *each: self.answers.append(each)
-        )
+        self.watch = LinkWatch(self.connection, 1, 1, self.reports.append, lambda *each: self.answers.append(each))
 
-    def ask(self) -> Timesync:
-        self.watch.ask()
+    def request_time(self) -> Timesync:
+        self.watch.request_time()
         question = self.sent[-1]
         assert isinstance(question, Timesync)
         return question
@@ -266,10 +262,10 @@ class Measured(Stage):
         return self.reports[-1]
 
 
-def test_a_round_trip_is_that_of_the_first_answer_to_our_question() -> None:
+def test_round_trip_uses_first_answer() -> None:
     stage = Measured()
     stage.at = 5.0
-    question = stage.ask()
+    question = stage.request_time()
     assert (question.tc1, question.ts1) == (0, 5_000_000_000)
     answer = Timesync(77_000_000, question.ts1)
     stage.at = 5.1
@@ -296,17 +292,17 @@ def test_loss_and_rates_of_a_second() -> None:
     assert (report.loss_percent, report.frames_per_s) == (100.0, 0.0)
 
 
-# ------------------------------------------------------------------------------- standing still
+# ------------------------------------------------------------------------------- order_status still
 
 
 class Standing:
     def __init__(self) -> None:
         self.at = 0.0
         self.cell = StateCell[Position]("position", lambda: self.at, "GLOBAL_POSITION_INT")
-        talk = SimpleNamespace(
+        session = SimpleNamespace(
             connection=SimpleNamespace(now=lambda: self.at), telemetry=SimpleNamespace(position=self.cell)
         )
-        self.stillness = Stillness(cast("Talk", talk))
+        self.stillness = StallDetector(cast("VehicleSession", session))
 
     def tell(self, place: Position | None, at: float) -> str | None:
         self.at = at
@@ -319,11 +315,11 @@ HERE = Position(47.0, 8.0)
 
 
 @pytest.mark.parametrize("altitudes", [{}, {"altitude_relative_m": 5.0}, {"altitude_amsl_m": 5.0}])
-def test_who_stands_for_twelve_seconds_does_not_move(altitudes: dict[str, float]) -> None:
-    standing, here = Standing(), Position(47.0, 8.0, **altitudes)
+def test_stall_detector_reports_after_twelve_seconds(altitudes: dict[str, float]) -> None:
+    order_status, here = Standing(), Position(47.0, 8.0, **altitudes)
     for at in range(12):
-        assert standing.tell(here, float(at)) is None
-    assert standing.tell(here, 12.0) == "it has accepted the order and not moved for 12 s"
+        assert order_status.tell(here, float(at)) is None
+    assert order_status.tell(here, 12.0) == "it accepted the order and has not moved for 12 s"
 
 
 @pytest.mark.parametrize(
@@ -336,29 +332,29 @@ def test_who_stands_for_twelve_seconds_does_not_move(altitudes: dict[str, float]
         (Position(47.0, 8.0, altitude_relative_m=5.29), False),
     ],
 )
-def test_who_moves_by_a_foot_moves(further: Position, moves: bool) -> None:
-    standing = Standing()
+def test_stall_detector_small_movement_counts(further: Position, moves: bool) -> None:
+    order_status = Standing()
     here = HERE if further.altitude_relative_m is None else HERE.replace(altitude_relative_m=5.0)
     for at in range(12):
-        standing.tell(here, float(at))
-    assert (standing.tell(further, 12.0) is None) is moves
-    assert (standing.tell(further, 23.0) is None) is moves
+        order_status.tell(here, float(at))
+    assert (order_status.tell(further, 12.0) is None) is moves
+    assert (order_status.tell(further, 23.0) is None) is moves
 
 
-def test_without_a_position_of_the_last_two_seconds_nothing_is_known() -> None:
-    standing = Standing()
-    assert standing.tell(None, 0.0) is None
-    assert standing.tell(HERE, 1.0) is None
-    assert standing.tell(None, 3.1) is None
+def test_position_older_than_two_seconds_is_unknown() -> None:
+    order_status = Standing()
+    assert order_status.tell(None, 0.0) is None
+    assert order_status.tell(HERE, 1.0) is None
+    assert order_status.tell(None, 3.1) is None
     for at in range(4, 16):
-        assert standing.tell(HERE, float(at)) is None
-    assert standing.tell(None, 17.0) is not None
-    assert standing.tell(None, 17.1) is None
+        assert order_status.tell(HERE, float(at)) is None
+    assert order_status.tell(None, 17.0) is not None
+    assert order_status.tell(None, 17.1) is None
 
 
 @pytest.mark.parametrize(("speed_m_s", "wanted"), [(SLOW_M_S, True), (0.99 * SLOW_M_S, False)])
-def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bool) -> None:
-    nobody = cast("Bridge", None)  # a velocity alone says it
+def test_stall_velocity_threshold(speed_m_s: float, wanted: bool) -> None:
+    nobody = cast("VehicleContext", None)  # A velocity needs no context.
     assert wants_motion(VelocitySetpoint(east_m_s=speed_m_s), nobody) is wanted
     assert wants_motion(BodyVelocitySetpoint(right_m_s=speed_m_s), nobody) is wanted
 
@@ -366,23 +362,23 @@ def test_who_is_told_to_move_at_0_3_m_s_should_move(speed_m_s: float, wanted: bo
 @pytest.mark.parametrize(
     ("away_m", "wanted"), [(0.0, False), (3.0, False), (3.1, True), (1e7, True), (math.inf, False)]
 )
-def test_who_is_told_a_place_on_earth_moves_when_it_is_far(away_m: float, wanted: bool) -> None:
-    talk = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR))
+def test_stall_global_position_requires_distance(away_m: float, wanted: bool) -> None:
+    session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR))
     where = SimpleNamespace(distance_to=lambda _: away_m)  # infinite while the position is unknown
-    bridge = cast("Bridge", SimpleNamespace(talk=talk, where=where))
-    assert wants_motion(PositionSetpoint(HERE), bridge) is wanted
+    context = cast("VehicleContext", SimpleNamespace(session=session, vehicle_position=where))
+    assert wants_motion(PositionSetpoint(HERE), context) is wanted
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("off_m", "wanted"), [(0.0, False), (2.9, False), (3.1, True), (-3.1, True)])
-def test_who_is_told_a_place_moves_when_it_is_far(axis: int, off_m: float, wanted: bool) -> None:
-    """By what it is away from where it is, along each axis."""
+def test_stall_local_position_requires_distance(axis: int, off_m: float, wanted: bool) -> None:
+    """By the distance along each axis."""
     here = LocalPosition(-5.0, 7.0, -10.0, 0.0, 0.0, 0.0)
     telemetry = SimpleNamespace(local_position=SimpleNamespace(latest=here))
-    talk = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR), telemetry=telemetry)
+    session = SimpleNamespace(autopilot=SimpleNamespace(arrival_radius_m=3.0 / FAR), telemetry=telemetry)
     place = [here.north_m, here.east_m, here.down_m]
     place[axis] += off_m
-    bridge = cast("Bridge", SimpleNamespace(talk=talk))
-    assert wants_motion(LocalPositionSetpoint(*place), bridge) is wanted
+    context = cast("VehicleContext", SimpleNamespace(session=session))
+    assert wants_motion(LocalPositionSetpoint(*place), context) is wanted
     telemetry.local_position.latest = None
-    assert wants_motion(LocalPositionSetpoint(*place), bridge) is False
+    assert wants_motion(LocalPositionSetpoint(*place), context) is False

@@ -1,4 +1,4 @@
-"""What each message says of a vehicle, for many values of its fields."""
+"""Decoded state values of each message, for many field values."""
 
 from __future__ import annotations
 
@@ -22,14 +22,12 @@ HEARTBEATS = {
 
 
 def test_message_updates_only_declared_states() -> None:
-    faults = [
-        fault for name in sorted(SOURCES) for vehicle in HEARTBEATS for fault in faults_of(name, vehicle)
-    ]
+    faults = [fault for name in sorted(SOURCES) for vehicle in HEARTBEATS for fault in faults_of(name, vehicle)]
     assert not faults, "\n".join(faults)
 
 
 def faults_of(name: str, vehicle: str) -> Iterator[str]:
-    """What is wrong with the states that a message of any content updates."""
+    """Return the invalid states after a message with any content."""
     dice, kind = random.Random(name), message_type(name)
     declared = {state.name for state, _ in SOURCES[name]}
     for _ in range(12):

@@ -1,7 +1,7 @@
-"""Flights of real firmwares: what the cells said is believable, and agrees with pymavlink at the end.
+"""Flights of real firmware: the cells' values are plausible, and agree with pymavlink at the end.
 
-The recordings are those beside the project (``../shared/traces``) when they are there, else the project's own, which
-hold the telling parts of two of these flights; a flight that is in neither is skipped.
+Uses the recordings beside the project (``../shared/traces``) if present, else the project's own, which contain the
+essential parts of two of these flights; a flight in neither is skipped.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def test_plane(flights: Flights) -> None:
     assert flight.armed == [False, True, False]
     assert flight.landed == [1, 2, 1]
     assert flight.highest_m == pytest.approx(70, abs=2)
-    assert flight.farthest_m < 2000  # it said to be near 0°N 0°E before its first fix
+    assert flight.farthest_m < 2000  # It reported a place near 0°N 0°E before its first fix.
     assert flight.telemetry.air_speed_m_s.is_known
 
 
@@ -151,7 +151,7 @@ def test_px4(flights: Flights) -> None:
 
 
 def theirs(flight: Flight) -> dict[str, Any]:
-    """The last message of each kind, as pymavlink reads it, but for kinds that it does not know."""
+    """Return the last message of each kind as decoded by pymavlink, except for kinds that pymavlink lacks."""
 
     def decoded() -> Iterator[tuple[str, Any]]:
         for name, raw in flight.last_frames.items():
@@ -165,7 +165,7 @@ def theirs(flight: Flight) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", SYSTEM_IDS)
-def test_the_last_values_are_pymavlinks(flights: Flights, name: str) -> None:
+def test_last_values_match_pymavlink(flights: Flights, name: str) -> None:
     flight = flights(name)
     telemetry, last = flight.telemetry, theirs(flight)
     fix = last["GLOBAL_POSITION_INT"]
@@ -186,14 +186,14 @@ def test_the_last_values_are_pymavlinks(flights: Flights, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ardupilot-copter", "ardupilot-plane", "ardupilot-rover"])
-def test_the_last_attitude_of_ardupilot_is_pymavlinks(flights: Flights, name: str) -> None:
+def test_ardupilot_last_attitude_matches_pymavlink(flights: Flights, name: str) -> None:
     flight = flights(name)
     attitude, theirs_ = flight.telemetry.attitude.value, theirs(flight)["ATTITUDE"]
     assert attitude.roll_deg == pytest.approx(math.degrees(theirs_.roll))
     assert attitude.yaw_rate_deg_s == pytest.approx(math.degrees(theirs_.yawspeed))
 
 
-def test_the_last_attitude_of_px4_is_pymavlinks(flights: Flights) -> None:
+def test_px4_last_attitude_matches_pymavlink(flights: Flights) -> None:
     quaternion = theirs(flights("px4-quad"))["ATTITUDE_QUATERNION"]
     telemetry = flights("px4-quad").telemetry
     assert telemetry.attitude.source is not None
@@ -205,7 +205,7 @@ def test_the_last_attitude_of_px4_is_pymavlinks(flights: Flights) -> None:
 
 
 @pytest.mark.parametrize("name", SYSTEM_IDS)
-def test_every_cell_that_is_known_says_who_told_it(flights: Flights, name: str) -> None:
+def test_known_cells_have_source(flights: Flights, name: str) -> None:
     telemetry = flights(name).telemetry
     for cell in telemetry.cells.values():
         if cell.is_known:

@@ -13,13 +13,13 @@ from aerokit.mavlink import messages
 from aerokit.mavlink.enums import MavPowerStatus
 from aerokit.vehicle.session.rates import subscription_rate_hz
 from aerokit.vehicle.state.equipment import Power
-from aerokit.vehicle.state.field import By, Told
+from aerokit.vehicle.state.field import MessageSource, StateField
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, STATES
 from aerokit.vehicle.state.table import documentation, rendered
 from aerokit.vehicle.state.telemetry import Telemetry
 
 
-def test_rate_of_a_subscription_is_the_default_of_its_message() -> None:
+def test_subscription_rate_defaults_to_message_rate() -> None:
     assert DEFAULT_RATES_HZ["Attitude"] > 4.0
     kinds = (messages.Attitude, messages.RawImu, messages.Odometry, messages.Statustext)
     rates = [subscription_rate_hz(kind) for kind in kinds]
@@ -33,22 +33,20 @@ def test_power() -> None:
     assert telemetry.power.value == Power(5.012, None, MavPowerStatus.BRICK_VALID)
 
 
-def test_a_declaration_that_cannot_be_right_is_an_error_at_once() -> None:
+def test_state_field_invalid_declaration_raises() -> None:
     with pytest.raises(ValueError, match="needs a message"):
-        Told[int]()
+        StateField[int]()
     with pytest.raises(ValueError, match="Heartbeet is no message class"):
-        By("Heartbeet", lambda message: 1)
+        MessageSource("Heartbeet", lambda message: 1)
 
 
 @for_each("name", STATES)
-def test_both_vehicles_have_it_and_it_is_documented(name: str) -> None:
+def test_states_are_on_both_vehicle_classes_and_documented(name: str) -> None:
     assert hasattr(aerokit.Vehicle, name)
     assert hasattr(aerokit.sync.Vehicle, name)
     assert documentation()[name][1].endswith(".")
 
 
-def test_the_page_is_that_of_the_declarations() -> None:
+def test_states_page_is_current() -> None:
     page = Path(__file__).parents[3] / "docs" / "states.md"
-    assert page.read_text(encoding="utf-8") == rendered(), (
-        "python -m aerokit.vehicle.state.table > docs/states.md"
-    )
+    assert page.read_text(encoding="utf-8") == rendered(), "python -m aerokit.vehicle.state.table > docs/states.md"

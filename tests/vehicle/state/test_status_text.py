@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 from aerokit.mavlink import STANDARD, Frame, FrameEncoder
 from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.state.condition import StatusText
-from aerokit.vehicle.state.status_text import LONGEST, MOST_OPEN, StatusTextAssembler
+from aerokit.vehicle.state.status_text import MAX_CHUNKS, MAX_OPEN, StatusTextAssembler
 
-LONG = (
-    "A text much longer than the fifty characters which fit into one STATUSTEXT message, and then some more."
-)
+LONG = "A text much longer than the fifty characters which fit into one STATUSTEXT message, and then some more."
 
 
 def chunks(text: str, number: int = 1, severity: int = 4) -> list[Statustext]:
@@ -34,45 +32,40 @@ def _received(message: Statustext, text: bytes) -> Statustext:
     return Statustext.decode(bytes(payload), Frame.parse(header + bytes(payload)))
 
 
-def test_single_text_with_trailing_tabs() -> None:
+def test_status_text_trailing_tabs_are_removed() -> None:
     texts = StatusTextAssembler()
     assert texts.receive(Statustext(6, "Armed by external command\t"), 3.0) == [
         StatusText(6, "Armed by external command", 3.0)
     ]
 
 
-def test_chunks_are_joined() -> None:
+def test_status_text_chunks_are_joined() -> None:
     texts = StatusTextAssembler()
     told = [text for each in chunks(LONG) for text in texts.receive(each, 1.0)]
     assert told == [StatusText(4, LONG, 1.0)]
 
 
-def test_a_text_that_fills_its_chunks_ends_with_an_empty_one() -> None:
+def test_status_text_full_chunks_end_with_empty_chunk() -> None:
     texts = StatusTextAssembler()
     told = [text.text for each in chunks("x" * 100) for text in texts.receive(each, 1.0)]
     assert told == ["x" * 100]
 
 
 @given(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=300))
-def test_every_text_survives_its_chunks(text: str) -> None:
+def test_status_text_round_trip_any_text(text: str) -> None:
     texts = StatusTextAssembler()
     told = [each.text for chunk in chunks(text) for each in texts.receive(chunk, 0.0)]
     assert told == [text.rstrip()]
 
 
-def test_texts_of_two_components_and_ids_do_not_mix() -> None:
+def test_status_texts_of_components_and_ids_are_separate() -> None:
     texts = StatusTextAssembler()
     first, second = chunks(LONG, 1), chunks(LONG.upper(), 2)
-    told = [
-        text.text
-        for pair in zip(first, second, strict=True)
-        for each in pair
-        for text in texts.receive(each, 0.0)
-    ]
+    told = [text.text for pair in zip(first, second, strict=True) for each in pair for text in texts.receive(each, 0.0)]
     assert told == [LONG, LONG.upper()]
 
 
-def test_a_missing_chunk_is_marked() -> None:
+def test_status_text_chunk_missing_is_marked() -> None:
     texts = StatusTextAssembler()
     first, _, last = chunks(LONG)
     assert texts.receive(first, 0.0) == []
@@ -80,13 +73,13 @@ def test_a_missing_chunk_is_marked() -> None:
     assert text.text == LONG[:50] + "…" + LONG[100:]
 
 
-def test_a_missing_beginning_is_marked() -> None:
+def test_status_text_first_chunk_missing_is_marked() -> None:
     texts = StatusTextAssembler()
     (text,) = texts.receive(chunks(LONG)[2], 0.1)
     assert text.text == "…" + LONG[100:]
 
 
-def test_a_missing_end_is_told_after_two_seconds() -> None:
+def test_status_text_end_missing_is_delivered_after_two_seconds() -> None:
     texts = StatusTextAssembler()
     texts.receive(chunks(LONG)[0], 0.0)
     assert texts.expire(2.0) == []
@@ -95,7 +88,7 @@ def test_a_missing_end_is_told_after_two_seconds() -> None:
 
 
 @pytest.mark.anyio
-async def test_a_vehicle_that_says_nothing_more_is_not_waited_for() -> None:
+async def test_why_not_armable_silent_vehicle_returns_promptly() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
         begin = now()
@@ -105,7 +98,7 @@ async def test_a_vehicle_that_says_nothing_more_is_not_waited_for() -> None:
         assert text.startswith(LONG[:50])
 
 
-def test_a_new_text_with_the_same_id_cuts_the_old_one_off() -> None:
+def test_status_text_id_reused_ends_previous_text() -> None:
     texts = StatusTextAssembler()
     texts.receive(chunks(LONG)[0], 0.0)
     texts.receive(chunks(LONG)[1], 0.0)
@@ -113,7 +106,7 @@ def test_a_new_text_with_the_same_id_cuts_the_old_one_off() -> None:
     assert told == [LONG[:100].rstrip() + "…", "Another " + LONG]
 
 
-def test_a_repeated_chunk_is_taken_once() -> None:
+def test_status_text_repeated_chunk_is_used_once() -> None:
     texts = StatusTextAssembler()
     told = [text.text for each in chunks(LONG) for _ in range(2) for text in texts.receive(each, 0.0)]
     assert told[0] == LONG
@@ -129,37 +122,33 @@ def test_recent_texts_by_time() -> None:
     assert texts.recent() == ()
 
 
-def test_garbage_does_not_pile_up() -> None:
+def test_invalid_chunks_do_not_accumulate() -> None:
     texts = StatusTextAssembler()
     for number in range(1, 1000):
         texts.receive(chunks("y" * 120, number)[0], 0.0)
-    assert len(texts._open) == MOST_OPEN
+    assert len(texts._open) == MAX_OPEN
     for seq in range(100):
         texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0)
-    assert len(texts._open) <= MOST_OPEN
+    assert len(texts._open) <= MAX_OPEN
 
 
-def test_sixteen_texts_may_be_under_way_and_the_first_makes_room_for_another_one() -> None:
+def test_status_text_open_limit_drops_oldest() -> None:
     texts = StatusTextAssembler()
-    for number in range(1, MOST_OPEN + 2):
+    for number in range(1, MAX_OPEN + 2):
         texts.receive(chunks("y" * 70, number)[0], 0.0)
     told = [text.text for number in (2, 1) for text in texts.receive(chunks("y" * 70, number)[1], 0.1)]
     assert told == ["y" * 70, "…" + "y" * 20]
 
 
-def test_a_text_has_twenty_chunks_at_most() -> None:
+def test_status_text_is_limited_to_twenty_chunks() -> None:
     texts = StatusTextAssembler()
-    told = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(LONGEST)]
-    assert told[:-1] == [[]] * (LONGEST - 1)
-    assert told[-1] == [StatusText(6, "z" * 50 * LONGEST, 0.0)]
+    told = [texts.receive(_received(Statustext(6, "", 7, seq), b"z" * 50), 0.0) for seq in range(MAX_CHUNKS)]
+    assert told[:-1] == [[]] * (MAX_CHUNKS - 1)
+    assert told[-1] == [StatusText(6, "z" * 50 * MAX_CHUNKS, 0.0)]
 
 
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 3), st.integers(0, 5), st.binary(max_size=50), st.floats(0, 1)), max_size=40
-    )
-)
-def test_any_sequence_of_chunks_is_taken(sequence: list[tuple[int, int, bytes, float]]) -> None:
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 5), st.binary(max_size=50), st.floats(0, 1)), max_size=40))
+def test_status_text_any_chunk_sequence_is_processed(sequence: list[tuple[int, int, bytes, float]]) -> None:
     texts = StatusTextAssembler()
     now = 0.0
     for number, seq, data, step in sequence:
@@ -170,7 +159,7 @@ def test_any_sequence_of_chunks_is_taken(sequence: list[tuple[int, int, bytes, f
     assert not texts._open
 
 
-def test_severity_in_words() -> None:
+def test_severity_names() -> None:
     assert str(StatusText(2, "Preflight Fail: Yaw")) == "CRITICAL: Preflight Fail: Yaw"
     assert StatusText(3, "").is_error
     assert not StatusText(4, "").is_error
@@ -182,11 +171,11 @@ def test_empty_texts(text: str) -> None:
     assert [each.text for each in StatusTextAssembler().receive(Statustext(6, text), 0.0)] == [""]
 
 
-def test_the_standard_dialect_knows_the_message() -> None:
+def test_every_state_message_is_in_standard_dialect() -> None:
     assert STANDARD[253] is Statustext
 
 
-def test_another_text_with_the_last_number_is_no_repetition_nor_is_the_same_text_further_back() -> None:
+def test_status_text_repetition_requires_same_text_and_sequence() -> None:
     """Only the last chunk once more is a frame that came by another way."""
     texts = StatusTextAssembler()
     first, second, other = chunks("a" * 50 + "b" * 50 + "c")[:2] + chunks("a" * 50 + "d" * 50)[1:2]

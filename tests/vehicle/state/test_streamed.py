@@ -1,4 +1,4 @@
-"""Streamed messages are worked out when somebody looks, and nobody can tell."""
+"""Streamed messages are decoded on access, without a visible difference."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ ANYTHING: dict[str, Message] = {
     "Attitude": messages.Attitude(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0),
     "AttitudeQuaternion": messages.AttitudeQuaternion(0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     "LocalPositionNed": messages.LocalPositionNed(0, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3),
-    "GlobalPositionInt": messages.GlobalPositionInt(
-        0, 473977000, 85456000, 498000, 10000, 100, -200, 50, 9000
-    ),
+    "GlobalPositionInt": messages.GlobalPositionInt(0, 473977000, 85456000, 498000, 10000, 100, -200, 50, 9000),
     "RcChannels": messages.RcChannels(0, 8, **CHANNELS, rssi=200),
     "ServoOutputRaw": messages.ServoOutputRaw(0, 0, *[1500] * 8),
     "MissionCurrent": messages.MissionCurrent(2),
@@ -82,7 +80,7 @@ def take(telemetry: Telemetry, message: Message, at: float, component_id: int = 
 
 
 @pytest.mark.parametrize("name", LAZY)
-def test_the_table_names_every_cell_that_a_message_changes(telemetry: Telemetry, name: str) -> None:
+def test_table_lists_every_cell_of_message(telemetry: Telemetry, name: str) -> None:
     telemetry.receive(ANYTHING.get(name) or ones(message_type(name)))
     changed = {cell.name for cell in telemetry.cells.values() if cell.is_known}
     assert changed == {told.name for told, _ in SOURCES[name]}
@@ -91,14 +89,14 @@ def test_the_table_names_every_cell_that_a_message_changes(telemetry: Telemetry,
 @pytest.mark.parametrize(
     ("name", "field"), [("ServoOutputRaw", "port"), ("DistanceSensor", "id"), ("BatteryStatus", "id")]
 )
-def test_which_one_of_several_is_read_where_it_is(name: str, field: str) -> None:
+def test_instance_field_is_read_from_payload(name: str, field: str) -> None:
     message = ANYTHING[name]
     fields = {each.name: getattr(message, each.name) for each in message.FIELDS}
     body = frame_of(message_type(name)(**{**fields, field: 201})).body
     assert body[9 + offset_of(message_type(name), field)] == 201
 
 
-def test_what_nobody_looks_at_waits(telemetry: Telemetry, clock: Clock) -> None:
+def test_unread_value_is_not_decoded(telemetry: Telemetry, clock: Clock) -> None:
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
     take(telemetry, messages.Attitude(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0), 100.0)
     assert not stream.pending, "the first is worked out at once: everybody can see that it is known"
@@ -112,12 +110,12 @@ def test_what_nobody_looks_at_waits(telemetry: Telemetry, clock: Clock) -> None:
     assert telemetry.attitude.value.roll_deg == pytest.approx(17.19, abs=0.01)
 
 
-def test_other_components_say_nothing(telemetry: Telemetry) -> None:
+def test_status_texts_of_other_components_are_ignored(telemetry: Telemetry) -> None:
     take(telemetry, ANYTHING["Attitude"], 100.0, component_id=154)
     assert not telemetry.attitude.is_known
 
 
-def test_whoever_observes_sees_each(telemetry: Telemetry) -> None:
+def test_observers_see_every_frame(telemetry: Telemetry) -> None:
     take(telemetry, messages.VfrHud(3.0, 4.0, 10, 50, 20.0, 0.5), 100.0)
     take(telemetry, messages.VfrHud(3.0, 5.0, 10, 50, 20.0, 0.5), 100.1)
     seen: list[tuple[float | None, float]] = []
@@ -131,17 +129,15 @@ def test_whoever_observes_sees_each(telemetry: Telemetry) -> None:
     assert telemetry.ground_speed_m_s.value == 9.0
 
 
-def test_two_batteries_wait_side_by_side(telemetry: Telemetry) -> None:
+def test_pending_frames_of_two_batteries_are_kept(telemetry: Telemetry) -> None:
     for percent in (90, 80):
         for number in (0, 1):
-            battery = messages.BatteryStatus(
-                number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent - number
-            )
+            battery = messages.BatteryStatus(number, 1, 1, 2500, (12000, *[65535] * 9), 100, 10, 10, percent - number)
             take(telemetry, battery, 100.0 + (90 - percent) / 100)
     assert [each.remaining_percent for each in telemetry.batteries.value] == [80, 79]
 
 
-def test_a_number_that_is_cut_off_is_number_0(telemetry: Telemetry) -> None:
+def test_instance_field_truncated_is_zero(telemetry: Telemetry) -> None:
     """MAVLink 2 cuts off the zeros at the end of a message."""
     at = offset_of(messages.ServoOutputRaw, "port")
     for first, ninth in ((1100, 0), (1200, 1500), (1300, 0)):
@@ -157,8 +153,8 @@ def battery(number: int, percent: int) -> Message:
 
 
 @pytest.mark.parametrize("ends", [0, 1, 2])
-def test_what_came_last_says_how_old_it_is(telemetry: Telemetry, clock: Clock, ends: int) -> None:
-    """One of several that is not told of any more does not make the others old."""
+def test_value_age_is_of_last_frame(telemetry: Telemetry, clock: Clock, ends: int) -> None:
+    """An instance that is no longer reported does not make the others old."""
     take(telemetry, battery(0, 80), 100.0)
     for at in range(101, 105):
         for number in range(3):
@@ -170,13 +166,13 @@ def test_what_came_last_says_how_old_it_is(telemetry: Telemetry, clock: Clock, e
     assert [each.id for each in telemetry.batteries.value] == [0, 1, 2]
 
 
-def test_as_many_as_there_are_numbers_wait_side_by_side(telemetry: Telemetry) -> None:
+def test_pending_frames_are_kept_per_instance(telemetry: Telemetry) -> None:
     for number in (0, *range(256)):
         take(telemetry, battery(number, number % 100), 100.0)
     assert [each.remaining_percent for each in telemetry.batteries.value] == [n % 100 for n in range(256)]
 
 
-def test_the_better_of_two_sources_goes_first_whatever_is_looked_at_when(telemetry: Telemetry) -> None:
+def test_better_source_wins_in_any_read_order(telemetry: Telemetry) -> None:
     for at in (100.0, 101.0):
         take(telemetry, ANYTHING["GlobalPositionInt"], at)
         take(telemetry, ANYTHING["VfrHud"], at + 0.1)
@@ -185,7 +181,7 @@ def test_the_better_of_two_sources_goes_first_whatever_is_looked_at_when(telemet
     assert telemetry.heading_deg.value == 271.0
 
 
-def test_what_nobody_looks_at_is_worked_out_every_five_seconds(telemetry: Telemetry) -> None:
+def test_unread_value_is_decoded_every_five_seconds(telemetry: Telemetry) -> None:
     streamed = telemetry.streams[messages.GlobalPositionInt.ID]
     waits = []
     for number in range(21):
@@ -194,8 +190,8 @@ def test_what_nobody_looks_at_is_worked_out_every_five_seconds(telemetry: Teleme
     assert waits == [number % 10 != 0 for number in range(21)]
 
 
-def test_a_position_without_a_fix_leaves_the_one_before(telemetry: Telemetry) -> None:
-    """Also when nobody looked: it is worked out every few seconds."""
+def test_position_without_fix_keeps_previous(telemetry: Telemetry) -> None:
+    """Also without access: it is decoded every few seconds."""
     place, nowhere = ANYTHING["GlobalPositionInt"], messages.GlobalPositionInt(0, 0, 0, 0, 0, 0, 0, 0, 9000)
     for number in range(50):
         take(telemetry, place, 100.0 + number / 4)
@@ -205,7 +201,7 @@ def test_a_position_without_a_fix_leaves_the_one_before(telemetry: Telemetry) ->
     assert 112.25 - telemetry.position.updated_at <= 5.0
 
 
-def test_a_reboot_forgets_what_waits(telemetry: Telemetry) -> None:
+def test_reboot_discards_pending_frames(telemetry: Telemetry) -> None:
     take(telemetry, ANYTHING["Wind"], 100.0)
     take(telemetry, ANYTHING["Wind"], 100.1)
     telemetry.forget()
@@ -214,7 +210,7 @@ def test_a_reboot_forgets_what_waits(telemetry: Telemetry) -> None:
     assert telemetry.wind.updated_at == 100.2
 
 
-def test_other_threads_look_while_frames_come(telemetry: Telemetry) -> None:
+def test_cells_can_be_read_by_other_threads(telemetry: Telemetry) -> None:
     """A value is always one message's, and never older than one seen before."""
     wrong: list[object] = []
     ended = threading.Event()
@@ -241,7 +237,7 @@ def test_other_threads_look_while_frames_come(telemetry: Telemetry) -> None:
     assert wrong == []
 
 
-def test_what_somebody_else_has_had_decoded_is_not_decoded_again(telemetry: Telemetry) -> None:
+def test_decoded_message_is_reused(telemetry: Telemetry) -> None:
     bus, seen = Bus(), list[Message]()
     stream = telemetry.streams[MESSAGE_IDS["Attitude"]]
     bus.attach_lazily(messages.Attitude, stream.take)

@@ -49,9 +49,7 @@ def heartbeat(
     return messages.Heartbeat(2, autopilot, base_mode, custom_mode, status)
 
 
-def global_position(
-    lat: int = 473977000, relative_alt: int = 10000, hdg: int = 9000
-) -> messages.GlobalPositionInt:
+def global_position(lat: int = 473977000, relative_alt: int = 10000, hdg: int = 9000) -> messages.GlobalPositionInt:
     return messages.GlobalPositionInt(0, lat, 85456000, 498000, relative_alt, 100, -200, 50, hdg)
 
 
@@ -73,7 +71,7 @@ def test_others_never_change_the_state(telemetry: Telemetry, system_id: int, com
     assert telemetry.texts_since(-1) == ()
 
 
-def test_the_autopilots_messages_do(telemetry: Telemetry) -> None:
+def test_messages_of_autopilot_are_processed(telemetry: Telemetry) -> None:
     message = received(heartbeat())
     assert message.received_frame is not None
     assert telemetry.accepts(message.received_frame)
@@ -84,7 +82,7 @@ def test_the_autopilots_messages_do(telemetry: Telemetry) -> None:
     assert (source.system_id, source.component_id, source.message) == (1, 1, "HEARTBEAT")
 
 
-def test_messages_that_say_nothing_are_passed_over(telemetry: Telemetry) -> None:
+def test_unrelated_messages_are_ignored(telemetry: Telemetry) -> None:
     telemetry.receive(messages.Ping(0, 0, 0, 0))
 
 
@@ -98,7 +96,7 @@ def test_heartbeat(telemetry: Telemetry) -> None:
     assert (telemetry.system_status.value, telemetry.landed_state.value) == (4, 2)
 
 
-def test_without_an_autopilot_the_first_heartbeat_tells_which_it_is(clock: Clock) -> None:
+def test_telemetry_autopilot_is_taken_from_first_heartbeat(clock: Clock) -> None:
     telemetry = Telemetry(clock)
     telemetry.receive(heartbeat(autopilot=PX4, custom_mode=50593792))
     assert telemetry.autopilot.name == "PX4"
@@ -106,9 +104,7 @@ def test_without_an_autopilot_the_first_heartbeat_tells_which_it_is(clock: Clock
     assert telemetry.wind.waits_for == "WIND_COV"
 
 
-def test_extended_state_goes_before_what_the_heartbeat_seems_to_say(
-    telemetry: Telemetry, clock: Clock
-) -> None:
+def test_landed_state_prefers_extended_sys_state(telemetry: Telemetry, clock: Clock) -> None:
     telemetry.receive(messages.ExtendedSysState(0, 3))
     telemetry.receive(heartbeat(status=4))
     assert telemetry.landed_state.value == 3
@@ -119,7 +115,7 @@ def test_extended_state_goes_before_what_the_heartbeat_seems_to_say(
     assert (telemetry.landed_state.value, telemetry.vtol_state.value) == (1, 3)
 
 
-def test_current_mode_is_heard_too(clock: Clock) -> None:
+def test_current_mode_message_updates_mode(clock: Clock) -> None:
     telemetry = vehicle(clock, PX4)
     telemetry.receive(messages.CurrentMode(5, 84148224, 84148224))
     assert not telemetry.mode.is_known
@@ -130,7 +126,7 @@ def test_current_mode_is_heard_too(clock: Clock) -> None:
     assert telemetry.mode.value.name == "RTL"
 
 
-def test_modes_the_vehicle_tells_by_itself(telemetry: Telemetry) -> None:
+def test_unsolicited_available_modes_are_used(telemetry: Telemetry) -> None:
     telemetry.receive(messages.AvailableModes(2, 1, 0, 127, 0, "Drone show"))
     telemetry.receive(messages.AvailableModes(2, 2, 0, 4, 0, "GUIDED"))
     assert telemetry.mode_names == {127: "Drone show"}
@@ -148,24 +144,22 @@ def test_global_position(telemetry: Telemetry) -> None:
     assert telemetry.heading_deg.value == 90.0
 
 
-def test_before_a_fix_there_is_a_heading_but_no_position(telemetry: Telemetry) -> None:
+def test_heading_before_fix_is_known_position_is_not(telemetry: Telemetry) -> None:
     telemetry.receive(messages.GlobalPositionInt(0, 0, 0, 12, 170, 0, 0, 0, 36000))
-    telemetry.receive(
-        messages.GlobalPositionInt(0, 3001, -1091, -220, -223, 0, 0, 0, 36000)
-    )  # seen of a plane
+    telemetry.receive(messages.GlobalPositionInt(0, 3001, -1091, -220, -223, 0, 0, 0, 36000))  # seen of a plane
     assert telemetry.heading_deg.value == 0.0
     with pytest.raises(ValueUnknownError, match="no GLOBAL_POSITION_INT with a fix"):
         _ = telemetry.position.value
     assert not telemetry.velocity.is_known
 
 
-def test_what_is_no_place_on_earth_is_unknown(telemetry: Telemetry) -> None:
+def test_invalid_position_is_unknown(telemetry: Telemetry) -> None:
     telemetry.receive(global_position(lat=2_000_000_000, hdg=U16))
     assert not telemetry.position.is_known
     assert not telemetry.heading_deg.is_known
 
 
-def test_altitude_above_home_is_unknown_while_it_is_above_the_sea(telemetry: Telemetry) -> None:
+def test_relative_altitude_before_home_is_unknown(telemetry: Telemetry) -> None:
     telemetry.receive(global_position(relative_alt=498004))
     assert telemetry.position.value.altitude_relative_m is None
     telemetry.receive(messages.HomePosition(473977000, 85456000, 0, 0, 0, 0, (1, 0, 0, 0), 0, 0, 0))
@@ -173,7 +167,7 @@ def test_altitude_above_home_is_unknown_while_it_is_above_the_sea(telemetry: Tel
     assert telemetry.position.value.altitude_relative_m == 498.0
 
 
-def test_second_best_sources_keep_quiet_after_the_best(telemetry: Telemetry, clock: Clock) -> None:
+def test_fallback_source_is_ignored_after_better_one(telemetry: Telemetry, clock: Clock) -> None:
     telemetry.receive(global_position())
     local = messages.LocalPositionNed(0, 1, 2, -3, 9, 9, 9)
     hud = messages.VfrHud(NAN, 2.0, 91, 40, 500, 0.5)
@@ -204,7 +198,7 @@ def test_attitude_from_both_messages(telemetry: Telemetry) -> None:
     assert telemetry.attitude.source.message == "ATTITUDE_QUATERNION"
 
 
-def test_home_and_origin(telemetry: Telemetry) -> None:
+def test_home_and_origin_are_decoded(telemetry: Telemetry) -> None:
     telemetry.receive(messages.HomePosition(0, 0, 0, 0, 0, 0, (1, 0, 0, 0), 0, 0, 0))
     telemetry.receive(messages.GpsGlobalOrigin(0, 0, 0))
     assert not telemetry.home.is_known
@@ -233,10 +227,8 @@ def gps(fix_type: int = 3, satellites: int = 9) -> messages.GpsRawInt:
     return messages.GpsRawInt(0, fix_type, 473977000, 85456000, 488000, 121, U16, U16, 9000, satellites)
 
 
-def test_receivers_are_told_apart(telemetry: Telemetry) -> None:
-    second = messages.Gps2Raw(
-        0, 6, 473977000, 85456000, 488000, 80, 90, 100, U16, 12, 0, 0, yaw=36000, h_acc=14
-    )
+def test_gps_receivers_are_kept_separately(telemetry: Telemetry) -> None:
+    second = messages.Gps2Raw(0, 6, 473977000, 85456000, 488000, 80, 90, 100, U16, 12, 0, 0, yaw=36000, h_acc=14)
     telemetry.receive(second)
     telemetry.receive(gps())
     first_receiver, second_receiver = telemetry.gps.value
@@ -247,7 +239,7 @@ def test_receivers_are_told_apart(telemetry: Telemetry) -> None:
     assert second_receiver.course_deg is None
 
 
-def test_a_receiver_without_a_fix_has_no_place(telemetry: Telemetry) -> None:
+def test_gps_without_fix_has_no_position(telemetry: Telemetry) -> None:
     telemetry.receive(gps(fix_type=1, satellites=255))
     (receiver,) = telemetry.gps.value
     assert (receiver.latitude_deg, receiver.altitude_amsl_m, receiver.satellites) == (None, None, None)
@@ -265,7 +257,7 @@ def battery(number: int, voltages: list[int], **fields: Any) -> messages.Battery
     return messages.BatteryStatus(number, 0, 0, voltages=cells, **values)
 
 
-def test_a_battery_without_cells_and_one_with(telemetry: Telemetry) -> None:
+def test_battery_with_and_without_cells_is_decoded(telemetry: Telemetry) -> None:
     telemetry.receive(battery(1, [4100, 4050, 4000], current_battery=1234, current_consumed=500))
     telemetry.receive(battery(0, [12600]))
     first, second = telemetry.batteries.value
@@ -277,7 +269,7 @@ def test_a_battery_without_cells_and_one_with(telemetry: Telemetry) -> None:
     assert (second.current_a, second.consumed_mah) == (12.34, 500)
 
 
-def test_more_than_ten_cells_and_more_than_65_volts(telemetry: Telemetry) -> None:
+def test_battery_with_many_cells_or_high_voltage(telemetry: Telemetry) -> None:
     telemetry.receive(battery(0, [4000] * 10, voltages_ext=(4000, 4000, 0, 0)))
     assert len(telemetry.batteries.value[0].cell_voltages_v) == 12
     telemetry.receive(battery(0, [65534, 10000]))
@@ -289,7 +281,7 @@ def sys_status(voltage: int = 12600, remaining: int = 80, health: int = 0) -> me
     return messages.SysStatus(0x10000020, 0x10000020, health, 250, voltage, 150, remaining, 0, 0, 0, 0, 0, 0)
 
 
-def test_sys_status_tells_the_battery_only_where_nobody_else_does(telemetry: Telemetry, clock: Clock) -> None:
+def test_sys_status_battery_is_fallback(telemetry: Telemetry, clock: Clock) -> None:
     telemetry.receive(sys_status())
     assert (telemetry.batteries.value[0].voltage_v, telemetry.batteries.value[0].current_a) == (12.6, 1.5)
     telemetry.receive(battery(0, [12500], battery_remaining=79))
@@ -300,7 +292,7 @@ def test_sys_status_tells_the_battery_only_where_nobody_else_does(telemetry: Tel
     assert telemetry.batteries.value[0].remaining_percent == 79
 
 
-def test_px4_says_minus_one_ampere_for_unknown(clock: Clock) -> None:
+def test_px4_current_minus_one_is_unknown(clock: Clock) -> None:
     telemetry = vehicle(clock, PX4)
     telemetry.receive(battery(0, [15300], current_battery=-100, current_consumed=-25))
     assert (telemetry.batteries.value[0].current_a, telemetry.batteries.value[0].consumed_mah) == (None, None)
@@ -320,7 +312,7 @@ def test_distance_sensors(telemetry: Telemetry) -> None:
     )
 
 
-def test_range_finder_where_there_is_no_distance_sensor(telemetry: Telemetry) -> None:
+def test_rangefinder_message_without_distance_sensor_is_used(telemetry: Telemetry) -> None:
     telemetry.receive(messages.Rangefinder(2.5, 0))
     assert (telemetry.range_finders.value[0].distance_m, telemetry.range_finders.value[0].orientation) == (
         2.5,
@@ -361,7 +353,7 @@ def test_sensors(telemetry: Telemetry) -> None:
     assert (sensors.failing, sensors.prearm_checks_pass, sensors.load_percent) == (("GPS",), False, 25.0)
 
 
-def test_estimators_of_both_autopilots(telemetry: Telemetry, clock: Clock) -> None:
+def test_estimator_health_of_both_autopilots_is_decoded(telemetry: Telemetry, clock: Clock) -> None:
     telemetry.receive(messages.EkfStatusReport(831, 0.1, 0.2, 0.3, 0.4, NAN))
     estimator = telemetry.estimator.value
     assert (estimator.message, estimator.missing, estimator.terrain_ratio) == ("EKF_STATUS_REPORT", (), None)
@@ -387,16 +379,14 @@ def test_mission_time_vibration_version(telemetry: Telemetry) -> None:
     telemetry.receive(messages.Vibration(0, 1.0, 2.0, 3.0, 4, 5, 6))
     assert telemetry.vibration.value.clippings == (4, 5, 6)
     blank = bytes(8)
-    telemetry.receive(
-        messages.AutopilotVersion(0xFBEF, 0x04070000, 0, 0, 0, b"21910f24", blank, blank, 0, 0, 0)
-    )
+    telemetry.receive(messages.AutopilotVersion(0xFBEF, 0x04070000, 0, 0, 0, b"21910f24", blank, blank, 0, 0, 0))
     assert (str(telemetry.version.value), telemetry.capabilities.value) == ("4.7.0-dev (21910f24)", 0xFBEF)
 
 
 # ---------------------------------------------------------------------------------------- texts
 
 
-def test_texts_are_told_one_by_one_and_remembered(telemetry: Telemetry, clock: Clock) -> None:
+def test_status_texts_are_published_and_kept(telemetry: Telemetry, clock: Clock) -> None:
     seen: list[str] = []
     telemetry.status_text.observe(lambda _, text: seen.append(text.text))
     for clock.now in (1.0, 2.0):
@@ -405,7 +395,7 @@ def test_texts_are_told_one_by_one_and_remembered(telemetry: Telemetry, clock: C
     assert [text.at for text in telemetry.texts_since(1.5)] == [2.0]
 
 
-def test_a_text_whose_end_is_lost_is_told_in_time(telemetry: Telemetry, clock: Clock) -> None:
+def test_status_text_end_lost_is_delivered_in_time(telemetry: Telemetry, clock: Clock) -> None:
     telemetry.receive(messages.Statustext(4, "x" * 50, 1, 0))
     assert not telemetry.status_text.is_known
     clock.now = 3.0
@@ -416,7 +406,7 @@ def test_a_text_whose_end_is_lost_is_told_in_time(telemetry: Telemetry, clock: C
 # ------------------------------------------------------------------------------------ as a whole
 
 
-def test_forgetting_everything_but_the_texts(telemetry: Telemetry) -> None:
+def test_forget_keeps_status_texts(telemetry: Telemetry) -> None:
     telemetry.receive(heartbeat())
     telemetry.receive(messages.Statustext(6, "hello"))
     telemetry.forget()
@@ -425,14 +415,14 @@ def test_forgetting_everything_but_the_texts(telemetry: Telemetry) -> None:
 
 
 @pytest.mark.anyio
-async def test_closing_ends_all_waiting(telemetry: Telemetry) -> None:
+async def test_telemetry_close_ends_all_waits(telemetry: Telemetry) -> None:
     telemetry.close(ConnectionClosed("closed"))
     for cell in telemetry.cells.values():
         with pytest.raises(ConnectionClosed):
             await cell.wait_until(lambda _: True)
 
 
-def test_every_cell_can_be_asked_for(telemetry: Telemetry, clock: Clock) -> None:
+def test_required_messages_exist_for_every_cell(telemetry: Telemetry, clock: Clock) -> None:
     for name in telemetry.cells:
         for message in telemetry.required_messages(name):
             assert message.ID in telemetry.handles
@@ -445,6 +435,6 @@ def test_every_cell_can_be_asked_for(telemetry: Telemetry, clock: Clock) -> None
     assert messages.EkfStatusReport not in px4.default_rates
 
 
-def test_a_wrong_cell_name_is_an_error(telemetry: Telemetry) -> None:
+def test_unknown_cell_name_raises(telemetry: Telemetry) -> None:
     with pytest.raises(KeyError):
         telemetry.required_messages("nonsense")

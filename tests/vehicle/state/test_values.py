@@ -20,7 +20,7 @@ from aerokit.vehicle.state.movement import Attitude, Home, Velocity
 angles = st.floats(-179, 179)
 
 
-def test_a_position_as_users_write_it() -> None:
+def test_position_setpoint_is_encoded() -> None:
     place = Position(47.3977, 8.5456, altitude_relative_m=30)
     assert (place.latitude_deg, place.altitude_relative_m, place.altitude_amsl_m) == (47.3977, 30, None)
     with pytest.raises(AttributeError, match="immutable"):
@@ -45,7 +45,7 @@ def test_nonsense_is_refused_by_name(fields: dict[str, Any], text: str) -> None:
         Position(**fields)
 
 
-def test_an_offset_of_a_wrong_type_is_refused_by_name() -> None:
+def test_position_offset_wrong_type_is_named() -> None:
     north: Any = "30"
     with pytest.raises(InvalidArgument, match="north_m = '30' is not allowed: a number"):
         Position(47.3977, 8.5456).offset(north_m=north)
@@ -64,7 +64,7 @@ def test_home_as_a_target() -> None:
     assert Home(47.0, 8.0, 488.0).position == Position(47.0, 8.0)
 
 
-def test_velocity_as_speed_and_course() -> None:
+def test_velocity_has_speed_and_course() -> None:
     assert Velocity(3, -4, 1).ground_speed_m_s == 5
     assert Velocity(0, -4, 1).course_deg == pytest.approx(270)
 
@@ -77,7 +77,7 @@ def test_quaternions_and_euler_angles_agree(roll: float, pitch: float, yaw: floa
     assert (back.roll_deg, back.pitch_deg, back.yaw_deg) == pytest.approx((roll, pitch, yaw), abs=1e-5)
 
 
-def test_a_quarter_turn_to_the_right() -> None:
+def test_quaternion_of_quarter_turn_is_yaw_90() -> None:
     half = math.sqrt(0.5)
     assert Attitude(0, 0, 90).quaternion == pytest.approx((half, 0, 0, half))
 
@@ -91,7 +91,7 @@ def test_fix(fix_type: int, has_fix: bool) -> None:
 
 
 @pytest.mark.parametrize(("passes", "blocking"), [(True, ()), (False, ("GPS",)), (None, ("GPS",))])
-def test_what_fails_blocks_unless_the_checks_pass(passes: bool | None, blocking: tuple[str, ...]) -> None:
+def test_failing_sensor_blocks_unless_checks_pass(passes: bool | None, blocking: tuple[str, ...]) -> None:
     assert SensorHealth(0, 0, 0, ("GPS",), passes, 0.0).blocks_arming == blocking
 
 
@@ -105,7 +105,7 @@ def test_what_fails_blocks_unless_the_checks_pass(passes: bool | None, blocking:
         ("has_altitude", enums.EstimatorStatusFlags.POS_VERT_ABS),
     ],
 )
-def test_each_flag_of_an_estimator_has_its_property(name: str, flag: int) -> None:
+def test_estimator_flags_have_properties(name: str, flag: int) -> None:
     assert getattr(EstimatorHealth("ESTIMATOR_STATUS", flag, ()), name) is True
     assert getattr(EstimatorHealth("ESTIMATOR_STATUS", 0xFFFF & ~flag, ()), name) is False
 
@@ -119,7 +119,7 @@ FROM_NOSE, FROM_NORTH, LOCK = (
 )
 
 
-def test_a_mount_tells_hundredths_of_degrees() -> None:
+def test_mount_status_is_in_hundredths_of_degrees() -> None:
     told = gimbal.from_status(messages.MountStatus(1, 1, -4512, 150, 9001))
     assert told == gimbal.GimbalAttitude(-45.12, 1.5, 90.01)
 
@@ -134,7 +134,7 @@ def test_a_mount_tells_hundredths_of_degrees() -> None:
         (math.nan, 0.0, None, None),
     ],
 )
-def test_a_mount_turns_with_the_vehicle(
+def test_mount_yaw_follows_vehicle_heading(
     yaw: float, absolute: float, heading: float | None, told: float | None
 ) -> None:
     message = messages.MountOrientation(0, 1.25, -30.5, yaw, absolute)
@@ -149,8 +149,7 @@ def pointing(q: tuple[float, ...], flags: int = 0, delta_yaw: float = 0.0) -> An
 def turned(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
     """The quaternion of yaw, then pitch, then roll."""
     (sr, cr), (sp, cp), (sy, cy) = (
-        (math.sin(math.radians(each) / 2), math.cos(math.radians(each) / 2))
-        for each in (roll_deg, pitch_deg, yaw_deg)
+        (math.sin(math.radians(each) / 2), math.cos(math.radians(each) / 2)) for each in (roll_deg, pitch_deg, yaw_deg)
     )
     return (
         cr * cp * cy + sr * sp * sy,
@@ -176,7 +175,7 @@ def turned(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ..
         (0, 50.0, 100.0, 130.0, 30.0),
     ],
 )
-def test_a_gimbal_tells_its_yaw_from_the_nose_or_from_north(
+def test_gimbal_yaw_from_nose_or_north_is_converted(
     flags: int, delta_deg: float, heading: float | None, yaw_deg: float, from_nose_deg: float | None
 ) -> None:
     message = pointing(turned(10, -20, 30), flags, math.radians(delta_deg))
@@ -185,10 +184,8 @@ def test_a_gimbal_tells_its_yaw_from_the_nose_or_from_north(
 
 
 @given(angles, st.floats(-89, 89), angles, st.floats(0.1, 10))
-def test_a_gimbals_angles_are_those_it_was_turned_by(
-    roll: float, pitch: float, yaw: float, length: float
-) -> None:
-    """Whatever the length of its quaternion."""
+def test_gimbal_angles_match_rotation(roll: float, pitch: float, yaw: float, length: float) -> None:
+    """For any length of the quaternion."""
     q = tuple(length * each for each in turned(roll, pitch, yaw))
     told = gimbal.from_device(pointing(q, FROM_NORTH), None)
     assert told.pitch_deg == pytest.approx(pitch, abs=0.02)
@@ -198,13 +195,11 @@ def test_a_gimbals_angles_are_those_it_was_turned_by(
 
 @pytest.mark.parametrize("pitch_deg", [-90.0, 90.0])
 @pytest.mark.parametrize("roll_deg", [0.0, 25.0])
-def test_of_a_camera_that_looks_straight_up_or_down_all_turning_is_yaw(
-    pitch_deg: float, roll_deg: float
-) -> None:
+def test_vertical_camera_rotation_is_yaw(pitch_deg: float, roll_deg: float) -> None:
     told = gimbal.from_device(pointing(turned(roll_deg, pitch_deg, 40), FROM_NORTH), None)
     assert told == gimbal.GimbalAttitude(pitch_deg, 0.0, 40.0 - math.copysign(roll_deg, pitch_deg))
 
 
-def test_a_quaternion_of_zeros_points_nowhere() -> None:
+def test_zero_quaternion_has_no_attitude() -> None:
     told = gimbal.from_device(pointing((0.0, 0.0, 0.0, 0.0), FROM_NORTH), None)
     assert told == gimbal.GimbalAttitude(None, None, None)

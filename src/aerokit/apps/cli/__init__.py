@@ -1,4 +1,4 @@
-"""The command line: ``aerokit demo`` and ``aerokit sim``."""
+"""The command line, ``aerokit COMMAND``."""
 
 from aerokit.apps.cli.main import main
 

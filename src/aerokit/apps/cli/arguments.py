@@ -1,4 +1,4 @@
-"""What arguments may look like: functions for argparse, which turns their errors into exit code 2."""
+"""Argument types for argparse: each raises ArgumentTypeError, which becomes exit code 2."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aerokit._internal import geo
-from aerokit.apps.cli.completers import kinds as kind_names
-from aerokit.apps.cli.completers import offer
+from aerokit.apps.cli.completion import kinds as kind_names
+from aerokit.apps.cli.completion import offer
 from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.parameters import ParameterType, check_name, checked_value
 from aerokit.parameters.encoding import parse_number
@@ -20,29 +20,30 @@ from aerokit.transport import parse_address
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-EACH_ITS_OWN = "tcpin:127.0.0.1:{5760+10n}"
-"""As SITL numbers its instances: 5760, 5770, 5780 and so on."""
-
-_FORM = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
-
-
-def each_with_its_own(address: str) -> bool:
-    """Whether the address is a form, which gives each vehicle a link of its own."""
-    return _FORM.search(address) is not None
+DEFAULT_SIM_ADDRESS = "tcpin:127.0.0.1:{5760+10n}"
+"""The ports of SITL instances: 5760, 5770, 5780, …"""
+_TEMPLATE_FIELD = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
 
 
-def place_of(address: str, number: int, system_id: int) -> str:
-    """The address of one vehicle: ``n`` counts from 0, ``id`` is its system id; ``{5760+10n}`` reckons with them."""
+def is_address_template(address: str) -> bool:
+    """Return True if the address has placeholders, so that each vehicle gets a link of its own."""
+    return _TEMPLATE_FIELD.search(address) is not None
+
+
+def expand_address(address: str, number: int, system_id: int) -> str:
+    """Fill in the placeholders of an address template for one vehicle.
+
+    ``{n}`` is the number of the vehicle, from 0; ``{id}`` its system id. ``{5760+10n}`` computes with them.
+    """
 
     def value(match: re.Match[str]) -> str:
         start, factor, name = match.groups()
         return str(int(start or 0) + int(factor or 1) * (number if name == "n" else system_id))
 
-    return _FORM.sub(value, address)
+    return _TEMPLATE_FIELD.sub(value, address)
 
 
 def address(text: str) -> str:
-    """A connection string."""
     try:
         parse_address(text)
     except InvalidArgument as error:
@@ -50,19 +51,17 @@ def address(text: str) -> str:
     return text
 
 
-def address_or_form(text: str) -> str:
-    """A connection string, or a form of one for several vehicles."""
-    address(place_of(text, 0, 1))
+def address_or_template(text: str) -> str:
+    address(expand_address(text, 0, 1))
     return text
 
 
 def vehicle_kind(text: str) -> str:
-    """A kind of simulated vehicle, or a recording of one."""
     from aerokit.sim.kinds import kind_class
 
     if text.endswith(".tlog"):
         if not Path(text).is_file():
-            raise ArgumentTypeError(f"there is no recording {text!r}")
+            raise ArgumentTypeError(f"recording {text!r} does not exist")
         return text
     try:
         kind_class(text)
@@ -71,15 +70,23 @@ def vehicle_kind(text: str) -> str:
     return text
 
 
-def count(text: str) -> int:
-    """How many vehicles."""
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= 250):
-        raise ArgumentTypeError(f"{text!r} is not a number of vehicles: 1 to 250")
-    return int(text)
+def integer(low: int, high: int, what: str) -> Callable[[str], int]:
+    """Return a parser for integers from ``low`` to ``high``; ``what`` describes them in the error."""
+
+    def parse(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and low <= int(text) <= high):
+            raise ArgumentTypeError(f"{text!r} is not {what} from {low} to {high}")
+        return int(text)
+
+    return parse
+
+
+count: Callable[[str], int] = integer(1, 250, "a number of vehicles")
+port: Callable[[str], int] = integer(0, 65535, "a port number")
+system_id: Callable[[str], int] = integer(1, 255, "a system id")
 
 
 def wind(text: str) -> tuple[float, ...]:
-    """North, east, and perhaps gusts."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -91,8 +98,7 @@ def wind(text: str) -> tuple[float, ...]:
 
 
 def picture(text: str) -> str:
-    """A path of a picture."""
-    from aerokit.sim.picture import check_picture
+    from aerokit.testing.picture import check_picture
 
     try:
         check_picture(text)
@@ -102,7 +108,7 @@ def picture(text: str) -> str:
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """A number from ``low`` to ``high``."""
+    """Return a parser for numbers from ``low`` to ``high``."""
 
     def parse(text: str) -> float:
         try:
@@ -117,7 +123,7 @@ def number(low: float, high: float) -> Callable[[str], float]:
 
 
 def assignment(text: str) -> tuple[str, int | float]:
-    """``NAME=VALUE``, a parameter and what it may be set to; whole numbers also as 0x1F."""
+    """Parse ``NAME=VALUE`` for a parameter; whole numbers may be hexadecimal (0x1F)."""
     name, mark, value = text.partition("=")
     try:
         number = parse_number(value if mark else "")
@@ -131,20 +137,11 @@ def assignment(text: str) -> tuple[str, int | float]:
 
 
 def parameter(text: str) -> tuple[str, float]:
-    """The same of a simulated vehicle, whose names are in capitals."""
     name, number = assignment(text)
     return name.upper(), float(number)
 
 
-def system_id(text: str) -> int:
-    """A MAVLink system id."""
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= 255):
-        raise ArgumentTypeError(f"{text!r} is not a system id: 1 to 255")
-    return int(text)
-
-
 def home(text: str) -> tuple[float, float, float]:
-    """Latitude, longitude, altitude."""
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(","))
         geo.check_place(latitude, longitude)
@@ -153,36 +150,40 @@ def home(text: str) -> tuple[float, float, float]:
     except ValueError:
         raise ArgumentTypeError(f"{text!r} is not LAT,LON,ALT in degrees and metres") from None
     if not math.isfinite(altitude):
-        raise ArgumentTypeError(f"{text!r} has no altitude in metres")
+        raise ArgumentTypeError(f"{text!r} has no finite altitude in metres")
     return latitude, longitude, altitude
 
 
 def writable_file(text: str) -> str:
-    """A path in a directory that is there."""
+    """Parse the path of a file to write, in an existing directory."""
     path = Path(text)
     if path.is_dir() or not path.parent.is_dir():
-        raise ArgumentTypeError(f"{text!r} cannot be written: it is a directory, or its directory is missing")
+        why = "it is a directory" if path.is_dir() else f"directory {str(path.parent)!r} does not exist"
+        raise ArgumentTypeError(f"{text!r} cannot be written: {why}")
     return text
 
 
+def log_file(text: str) -> str:
+    """Parse the path of a recording to write."""
+    if not text.lower().endswith(".tlog"):
+        raise ArgumentTypeError(f"{text!r} does not end in .tlog")
+    return writable_file(text)
+
+
 def directory(text: str) -> Path:
-    """A directory that is there."""
     path = Path(text)
     if not path.is_dir():
-        raise ArgumentTypeError(f"{text!r} is no directory that is there")
+        raise ArgumentTypeError(f"{text!r} is not an existing directory")
     return path
 
 
 def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
-    """Add ``--vehicle KIND``; ``kinds`` lists them."""
     kind = command.add_argument(
-        "--vehicle", type=vehicle_kind, default="copter", metavar="KIND", help=f"simulated: {kinds}"
+        "--vehicle", type=vehicle_kind, default="copter", metavar="KIND", help=f"simulated vehicle: {kinds}"
     )
     offer(kind, kind_names)
 
 
-def add_baud(
-    command: argparse._ActionsContainer, whose: str = "a serial port whose address says none"
-) -> None:
-    """Add ``--baud``."""
-    command.add_argument("--baud", type=int, default=57600, help=f"of {whose} (57600)")
+def add_baud(command: argparse._ActionsContainer) -> None:
+    help_text = "baud rate of serial ports whose address has none (57600)"
+    command.add_argument("--baud", type=int, default=57600, help=help_text)

@@ -1,4 +1,4 @@
-"""``aerokit bridge``: every vehicle on a link, live in the Foxglove viewer, or as JSON on a network."""
+"""``aerokit bridge``: the vehicles on a link in Foxglove, or as JSON over zenoh or MQTT."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import asyncio
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from aerokit.apps.cli.arguments import address, number
-from aerokit.apps.cli.output import DONE, add_json, need, tell
+from aerokit.apps.cli.arguments import address, number, port
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
+from aerokit.apps.cli.output import DONE, add_json, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
-from aerokit.apps.cli.vehicle_command import ENVIRONMENT, add_place, add_signing_key, signing_of
 from aerokit.errors import InvalidArgument
 from aerokit.transport.address import parse_address
 
@@ -19,38 +19,38 @@ if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
     from aerokit.vehicle.vehicle import Vehicle
 
-WHERE = "where the vehicles are: "
+_ADDRESS_HELP = "address of the vehicles: "
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The actions of the command, and their arguments."""
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     foxglove = actions.add_parser(
         "foxglove",
-        help="serve Foxglove's WebSocket protocol",
-        description="Show every vehicle on a link to the Foxglove viewer, until Ctrl-C: position on the map, 3D frames,"
-        " texts, and each state as a topic. What a viewer does reaches no vehicle.",
+        help="serve vehicles to Foxglove",
+        description="Show every vehicle on a link in Foxglove, until Ctrl-C: position on the map, 3D frames, texts, and"
+        " each state as a topic. Viewers cannot send anything to a vehicle.",
     )
     foxglove.set_defaults(run=_foxglove)
-    add_place(foxglove, what=WHERE)
+    add_address(foxglove, what=_ADDRESS_HELP)
     foxglove.add_argument(
-        "--host", default="127.0.0.1", metavar="IP", help="listen here; 0.0.0.0: everywhere (127.0.0.1)"
+        "--host",
+        default="127.0.0.1",
+        metavar="IP",
+        help="address to listen on; 0.0.0.0: all interfaces (127.0.0.1)",
     )
-    foxglove.add_argument(
-        "--port", type=_port, default=8765, help="listen on this port; 0: a free one (8765)"
-    )
+    foxglove.add_argument("--port", type=port, default=8765, help="TCP port to listen on; 0: any free port (8765)")
     foxglove.add_argument(
         "--messages",
         action="append",
         default=[],
         metavar="NAME",
-        help="show these MAVLink messages as they come, too: 'GPS_*' (repeatable)",
+        help="show these MAVLink messages too, unconverted: 'GPS_*' (repeatable)",
     )
     _add_common(foxglove, 10.0, "topic")
     for name, where, forms, module, network, shown in (
         (
             "zenoh",
-            "on a zenoh network",
+            "to a zenoh network",
             "zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
             "zenoh",
             _network,
@@ -58,7 +58,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         ),
         (
             "mqtt",
-            "at a broker of MQTT",
+            "to an MQTT broker",
             "mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …",
             "paho",
             _broker,
@@ -67,13 +67,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     ):
         action = actions.add_parser(
             name,
-            help=f"put states {where}, as JSON",
-            description=f"Put each state of every vehicle on a link {where}, as JSON for programs in any"
-            " language, until Ctrl-C (docs/network.md). What anybody does there reaches no vehicle.",
+            help=f"publish states {where}",
+            description=f"Publish each state of every vehicle on a link {where}, as JSON, until Ctrl-C"
+            " (docs/network.md). Subscribers cannot send anything to a vehicle.",
         )
         action.set_defaults(run=_publish, needs=(module, name), shown=shown)
-        add_place(action, what=WHERE)
-        action.add_argument("network", type=network, metavar="NETWORK", help=f"where the states go: {forms}")
+        add_address(action, what=_ADDRESS_HELP)
+        action.add_argument("network", type=network, metavar="NETWORK", help=f"where to publish: {forms}")
         _add_common(action, 5.0, "state")
 
 
@@ -83,59 +83,48 @@ def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> N
         type=number(0.1, 50 if rate_hz < 10 else 100),
         default=rate_hz,
         metavar="HZ",
-        help=f"so many times a second at most, each {what} ({rate_hz:g})",
+        help=f"maximum rate of each {what} ({rate_hz:g})",
     )
     action.add_argument(
         "--listen-only",
         action="store_true",
-        help="ask the vehicles for nothing; else for the rates that every aerokit program asks for",
+        help="do not request message rates from the vehicles; by default, request aerokit's usual rates",
     )
-    add_signing_key(action, f"of vehicles that want signed messages (${ENVIRONMENT})")
+    add_signing_key(action, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     add_json(action)
 
 
 def _network(text: str) -> str:
-    """Looked at before a link is opened: the two addresses are easily given the other way round."""
+    # Checked before a link is opened, because the two addresses are easily swapped.
     if parse_address(address(text)).kind not in ("zenoh", "zenohin"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not on a network, as zenoh://FLEET/NAME is")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a zenoh address, zenoh://FLEET/NAME")
     return text
 
 
 def _broker(text: str) -> str:
-    """As :func:`_network`; an error does not show the password."""
     try:
-        _without_password(text)
+        _without_password(text)  # error messages must not show the password
     except InvalidArgument as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text
 
 
 def _without_password(broker: str) -> str:
-    from aerokit.apps.network.broker import parse_broker
+    from aerokit.apps.network.mqtt_publisher import parse_broker
 
     return str(parse_broker(broker, "mqtt", "mqtts"))
 
 
-def _port(text: str) -> int:
-    port = int(text)
-    if not 0 <= port <= 65535:
-        raise argparse.ArgumentTypeError(f"{text} is no port: 0 to 65535")
-    return port
-
-
 async def _foxglove(options: argparse.Namespace) -> int:
-    need("foxglove", "foxglove")
+    import_extra("foxglove", "foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
-    from aerokit.connection.opening import ONLOOKER, open_connection
+    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
 
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with (
             open_connection(
-                options.address,
-                source_system=ONLOOKER,
-                baud=options.baud,
-                signing=signing_of(options),
+                options.address, source_system=OBSERVER_SYSTEM_ID, baud=options.baud, signing=signing_of(options)
             ) as connection,
             foxglove_bridge(
                 connection,
@@ -144,19 +133,19 @@ async def _foxglove(options: argparse.Namespace) -> int:
                 rate_hz=options.rate,
                 messages=options.messages,
                 rates={} if options.listen_only else None,
-                on_found=lambda vehicle: _tell_vehicle(options, vehicle),
+                on_found=lambda vehicle: _emit_vehicle(options, vehicle),
             ) as bridge,
         ):
-            _tell_serving(options, bridge)
-            await _until_end(connection, stop)
+            _emit_serving(options, bridge)
+            await _wait_end(connection, stop)
     return DONE
 
 
 async def _publish(options: argparse.Namespace) -> int:
-    need(*options.needs)
+    import_extra(*options.needs)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
-    from aerokit.connection.opening import ONLOOKER, open_connection
+    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
     from aerokit.vehicle.connect import vehicles_on
 
     stop = asyncio.Event()
@@ -165,18 +154,18 @@ async def _publish(options: argparse.Namespace) -> int:
     with on_interrupt(stop.set):
         async with (
             open_connection(
-                options.address, source_system=ONLOOKER, baud=options.baud, signing=signing
+                options.address, source_system=OBSERVER_SYSTEM_ID, baud=options.baud, signing=signing
             ) as connection,
             publisher_for(options.network) as publisher,
             vehicles_on(
                 connection,
                 rates={} if options.listen_only else None,
-                on_found=lambda vehicle: _tell_vehicle(options, vehicle),
+                on_found=lambda vehicle: _emit_vehicle(options, vehicle),
             ) as vehicles,
         ):
             where = {"network": network, "address": options.address}
-            text = f"listening to {options.address}\nputting states on {network}\nuntil Ctrl-C"
-            tell(options, "publishing", where, text)
+            text = f"listening to {options.address}\npublishing to {network}\nuntil Ctrl-C"
+            emit(options, "publishing", where, text)
             published: dict[int, Publishing] = {}
             while not stop.is_set():
                 connection.raise_if_ended()
@@ -189,8 +178,8 @@ async def _publish(options: argparse.Namespace) -> int:
     return DONE
 
 
-async def _until_end(connection: Connection, stop: asyncio.Event) -> None:
-    """Until the connection ends, which is raised, or somebody stops it."""
+async def _wait_end(connection: Connection, stop: asyncio.Event) -> None:
+    """Wait until ``stop`` is set or the connection ends; raise what ended the connection."""
     ended: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
     connection.on_end(ended.set_result)
     stopped = asyncio.ensure_future(stop.wait())
@@ -205,8 +194,8 @@ async def _until_end(connection: Connection, stop: asyncio.Event) -> None:
         connection.raise_if_ended()
 
 
-def _tell_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:
-    tell(
+def _emit_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:
+    emit(
         options,
         "bridging",
         {"url": bridge.url, "address": options.address},
@@ -215,6 +204,6 @@ def _tell_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:
     )
 
 
-def _tell_vehicle(options: argparse.Namespace, vehicle: Vehicle) -> None:
+def _emit_vehicle(options: argparse.Namespace, vehicle: Vehicle) -> None:
     record = {"system_id": vehicle.system_id, "firmware": vehicle.autopilot.firmware}
-    tell(options, "bridged_vehicle", record, f"vehicle {vehicle.system_id}: {vehicle.autopilot.firmware}")
+    emit(options, "bridged_vehicle", record, f"vehicle {vehicle.system_id}: {vehicle.autopilot.firmware}")

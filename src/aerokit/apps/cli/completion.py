@@ -1,26 +1,71 @@
-"""``aerokit completion``: completion of commands, options and names in the shell, by argcomplete."""
+"""``aerokit completion``: shell completion by argcomplete, and the values that it offers."""
 
 from __future__ import annotations
 
 import argparse
+import os
+from glob import glob
+from importlib.resources import files
+from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.output import DONE, need
+from aerokit.apps.cli.output import DONE, import_extra
 
-SHELLS = ("bash", "zsh", "fish")
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+_SHELLS = ("bash", "zsh", "fish")
+_COMMON_ADDRESSES = ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14540", "tcp:127.0.0.1:5760")
+_DEVICES = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/cu.usb*")
+_TABLES = {
+    "ArduPilot": tuple(f"sim/ardupilot/{kind}.param.csv" for kind in ("copter", "plane", "rover", "sub")),
+    "PX4": ("sim/px4/quadrotor.param.csv", "sim/px4/airplane.param.csv"),
+}
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The arguments of the command."""
     command.set_defaults(run=run_completion)
     command.add_argument(
         "shell",
-        choices=SHELLS,
+        choices=_SHELLS,
         help='bash, zsh: eval "$(aerokit completion bash)" in ~/.bashrc or ~/.zshrc; fish: aerokit completion'
         " fish > ~/.config/fish/completions/aerokit.fish",
     )
 
 
 async def run_completion(options: argparse.Namespace) -> int:
-    """Print what the shell has to read."""
-    print(need("argcomplete", "completion").shellcode(["aerokit"], shell=options.shell))
+    print(import_extra("argcomplete", "completion").shellcode(["aerokit"], shell=options.shell))
     return DONE
+
+
+def offer(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
+    """Set the completion values of an argument; argcomplete filters them by what is typed."""
+    setattr(action, "completer", lambda **_: list(values()))  # noqa: B010 - not an attribute of argparse.Action
+
+
+def addresses() -> list[str]:
+    own = os.environ.get("AEROKIT_ADDRESS", "").strip()
+    return [
+        *([own] if own else []),
+        *_COMMON_ADDRESSES,
+        *(path for form in _DEVICES for path in sorted(glob(form))),
+    ]
+
+
+def assignments() -> list[str]:
+    return [f"{name}=" for name in parameter_names()]
+
+
+def kinds() -> tuple[str, ...]:
+    from aerokit.sim.kinds import kind_names
+
+    return kind_names()
+
+
+def parameter_names(autopilot: str | None = None) -> list[str]:
+    """Return the sorted parameter names of simulated vehicles of "ArduPilot" or "PX4"; of both by default."""
+    paths = _TABLES.get(autopilot or "") or [path for group in _TABLES.values() for path in group]
+    names = set()
+    for path in paths:
+        lines = files("aerokit").joinpath(path).read_text(encoding="utf-8").splitlines()
+        names |= {line.partition(",")[0] for line in lines if line and not line.startswith("#")}
+    return sorted(names)

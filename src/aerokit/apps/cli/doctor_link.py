@@ -1,4 +1,4 @@
-"""What ``aerokit doctor`` finds on a link: who speaks, how, and what does not fit together."""
+"""Checks of a link for ``aerokit doctor``: senders, ids, protocol version, signing, dialect, loss."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal
 import anyio
 
 from aerokit._internal.values import Snapshot
-from aerokit.apps.cli.output import tell
-from aerokit.connection.components import is_autopilot
-from aerokit.connection.opening import no_vehicle_reason
-from aerokit.events import HeardTwice
+from aerokit.apps.cli.output import emit
+from aerokit.connection.heartbeats import is_autopilot
+from aerokit.connection.opening import explain_no_vehicle
+from aerokit.events import DuplicateSender
 from aerokit.mavlink.enums import MavType
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.messages import Heartbeat
@@ -29,14 +29,23 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 BAUD_RATES = (57600, 115200, 921600, 460800, 230400, 500000, 38400, 19200, 9600)
-"""The most usual first."""
+"""Rates to try, the most common first."""
+# One frame with a valid checksum may be noise.
+_MIN_FRAMES = 2
+_MARKS: dict[str, str] = {"ok": "ok  ", "note": "note", "problem": "BAD "}
+_MAX_LOSS = 0.02
+# Default ids of programs. doctor uses a system id of its own.
+_PROGRAM_IDS = (255, 190)
+# With fewer frames, the loss is not meaningful.
+_MIN_FRAMES_FOR_LOSS = 20
+_SERIAL_LOSS_ADVICE = (
+    "check antennas and distance, whether the baud rate is too low for the traffic, and RTS/CTS flow control"
+)
+_NETWORK_LOSS_ADVICE = "check the network (Wi-Fi, radio), and whether the link is too slow for the traffic"
 
-MIN_FRAMES_AT_A_RATE = 2
-"""One good checksum in noise may be luck."""
 
-
-class Heard:
-    """What came at one baud rate."""
+class BaudRateProbe:
+    """Counts what a serial port receives at one baud rate."""
 
     def __init__(self, baud: int) -> None:
         self.baud: int = baud
@@ -49,11 +58,10 @@ class Heard:
 
     @property
     def is_mavlink(self) -> bool:
-        """Whether there was enough of it."""
-        return self.frames >= MIN_FRAMES_AT_A_RATE
+        """Return True after enough valid frames."""
+        return self.frames >= _MIN_FRAMES
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """Called by the link."""
         self.bytes += len(data)
         self._framer.receive(data, self._loop.time())
         self.frames = self._framer.statistics.frames
@@ -61,39 +69,41 @@ class Heard:
             self._ended.set()
 
     def link_lost(self, error: LinkLost) -> None:
-        """Called by the link."""
         self.error = error
         self._ended.set()
 
     async def wait(self, seconds: float) -> None:
-        """Until it is MAVLink, the port has gone, or so many seconds have passed."""
+        """Wait until MAVLink is detected, the port is lost, or the time is over."""
         with anyio.move_on_after(seconds):
             await self._ended.wait()
 
 
-async def listen_at(device: str, baud: int, seconds: float) -> Heard:
-    """Listen to a port at one rate; raises LinkOpenError when it cannot be opened, LinkLost when it has gone."""
-    heard = Heard(baud)
+async def listen_at(device: str, baud: int, seconds: float) -> BaudRateProbe:
+    """Listen to a serial port at one baud rate.
+
+    Raises:
+        LinkOpenError: the port cannot be opened.
+        LinkLost: the port was lost.
+    """
+    probe = BaudRateProbe(baud)
     link = SerialLink(device, baud)
-    await link.open(heard)
+    await link.open(probe)
     try:
-        await heard.wait(seconds)
+        await probe.wait(seconds)
     finally:
         link.close()
         await link.wait_closed()
-    if heard.error is not None:
-        raise heard.error
-    return heard
+    if probe.error is not None:
+        raise probe.error
+    return probe
 
 
 Level = Literal["ok", "note", "problem"]
-"""As it should be; worth knowing; to be mended."""
-
-_MARKS: dict[str, str] = {"ok": "ok  ", "note": "note", "problem": "BAD "}
+"""Severity of a finding; only a "problem" makes the command fail."""
 
 
 class Finding(Snapshot):
-    """``subject`` is what was looked at in a few words, ``text`` what was found, ``do`` what to do (empty: nothing)."""
+    """One result of a check: its subject, what was found, and what to do (may be empty)."""
 
     level: Level
     subject: str
@@ -101,31 +111,15 @@ class Finding(Snapshot):
     do: str = ""
 
 
-def tell_finding(options: argparse.Namespace, finding: Finding) -> None:
-    """Print it."""
+def emit_finding(options: argparse.Namespace, finding: Finding) -> None:
     lines = [f"{_MARKS[finding.level]}  {finding.subject}: {finding.text}"]
     if finding.do:
         lines.append(f"      → {finding.do}")
-    tell(options, "finding", finding.to_dict(), "\n".join(lines))
-
-
-TOLERABLE_LOSS = 0.02
-
-PROGRAM = (255, 190)
-"""The ids of programs, unless they ask for others; doctor itself only looks on, by another one."""
-
-ENOUGH_FRAMES = 20
-"""Of fewer frames a loss says little."""
-
-SERIAL_LOSS = (
-    "check the antennas and the distance, the baud rate (is the link full?), and on serial lines RTS/CTS"
-)
-
-FORWARDED_LOSS = "check the network (Wi-Fi, radio), and whether the link is slower than what is sent over it"
+    emit(options, "finding", finding.to_dict(), "\n".join(lines))
 
 
 class LinkExamination:
-    """Listens to everything on a connection, from when it is made, and says what is to be said of it."""
+    """Collects everything a connection receives, and derives findings."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -134,14 +128,14 @@ class LinkExamination:
         self._signed: Counter[tuple[int, int]] = Counter()
         self._frames: Counter[tuple[int, int]] = Counter()
         self._kinds: dict[tuple[int, int], set[tuple[int, int]]] = {}
-        self._twice: set[tuple[int, int]] = set()
-        connection.tap(self._on_frame)
+        self._duplicate_sources: set[tuple[int, int]] = set()
+        connection.observe_frames(self._on_frame)
         connection.bus.attach(Heartbeat, self._on_heartbeat)
-        connection.bus.attach_event(HeardTwice, self._on_heard_twice)
+        connection.bus.attach_event(DuplicateSender, self._on_heard_twice)
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         if self._connection.bus.dialect.get(frame.message_id) is None:
-            return  # its checksum could not be checked: it might be noise
+            return  # without a definition the checksum cannot be verified, so the frame may be noise
         source = frame.system_id, frame.component_id
         self._frames[source] += 1
         self._versions.setdefault(source, set()).add(frame.version)
@@ -153,13 +147,11 @@ class LinkExamination:
             kinds = self._kinds.setdefault((frame.system_id, frame.component_id), set())
             kinds.add((heartbeat.type, heartbeat.autopilot))
 
-    def _on_heard_twice(self, event: HeardTwice) -> None:
-        self._twice.add((event.system_id, event.component_id))
-
-    # ---------------------------------------------------------------------------------- findings
+    def _on_heard_twice(self, event: DuplicateSender) -> None:
+        self._duplicate_sources.add((event.system_id, event.component_id))
 
     def findings(self) -> Iterator[Finding]:
-        """All of them, the worst kinds of trouble first."""
+        """Yield all findings, the most severe kinds first."""
         yield from self._silence()
         yield from self._ids()
         yield from self._senders()
@@ -169,81 +161,83 @@ class LinkExamination:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no frame of anybody else was heard."""
+        """Return True if no other system was received."""
         return not set(self._frames) - {self._own}
 
     def _silence(self) -> Iterator[Finding]:
         connection = self._connection
-        if any(is_autopilot(heartbeat) for heartbeat in connection.heard.values()):
+        if any(is_autopilot(heartbeat) for heartbeat in connection.heartbeats.values()):
             return
-        text = no_vehicle_reason(connection, None)
-        total = sum(each.bytes for each in connection.statistics())
+        text = explain_no_vehicle(connection, None)
+        total = sum(statistics.bytes for statistics in connection.statistics())
         if set(self._frames) == {self._own}:
-            text += "; they look like our own, which come back"
-            do = "are TX and RX joined, or does a router send everything back?"
+            text += "; they seem to be an echo of what this program sends"
+            do = "check whether TX and RX are shorted, or a router sends everything back"
         elif total == 0:
             do = (
-                "is the vehicle on? serial: TX to RX and RX to TX, ground to ground, SERIALn_PROTOCOL 2 (ArduPilot) or"
-                " MAV_n_CONFIG (PX4); UDP: does it send to this computer and this port, and does no firewall stop it?"
+                "check that the vehicle is on. Serial: TX to RX and RX to TX, ground to ground, SERIALn_PROTOCOL 2"
+                " (ArduPilot) or MAV_n_CONFIG (PX4). UDP: the vehicle must send to this computer and port, and no"
+                " firewall may block it"
             )
         elif not self._frames:
             do = (
-                "serial: try the other baud rates (SERIALn_BAUD, SER_TELn_BAUD); is this port MAVLink and not GPS, RC"
-                " or a console? UDP: who else sends to this port?"
+                "serial: try other baud rates (SERIALn_BAUD, SER_TELn_BAUD), and check that the port is MAVLink and not"
+                " GPS, RC or a console. UDP: check for other programs that send to this port"
             )
         else:
-            do = "is the autopilot's own port the one that you listen to?"
+            do = "check that this port is connected to the autopilot"
         yield Finding("problem", "vehicle", text, do)
 
     def _ids(self) -> Iterator[Finding]:
         different = {source for source, kinds in self._kinds.items() if len(kinds) > 1}
-        for system, component in sorted((self._twice | different) - {self._own}):
+        for system, component in sorted((self._duplicate_sources | different) - {self._own}):
             yield Finding(
                 "problem",
                 "ids",
-                f"two senders use system {system}, component {component}: one of them is not listened to",
-                "give each vehicle a system id of its own (ArduPilot MAV_SYSID or SYSID_THISMAV, PX4 MAV_SYS_ID); or is"
-                " there a second way to the same vehicle?",
+                f"two senders use system {system}, component {component}; the messages of one are ignored",
+                "give each vehicle a unique system id (ArduPilot MAV_SYSID or SYSID_THISMAV, PX4 MAV_SYS_ID), and check"
+                " for a second path to the same vehicle",
             )
-        autopilots = [source for source, beat in self._connection.heard.items() if is_autopilot(beat)]
+        autopilots = [source for source, beat in self._connection.heartbeats.items() if is_autopilot(beat)]
         for system, count in Counter(system for system, _ in autopilots).items():
             if count > 1:
-                components = ", ".join(
-                    str(component) for each, component in sorted(autopilots) if each == system
-                )
+                components = ", ".join(str(component) for other, component in sorted(autopilots) if other == system)
                 yield Finding(
                     "problem",
                     "ids",
                     f"system {system} has {count} autopilots (components {components})",
-                    "give each vehicle a system id of its own",
+                    "give each vehicle a unique system id",
                 )
-        if PROGRAM in self._frames:
+        if _PROGRAM_IDS in self._frames:
             yield Finding(
                 "note",
                 "ids",
-                f"another ground station uses our ids ({PROGRAM[0]}/{PROGRAM[1]})",
-                "vehicles cannot tell it from a program of yours: close it, or use source_system=254 in your program",
+                f"another ground station uses the ids of aerokit programs ({_PROGRAM_IDS[0]}/{_PROGRAM_IDS[1]})",
+                "vehicles cannot distinguish it from your program: close it, or set source_system=254 in your program",
             )
         if any(system == 0 for system, _ in self._frames):
             yield Finding(
-                "problem", "ids", "somebody uses system id 0, which is nobody's", "give it an id of 1 to 255"
+                "problem",
+                "ids",
+                "a sender uses system id 0, which means broadcast",
+                "give it an id from 1 to 255",
             )
 
     def _senders(self) -> Iterator[Finding]:
-        for source, heartbeat in sorted(self._connection.heard.items()):
+        for source, heartbeat in sorted(self._connection.heartbeats.items()):
             if source == self._own:
                 continue
             versions = self._versions.get(source, set())
-            who = "autopilot" if is_autopilot(heartbeat) else _kind(heartbeat.type)
-            number = " and ".join(str(each) for each in sorted(versions)) or "?"
-            text = f"system {source[0]}, component {source[1]}: {who}, MAVLink {number}, {self._frames[source]} frames"
+            kind = "autopilot" if is_autopilot(heartbeat) else _kind(heartbeat.type)
+            number = " and ".join(str(version) for version in sorted(versions)) or "?"
+            text = f"system {source[0]}, component {source[1]}: {kind}, MAVLink {number}, {self._frames[source]} frames"
             if is_autopilot(heartbeat) and 2 not in versions:
                 yield Finding(
                     "note",
                     "sender",
                     text,
-                    "MAVLink 1 has neither signatures nor the newer messages: SERIALn_PROTOCOL 2 (ArduPilot),"
-                    " MAV_PROTO_VER 2 (PX4); ArduPilot also speaks 1 until it has heard 2",
+                    "MAVLink 1 lacks signing and newer messages: set SERIALn_PROTOCOL 2 (ArduPilot) or MAV_PROTO_VER 2"
+                    " (PX4); ArduPilot sends version 1 until it receives version 2",
                 )
             else:
                 yield Finding("ok", "sender", text)
@@ -251,8 +245,8 @@ class LinkExamination:
     def _signing(self) -> Iterator[Finding]:
         signing = self._connection.signing
         if signing is not None:
-            if refused := self._connection.describe_signatures():
-                yield Finding("problem", "signing", refused, "is this the vehicle's key? docs/signing.md")
+            if refused := self._connection.describe_signature_problems():
+                yield Finding("problem", "signing", refused, "check that the key is the vehicle's (docs/signing.md)")
             return
         signed = sorted(source for source, count in self._signed.items() if count)
         if signed:
@@ -260,44 +254,44 @@ class LinkExamination:
             yield Finding(
                 "problem",
                 "signing",
-                f"{names} signs its frames, and no key is given: it will not listen to us",
-                "--signing-key FILE, or AEROKIT_SIGNING_KEY",
+                f"{names} signs its frames, but no key is given: it will ignore this computer",
+                "give the key: --signing-key FILE, or the variable AEROKIT_SIGNING_KEY",
             )
 
     def _unknown(self) -> Iterator[Finding]:
         numbers: Counter[int] = Counter()
-        for each in self._connection.statistics():
-            numbers.update(each.unknown_messages)
+        for statistics in self._connection.statistics():
+            numbers.update(statistics.unknown_messages)
         if numbers:
             listed = ", ".join(f"{number} ({count})" for number, count in sorted(numbers.items())[:10])
             yield Finding(
                 "note",
                 "dialect",
-                f"messages that are in no dialect that aerokit has: {listed}",
-                "they are passed over; Dialect.from_xml reads the definitions of their maker",
+                f"messages of an unknown dialect: {listed}",
+                "they are ignored; load their definitions with Dialect.from_xml",
             )
-        bad = sum(each.bad_bytes for each in self._connection.statistics())
-        total = sum(each.bytes for each in self._connection.statistics())
-        if self._frames and bad > TOLERABLE_LOSS * total:
+        bad = sum(statistics.bad_bytes for statistics in self._connection.statistics())
+        total = sum(statistics.bytes for statistics in self._connection.statistics())
+        if self._frames and bad > _MAX_LOSS * total:
             yield Finding(
                 "problem",
                 "bytes",
-                f"{bad} of {total} bytes are no MAVLink",
-                "a console or another protocol on the same port, or a line that damages bytes",
+                f"{bad} of {total} bytes are not MAVLink",
+                "check for a console or another protocol on the port, and for a damaged line",
             )
 
     def _loss(self) -> Iterator[Finding]:
         is_serial = self._connection.link.address.startswith(("serial:", "/dev/", "COM"))
         for system in sorted({system for system, _ in self._frames} - {self._own[0]}):
             received, lost = self._connection.counts(system)
-            if received + lost < ENOUGH_FRAMES:
+            if received + lost < _MIN_FRAMES_FOR_LOSS:
                 continue
             share = lost / (received + lost)
             text = f"system {system}: {100 * share:.1f} % of {received + lost} frames lost"
-            if share <= TOLERABLE_LOSS:
+            if share <= _MAX_LOSS:
                 yield Finding("ok", "loss", text)
             else:
-                yield Finding("problem", "loss", text, SERIAL_LOSS if is_serial else FORWARDED_LOSS)
+                yield Finding("problem", "loss", text, _SERIAL_LOSS_ADVICE if is_serial else _NETWORK_LOSS_ADVICE)
 
 
 def _kind(number: int) -> str:

@@ -1,44 +1,60 @@
-"""``aerokit files``: the files on a vehicle, by MAVFTP."""
+"""``aerokit files`` and ``aerokit logs``: files on a vehicle by MAVFTP, and its flight logs."""
 
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
-from aerokit.apps.cli.output import DONE, tell, tell_done
-from aerokit.apps.cli.terminal import file_size, progress_bar
-from aerokit.apps.cli.vehicle_command import add_action, connected
+from aerokit.apps.cli.arguments import directory
+from aerokit.apps.cli.connecting import add_action, command_action, confirm_blocking, connected
+from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
+from aerokit.apps.cli.terminal import progress_bar
+from aerokit.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from aerokit.vehicle.files.logs import LogEntry
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The actions of the command, and their arguments."""
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     listing = add_action(actions, "ls", _list, "List a directory.")
     listing.add_argument("path", nargs="?", default="/", help="directory on the vehicle (/)")
-    get = add_action(actions, "get", _get, "Fetch a file; one begun before is continued.")
-    get.add_argument("path", help="on the vehicle")
-    get.add_argument("to", nargs="?", help="here (the same name in this directory)")
-    put = add_action(actions, "put", _put, "Write a file to the vehicle.")
-    put.add_argument("file", help="here")
-    put.add_argument("path", help="on the vehicle")
+    get = add_action(actions, "get", _get, "Download a file; a partial download is resumed.")
+    get.add_argument("path", help="path on the vehicle")
+    get.add_argument("to", nargs="?", help="local file or directory (the same name in this directory)")
+    put = add_action(actions, "put", _put, "Upload a file.")
+    put.add_argument("file", help="local file")
+    put.add_argument("path", help="path on the vehicle")
+    remove = command_action("files rm", lambda v, o: v.files.remove(o.path, idle_timeout_s=o.patience))
+    rmdir = command_action("files rmdir", lambda v, o: v.files.remove_directory(o.path, idle_timeout_s=o.patience))
+    mkdir = command_action("files mkdir", lambda v, o: v.files.make_directory(o.path, idle_timeout_s=o.patience))
+    rename = command_action("files mv", lambda v, o: v.files.rename(o.path, o.new_path, idle_timeout_s=o.patience))
     for name, run, text in (
-        ("rm", _remove, "Remove a file."),
-        ("rmdir", _remove_directory, "Remove an empty directory."),
-        ("mkdir", _make_directory, "Make a directory."),
-        ("crc", _crc, "Print the CRC-32 that the vehicle computes of a file."),
+        ("rm", remove, "Remove a file."),
+        ("rmdir", rmdir, "Remove an empty directory."),
+        ("mkdir", mkdir, "Create a directory."),
+        ("crc", _crc, "Print the CRC-32 of a file, computed by the vehicle."),
     ):
-        add_action(actions, name, run, text).add_argument("path", help="on the vehicle")
-    move = add_action(actions, "mv", _move, "Rename a file or directory.")
-    move.add_argument("path", help="on the vehicle")
-    move.add_argument("new_path", help="on the vehicle")
+        add_action(actions, name, run, text).add_argument("path", help="path on the vehicle")
+    move = add_action(actions, "mv", rename, "Rename a file or directory.")
+    move.add_argument("path", help="path on the vehicle")
+    move.add_argument("new_path", help="path on the vehicle")
+
+
+def _size(path: str | os.PathLike[str]) -> int:
+    return os.path.getsize(path)
 
 
 async def _list(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
-        for entry in await vehicle.files.list(options.path, patience_s=options.patience):
+        for entry in await vehicle.files.list(options.path, idle_timeout_s=options.patience):
             size = "" if entry.size is None else f"{entry.size}"
             text = f"{size:>12}  {entry.name}{'/' if entry.is_directory else ''}"
-            tell(options, "file", {"directory": options.path, **entry.to_dict()}, text)
+            emit(options, "file", {"directory": options.path, **entry.to_dict()}, text)
     return DONE
 
 
@@ -47,62 +63,91 @@ async def _get(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         with progress_bar(to.name, "B") as show:
             await vehicle.files.download(
-                options.path, to, resume=True, patience_s=options.patience, on_progress=show
+                options.path, to, resume=True, idle_timeout_s=options.patience, on_progress=show
             )
-    size = file_size(to)
-    tell(options, "fetched", {"path": options.path, "file": to, "bytes": size}, f"{to}: {size} bytes")
+    size = _size(to)
+    emit(options, "fetched", {"path": options.path, "file": to, "bytes": size}, f"{to}: {size} bytes")
     return DONE
 
 
 def _destination(options: argparse.Namespace) -> Path:
-    """Where to put a file: where it is wanted, or under its own name."""
     name = PurePosixPath(options.path).name
     to = Path(options.to or name)
     return to / name if to.is_dir() else to
 
 
 async def _put(options: argparse.Namespace) -> int:
-    size = file_size(options.file)
+    size = _size(options.file)
     async with connected(options, changes=True) as vehicle:
         with progress_bar(Path(options.file).name, "B") as show:
-            await vehicle.files.upload(
-                options.file, options.path, patience_s=options.patience, on_progress=show
-            )
+            await vehicle.files.upload(options.file, options.path, idle_timeout_s=options.patience, on_progress=show)
     record = {"file": options.file, "path": options.path, "bytes": size}
-    tell(options, "sent", record, f"{options.path}: {size} bytes")
-    return DONE
-
-
-async def _remove(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.files.remove(options.path, patience_s=options.patience)
-    tell_done(options, "files rm")
-    return DONE
-
-
-async def _remove_directory(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.files.remove_directory(options.path, patience_s=options.patience)
-    tell_done(options, "files rmdir")
-    return DONE
-
-
-async def _make_directory(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.files.make_directory(options.path, patience_s=options.patience)
-    tell_done(options, "files mkdir")
-    return DONE
-
-
-async def _move(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.files.rename(options.path, options.new_path, patience_s=options.patience)
-    tell_done(options, "files mv")
+    emit(options, "sent", record, f"{options.path}: {size} bytes")
     return DONE
 
 
 async def _crc(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
-        crc = f"{await vehicle.files.crc32(options.path, patience_s=options.patience):08x}"
-    tell(options, "crc", {"path": options.path, "crc32": crc}, crc)
+        crc = f"{await vehicle.files.crc32(options.path, idle_timeout_s=options.patience):08x}"
+    emit(options, "crc", {"path": options.path, "crc32": crc}, crc)
+    return DONE
+
+
+def add_logs_arguments(command: argparse.ArgumentParser) -> None:
+    actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
+    add_action(actions, "list", _list_logs, "List the flight logs.")
+    get = add_action(actions, "get", _get_logs, "Download flight logs; a partial download is resumed.")
+    get.add_argument("ids", nargs="*", type=int, metavar="ID", help="ids of logs (the newest)")
+    get.add_argument("--all", action="store_true", help="every log")
+    get.add_argument(
+        "--to",
+        type=directory,
+        default=Path(),
+        metavar="DIRECTORY",
+        help="directory to write them to (this directory)",
+    )
+    get.add_argument("--method", choices=("auto", "ftp", "log"), default="auto", help="download method (auto)")
+    erase = add_action(actions, "erase", _erase, "Erase all flight logs.")
+    erase.add_argument("--yes", action="store_true", help="do not ask")
+
+
+async def _list_logs(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        for entry in await vehicle.logs.list(idle_timeout_s=options.patience):
+            time = "" if entry.time_utc is None else f"{entry.time_utc:%Y-%m-%d %H:%M:%S}"
+            emit(options, "log", entry.to_dict(), f"{entry.id:>6}  {entry.size:>12}  {time}".rstrip())
+    return DONE
+
+
+async def _get_logs(options: argparse.Namespace) -> int:
+    async with connected(options) as vehicle:
+        entries = await vehicle.logs.list(idle_timeout_s=options.patience)
+        for entry in _chosen(entries, options):
+            to = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
+            with progress_bar(to.name, "B") as show:
+                await vehicle.logs.download(
+                    entry, to, method=options.method, idle_timeout_s=options.patience, on_progress=show
+                )
+            size = _size(to)
+            emit(options, "fetched_log", {"id": entry.id, "file": to, "bytes": size}, f"{to}: {size} bytes")
+    return DONE
+
+
+def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
+    if options.all or not options.ids:
+        return entries if options.all else entries[-1:]
+    known = {entry.id: entry for entry in entries}
+    for log_id in options.ids:
+        if log_id not in known:
+            raise InvalidArgument(f"the vehicle has no log {log_id}; its logs: {', '.join(map(str, known)) or 'none'}")
+    return [known[log_id] for log_id in options.ids]
+
+
+async def _erase(options: argparse.Namespace) -> int:
+    if not options.yes and not confirm_blocking("erase all flight logs of the vehicle?"):
+        emit(options, "declined", {"action": "logs erase"}, "not confirmed; nothing was erased")
+        return FAILED
+    async with connected(options, changes=True) as vehicle:
+        await vehicle.logs.erase(idle_timeout_s=options.patience)
+    emit_done(options, "logs erase", "erased")
     return DONE

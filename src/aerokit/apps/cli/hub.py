@@ -1,4 +1,4 @@
-"""``aerokit hub``: several links joined into one MAVLink network, until Ctrl-C."""
+"""``aerokit hub``: several links joined into one MAVLink network."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit._internal.wording import did_you_mean
-from aerokit.apps.cli.arguments import add_baud, address, number, writable_file
-from aerokit.apps.cli.completers import addresses, offer
-from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, make_new_recording, remove_if_empty, tell
+from aerokit._internal.formatting import did_you_mean
+from aerokit.apps.cli.arguments import add_baud, address, log_file, number
+from aerokit.apps.cli.completion import addresses, offer
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, signing_of
+from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, create_recording, emit, remove_if_empty
 from aerokit.apps.cli.terminal import on_interrupt
-from aerokit.apps.cli.vehicle_command import ENVIRONMENT, add_signing_key, signing_of
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
@@ -27,41 +27,32 @@ _FILTER = "'GPS_*,HEARTBEAT@NAME'"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The arguments of the command."""
     command.set_defaults(run=_hub)
     place = command.add_argument(
-        "places",
+        "endpoints",
         nargs="+",
-        type=_place,
+        type=_named_address,
         metavar="[NAME=]ADDRESS",
-        help="tcpin:0.0.0.0:5760, udpout:10.0.0.7:14550, radio=/dev/ttyUSB0,57600 …; options find it by its NAME,"
-        " or by the address as it is written",
+        help="tcpin:0.0.0.0:5760, udpout:10.0.0.7:14550, radio=/dev/ttyUSB0,57600 …; options refer to an endpoint by"
+        " NAME, or by ADDRESS as written",
     )
     offer(place, addresses)
-    _add_names(command, "--read-only", "what comes from there is not passed on, not even heartbeats")
-    _add_names(command, "--patient", "begin without it when it cannot be opened, and go on trying")
-    only = f"only these messages go out, at one endpoint or, without @NAME, at all: {_FILTER}"
+    _add_names(command, "--read-only", "do not forward messages received there, heartbeats included")
+    _add_names(command, "--patient", "if it cannot be opened, start without it and keep trying")
+    only = f"send only these messages, at one endpoint or, without @NAME, at all: {_FILTER}"
     _add_filter(command, "--only", _messages, only)
-    _add_filter(command, "--block", _messages, f"these messages do not go out: {_FILTER}")
-    _add_filter(
-        command,
-        "--rate",
-        _rate,
-        "these go out so many times a second at most, of each sender: 'ATTITUDE=5@NAME'",
-    )
-    _add_names(command, "--signed", "sign what goes out there, and let in only what is signed")
-    add_signing_key(command, f"for --signed (${ENVIRONMENT})")
-    add_baud(command, "serial ports whose address says none")
+    _add_filter(command, "--block", _messages, f"do not send these messages: {_FILTER}")
+    _add_filter(command, "--rate", _rate, "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'")
+    _add_names(command, "--signed", "sign what is sent there, and accept only signed messages")
+    add_signing_key(command, f"key for --signed (${SIGNING_KEY_VARIABLE})")
+    add_baud(command)
     command.add_argument(
-        "--record",
-        type=_log_file,
-        metavar="FILE",
-        help="write every frame once, to a new file: flight.tlog",
+        "--record", type=log_file, metavar="FILE", help="record every frame once, to a new file: flight.tlog"
     )
     command.add_argument(
         "--every", type=number(0.1, 1e6), default=10.0, metavar="S", help="seconds between statistics (10)"
     )
-    command.add_argument("--seconds", type=number(0.1, 1e6), metavar="S", help="end after so many seconds")
+    command.add_argument("--seconds", type=number(0.1, 1e6), metavar="S", help="stop after S seconds")
     add_json(command)
 
 
@@ -69,33 +60,29 @@ def _add_names(command: argparse.ArgumentParser, option: str, text: str) -> None
     command.add_argument(option, action="append", default=[], metavar="NAME", help=f"{text} (repeatable)")
 
 
-def _add_filter(
-    command: argparse.ArgumentParser, option: str, read: Callable[[str], object], text: str
-) -> None:
-    command.add_argument(
-        option, action="append", default=[], type=read, metavar="FILTER", help=f"{text} (repeatable)"
-    )
+def _add_filter(command: argparse.ArgumentParser, option: str, read: Callable[[str], object], text: str) -> None:
+    command.add_argument(option, action="append", default=[], type=read, metavar="FILTER", help=f"{text} (repeatable)")
 
 
-def _place(text: str) -> tuple[str, str]:
-    """Name and address."""
+def _named_address(text: str) -> tuple[str, str]:
+    """Parse ``[NAME=]ADDRESS`` into name and address."""
     named = _NAMED.fullmatch(text)
     return (named[1], address(named[2])) if named else (text, address(text))
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
-    """For which endpoint ("": all), and names of messages."""
+    """Parse ``MESSAGE,…[@NAME]`` into the endpoint ("" for all) and message patterns."""
     names, at, endpoint = text.partition("@")
-    found = tuple(each.strip() for each in names.split(",") if each.strip())
+    found = tuple(name.strip() for name in names.split(",") if name.strip())
     if not found:
-        raise argparse.ArgumentTypeError(f"{text!r} names no message: {_FILTER}")
+        raise argparse.ArgumentTypeError(f"{text!r} has no message name; expected {_FILTER}")
     if at and not endpoint:
-        raise argparse.ArgumentTypeError(f"{text!r} names no endpoint behind the @: {_FILTER}")
+        raise argparse.ArgumentTypeError(f"{text!r} has no endpoint after the @; expected {_FILTER}")
     return endpoint, found
 
 
 def _rate(text: str) -> tuple[str, dict[str, float]]:
-    """For which endpoint ("": all), and the rate of each message."""
+    """Parse ``MESSAGE=HZ,…[@NAME]`` into the endpoint ("" for all) and rates."""
     endpoint, parts = _messages(text)
     rates = {}
     for part in parts:
@@ -103,14 +90,8 @@ def _rate(text: str) -> tuple[str, dict[str, float]]:
         try:
             rates[name] = float(hz)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{part!r} is no rate: ATTITUDE=5") from None
+            raise argparse.ArgumentTypeError(f"{part!r} is not a rate; expected ATTITUDE=5") from None
     return endpoint, rates
-
-
-def _log_file(text: str) -> str:
-    if not text.lower().endswith(".tlog"):
-        raise argparse.ArgumentTypeError(f"{text!r} does not end in .tlog")
-    return writable_file(text)
 
 
 async def _hub(options: argparse.Namespace) -> int:
@@ -119,14 +100,14 @@ async def _hub(options: argparse.Namespace) -> int:
     endpoints = _endpoints(options)
     stop = asyncio.Event()
     hub = Hub(endpoints)
-    hub.on_event(lambda event: _tell_event(options, event))
+    hub.on_event(lambda event: _emit_hub_event(options, event))
     with on_interrupt(stop.set):
         async with hub:
             if options.record is not None:
-                make_new_recording(options.record)
+                create_recording(options.record)
                 hub.record(options.record)
-            record = {"endpoints": [each.address for each in hub.endpoints], "file": options.record}
-            tell(
+            record = {"endpoints": [endpoint.address for endpoint in hub.endpoints], "file": options.record}
+            emit(
                 options,
                 "hub",
                 record,
@@ -137,8 +118,8 @@ async def _hub(options: argparse.Namespace) -> int:
                     with anyio.move_on_after(options.every):
                         await stop.wait()
                     if not stop.is_set():
-                        _tell_statistics(options, hub)
-            _tell_statistics(options, hub)
+                        _emit_statistics(options, hub)
+            _emit_statistics(options, hub)
         if options.record is not None:
             remove_if_empty(options.record)
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
@@ -151,7 +132,7 @@ def _how_long(options: argparse.Namespace) -> str:
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
     from aerokit.hub import Endpoint
 
-    names = [name for name, _ in options.places]
+    names = [name for name, _ in options.endpoints]
     for option in ("read_only", "patient", "signed"):
         for name in getattr(options, option):
             _check_known(name, names)
@@ -159,22 +140,20 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
         if name:
             _check_known(name, names)
     if options.signed and signing_of(options) is None:
-        raise InvalidArgument(f"--signed needs a key: --signing-key FILE or ${ENVIRONMENT}")
+        raise InvalidArgument(f"--signed needs a key: give --signing-key FILE, or set ${SIGNING_KEY_VARIABLE}")
     return [
         Endpoint(
             place,
             name=name,
             only=_for(name, options.only),
             block=_for(name, options.block),
-            rates={
-                key: hz for where, rates in options.rate if where in ("", name) for key, hz in rates.items()
-            },
+            rates={key: hz for where, rates in options.rate if where in ("", name) for key, hz in rates.items()},
             read_only=name in options.read_only,
             signing=signing_of(options) if name in options.signed else None,
             baud=options.baud,
-            patient=name in options.patient,
+            retry_open=name in options.patient,
         )
-        for name, place in options.places
+        for name, place in options.endpoints
     ]
 
 
@@ -185,25 +164,27 @@ def _for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str
 def _check_known(name: str, names: list[str]) -> None:
     if name not in names:
         raise InvalidArgument(
-            f"there is no endpoint {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}"
+            f"no endpoint is named {name!r}{did_you_mean(name, names)}; endpoints: {', '.join(names)}"
         )
 
 
-def _tell_event(options: argparse.Namespace, event: HubEvent) -> None:
+def _emit_hub_event(options: argparse.Namespace, event: HubEvent) -> None:
     record = {"endpoint": event.endpoint, "kind": event.kind, "text": event.text}
-    tell(options, "hub_event", record, f"{event.endpoint}: {event.text}")
+    emit(options, "hub_event", record, f"{event.endpoint}: {event.text}")
 
 
-def _tell_statistics(options: argparse.Namespace, hub: Hub) -> None:
-    for each in hub.endpoints:
-        tell(options, "endpoint", each.to_dict(), _line(each))
+def _emit_statistics(options: argparse.Namespace, hub: Hub) -> None:
+    for endpoint in hub.endpoints:
+        emit(options, "endpoint", endpoint.to_dict(), _line(endpoint))
 
 
-def _line(each: EndpointStatistics) -> str:
-    systems = ", ".join(f"{system}/{component}" for system, component in each.systems) or "nobody"
+def _line(endpoint: EndpointStatistics) -> str:
+    systems = ", ".join(f"{system}/{component}" for system, component in endpoint.systems) or "none"
     text = (
-        f"{each.name}: {each.frames_in} frames in, {each.frames_out} out, {each.lost} lost; heard {systems}"
+        f"{endpoint.name}: {endpoint.frames_in} frames in, {endpoint.frames_out} out, {endpoint.lost} lost;"
+        f" systems {systems}"
     )
-    if not each.is_open:
-        text += "; away"
-    return text + "".join(f"; {reason.replace('_', ' ')} {count}" for reason, count in each.dropped.items())
+    if not endpoint.is_open:
+        text += "; not connected"
+    dropped = (f"; {reason.replace('_', ' ')} {count}" for reason, count in endpoint.dropped.items())
+    return text + "".join(dropped)

@@ -1,4 +1,4 @@
-"""The command line: which command is meant, and how it ends."""
+"""The command line: the table of commands, argument parsing, and exit codes."""
 
 from __future__ import annotations
 
@@ -7,77 +7,180 @@ import asyncio
 import os
 import re
 import sys
+from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from aerokit._internal.imports import complaint
-from aerokit._internal.wording import did_you_mean
-from aerokit.apps.cli.commands import COMMANDS
-from aerokit.apps.cli.output import FAILED, NotInstalled, describe, exit_code, need, tell_error
+from aerokit._internal.formatting import did_you_mean
+from aerokit._internal.imports import installation_problem
+from aerokit.apps.cli.output import FAILED, NotInstalled, emit_error, exit_code, exit_codes_help, import_extra
 from aerokit.errors import AerokitError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-COMPLETING = "_ARGCOMPLETE"
-"""The variable that a shell sets when it asks for completions."""
-
+ARGCOMPLETE_VARIABLE = "_ARGCOMPLETE"
+"""Environment variable that the shell sets when it asks argcomplete for completions."""
+# `aerokit run PROGRAM ARGUMENTS…` is not parsed here: the arguments belong to the program.
 RUN = "run"
-"""Handled apart: what comes behind its program is the program's, and nothing of it is ours to parse."""
 
 
-_BELOW_ZERO = re.compile(r"-\.?\d")
+@dataclass(frozen=True)
+class CliCommand:
+    """A subcommand, ``aerokit NAME``. Its module is imported only when the command is called.
 
-_CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")
+    ``location`` is ``"module:function"`` in `aerokit.apps.cli`; the function is ``add_arguments`` by default.
+    It adds the arguments to a parser, and sets ``run`` to a coroutine function that takes the parsed options
+    and returns the exit code. The first sentence of ``description`` appears in the list of commands.
+    """
+
+    name: str
+    location: str
+    description: str
+
+    @property
+    def help(self) -> str:
+        """The first sentence of the description, for the list of commands."""
+        return self.description[0].lower() + self.description[1:].partition(". ")[0].rstrip(".")
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Import the module and let it add its arguments."""
+        module, _, function = self.location.partition(":")
+        getattr(import_module(f"aerokit.apps.cli.{module}"), function or "add_arguments")(parser)
+
+
+COMMANDS = (
+    CliCommand(
+        "demo",
+        "demo",
+        "Fly a square, on a simulated vehicle or with --connect on any vehicle. The vehicle takes off,"
+        " flies the square, and lands. Ctrl-C lands it where it is; a second Ctrl-C exits without further"
+        " commands.",
+    ),
+    CliCommand("sim", "sim", "Simulate vehicles for other programs, until Ctrl-C."),
+    CliCommand(
+        "status",
+        "status",
+        "Show what is on a link. Lists systems and components, firmware, mode, GPS, battery, link"
+        " quality, and what is missing for flight. Requests data that a vehicle does not stream; changes"
+        " nothing.",
+    ),
+    CliCommand(
+        "events",
+        "listening:add_events_arguments",
+        "Print the events of a link and the texts of its vehicles, until Ctrl-C.",
+    ),
+    CliCommand(
+        "doctor",
+        "doctor",
+        "Find problems of installation and connection. Without ADDRESS, checks this computer:"
+        " installation, serial ports, permissions, network ports. With ADDRESS, checks a link: baud rate,"
+        " protocol version, ids, signing, dialect, packet loss.",
+    ),
+    CliCommand("record", "listening", "Record a link to a telemetry log (.tlog), until Ctrl-C."),
+    CliCommand(
+        "hub",
+        "hub",
+        "Join links into one MAVLink network, until Ctrl-C. Forwards messages between serial, UDP and TCP"
+        " links by MAVLink's routing rules, and sends none of its own.",
+    ),
+    CliCommand(
+        "monitor",
+        "listening:add_monitor_arguments",
+        "Watch vehicles in the terminal. Shows state with ages, texts, message rates, link quality and a"
+        " map. Keys command hold, land and return, after a confirmation.",
+    ),
+    CliCommand("params", "params", "Read, set, save, load and compare the parameters of a vehicle."),
+    CliCommand("mission", "mission", "Transfer, show and check missions, fences and rally points."),
+    CliCommand(
+        "fly",
+        "fly",
+        "Fly a plan from a file. Uploads the plan, asks for confirmation, arms the vehicle, and flies the"
+        " mission to its end; --sim flies it on a simulated vehicle. Ctrl-C returns to launch; a second"
+        " Ctrl-C exits without further commands.",
+    ),
+    CliCommand("files", "files", "List, download and change files on a vehicle by MAVFTP."),
+    CliCommand("logs", "files:add_logs_arguments", "List, download and erase the flight logs on a vehicle."),
+    CliCommand("camera", "devices", "Use the cameras of a vehicle: pictures, video, lens and storage."),
+    CliCommand(
+        "serve",
+        "serve",
+        "Serve vehicles to the browser. The page shows map, state, missions and parameters, and sends"
+        " orders; there is also an HTTP and WebSocket API. Orders need the token that is printed.",
+    ),
+    CliCommand(
+        "gimbal",
+        "devices:add_gimbal_arguments",
+        "Show where a vehicle's gimbal points, and point it.",
+    ),
+    CliCommand("bridge", "bridge", "Publish the vehicles on a link to Foxglove, zenoh or MQTT."),
+    CliCommand(
+        "report",
+        "flight_logs:add_report_arguments",
+        "Write a report on a flight log as HTML. The self-contained file has a summary, map, charts,"
+        " failsafes and parameters. With two logs (.tlog, .bin, .ulg) it compares the flights.",
+    ),
+    CliCommand(
+        "convert",
+        "flight_logs",
+        "Convert a flight log (.tlog, .bin, .ulg) to MCAP for Foxglove, CSV, Parquet, GPX or KML.",
+    ),
+    CliCommand(
+        "completion",
+        "completion",
+        "Print a script that completes commands, options and names in your shell.",
+    ),
+)
 
 
 class Parser(argparse.ArgumentParser):
-    """Its subparsers are of this class, too, and each complains of its own arguments."""
+    """An ArgumentParser that accepts negative coordinates and suggests corrections. Subparsers have the same class."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # argparse takes "-35.36,149.16,584" for an option, and half of the world is south; a number alone it knows.
-        self._negative_number_matcher = _BELOW_ZERO
+        # argparse recognises "-35" as a number, but takes "-35.36,149.16,584" for an option.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
-        """Refuse what is left over here, where the known options and the right usage are known."""
+        """Report unrecognized arguments in the subparser, which has the right usage message."""
         if args is not None and self._subparsers is None:
-            self._refuse_unknown_options(args)
+            self._check_option_names(args)
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self._refuse(unknown)
+            self._fail_unrecognized(unknown)
         return namespace, unknown
 
-    def _refuse_unknown_options(self, args: Sequence[str]) -> None:
-        """Before what stands behind one is taken for an address."""
+    def _check_option_names(self, args: Sequence[str]) -> None:
+        # Checked first: otherwise argparse takes the value after an unknown option for a positional argument.
         options = list(args[: args.index("--")] if "--" in args else args)
-        names = [each.partition("=")[0] for each in options if each.startswith("--")]
+        names = [option.partition("=")[0] for option in options if option.startswith("--")]
         for name in names:
             if not any(known.startswith(name) for known in self._option_string_actions):
-                self._refuse([name])
+                self._fail_unrecognized([name])
 
-    def _refuse(self, unknown: Sequence[str]) -> NoReturn:
-        options = [each for each in unknown if each.startswith("-")]
-        meant = did_you_mean(options[0].partition("=")[0] if options else None, self._option_string_actions)
-        self.error(f"unrecognized arguments: {' '.join(unknown)}{meant}")
+    def _fail_unrecognized(self, unknown: Sequence[str]) -> NoReturn:
+        options = [argument for argument in unknown if argument.startswith("-")]
+        hint = did_you_mean(options[0].partition("=")[0] if options else None, self._option_string_actions)
+        self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
 
     def error(self, message: str) -> NoReturn:
-        """Exit code 2."""
-        if found := _CHOICE.search(message):
+        """Print the usage and the message, and exit with code 2."""
+        if found := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             message += did_you_mean(found[1], re.findall(r"[\w.-]+", found[2]))
         super().error(message)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code (`aerokit.apps.cli.output`).
+    """Run the command line and return its exit code, as listed in `aerokit.apps.cli.output`.
 
-    ``aerokit run`` ends as the program does that it runs; what that raises comes out.
+    ``aerokit run PROGRAM`` returns or raises what the program does.
     """
-    if (mixed := _mixed_files()) is not None:
-        print(f"aerokit: {mixed}", file=sys.stderr)
+    if (problem := _installation_problem()) is not None:
+        print(f"aerokit: {problem}", file=sys.stderr)
         return FAILED
-    if COMPLETING in os.environ:
+    if ARGCOMPLETE_VARIABLE in os.environ:
         return complete()
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments and arguments[0] == RUN:
@@ -88,53 +191,56 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - else the interpreter complains at its exit
+        # Otherwise the interpreter reports another BrokenPipeError when it flushes stdout at exit.
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return FAILED
     except KeyboardInterrupt:
-        return _failed(KeyboardInterrupt("interrupted"), options)
+        return _report(KeyboardInterrupt("interrupted"), options)
     except (AerokitError, OSError) as error:
-        return _failed(error, options)
+        return _report(error, options)
     return code
 
 
-def _mixed_files() -> str | None:
-    """Our entry point is called whoever's ``__init__`` it is that is there."""
+def _installation_problem() -> str | None:
+    # Another distribution named `aerokit` may have overwritten our files, `__init__.py` included.
     import aerokit
 
-    return complaint(aerokit.__path__[0], is_ours="open_connection" in getattr(aerokit, "__all__", ()))
+    return installation_problem(aerokit.__path__[0], is_ours="open_connection" in getattr(aerokit, "__all__", ()))
 
 
-def _failed(error: BaseException, options: argparse.Namespace) -> int:
+def _report(error: BaseException, options: argparse.Namespace) -> int:
     code = exit_code(error)
-    tell_error(error, code, as_json=getattr(options, "json", False))
+    emit_error(error, code, as_json=getattr(options, "json", False))
     return code
 
 
 def make_parser(only: str | None = None) -> argparse.ArgumentParser:
-    """The parser of all commands.
+    """Make the parser for the command line.
 
-    Arguments has that command alone that ``only`` names, if it is one: importing all of them takes long. None: all.
+    Args:
+        only: the one command that gets its arguments; importing all command modules is slow. None: all
+            commands.
     """
     from aerokit import __version__
 
-    parser = Parser(prog="aerokit", description="Control drones over MAVLink.", epilog=describe())
+    parser = Parser(prog="aerokit", description="Control drones over MAVLink.", epilog=exit_codes_help())
     parser.add_argument("--version", action="version", version=f"aerokit {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     for command in COMMANDS:
-        its_parser = commands.add_parser(command.name, help=command.help, description=command.description)
+        subparser = subparsers.add_parser(command.name, help=command.help, description=command.description)
         if only in (command.name, None):
-            command.add_arguments(its_parser)
-    run = commands.add_parser(RUN, help="run a DroneKit program unchanged", add_help=False)
-    run.add_argument("program", nargs=argparse.REMAINDER)  # for completion, which offers files
+            command.add_arguments(subparser)
+    run = subparsers.add_parser(RUN, help="run a DroneKit program unchanged", add_help=False)
+    run.add_argument("program", nargs=argparse.REMAINDER)  # for completion of file names
     return parser
 
 
 def complete() -> int:
-    """Answer the shell, which has said by variables what is typed so far."""
+    """Print completions for the command line in COMP_LINE, for argcomplete's shell functions."""
     try:
-        argcomplete = need("argcomplete", "completion")
+        argcomplete = import_extra("argcomplete", "completion")
     except NotInstalled:
         return FAILED
     words = os.environ.get("COMP_LINE", "").split()
-    argcomplete.autocomplete(make_parser(words[1] if len(words) > 1 else ""))
-    return FAILED  # it does not come back
+    argcomplete.autocomplete(make_parser(words[1] if len(words) > 1 else ""))  # exits the process
+    return FAILED

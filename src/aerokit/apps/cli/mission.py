@@ -1,4 +1,4 @@
-"""``aerokit mission``: missions, fences and rally points of a vehicle, and the files they are kept in."""
+"""``aerokit mission``: missions, fences and rally points of a vehicle, and plan files."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.wording import did_you_mean
+from aerokit._internal.formatting import did_you_mean
 from aerokit.apps.cli.arguments import writable_file
-from aerokit.apps.cli.completers import offer
-from aerokit.apps.cli.output import DONE, add_force, check_new, tell, tell_done
+from aerokit.apps.cli.completion import offer
+from aerokit.apps.cli.connecting import add_action, command_action, connected
+from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit
 from aerokit.apps.cli.terminal import progress_bar
-from aerokit.apps.cli.vehicle_command import add_action, connected
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,11 +23,11 @@ PARTS = ("mission", "fence", "rally")
 
 
 def read_plan(path: str) -> Plan:
-    """The plan in a file of either format, checked.
+    """Read and check a .plan or QGC WPL 110 file.
 
     Raises:
         OSError: the file cannot be read.
-        FileFormatError: it is neither of the two; the text says where.
+        FileFormatError: the file has neither format; the message says where.
         InvalidArgument: an item cannot be sent.
     """
     from aerokit.missions import Plan, read_plan_file, read_waypoint_file
@@ -40,14 +40,13 @@ def read_plan(path: str) -> Plan:
     return plan
 
 
-def tell_part(options: argparse.Namespace, part: str, items: int, state: str, text: str) -> None:
-    """One part of a plan: how many items it has, and what became of it."""
-    tell(options, "plan_part", {"part": part, "items": items, "state": state}, text)
+def emit_part(options: argparse.Namespace, part: str, items: int, state: str, text: str) -> None:
+    emit(options, "plan_part", {"part": part, "items": items, "state": state}, text)
 
 
-def tell_items(options: argparse.Namespace, part: str, items: Sequence[MissionItem], state: str) -> None:
-    """A part of a plan, item by item."""
-    tell_part(options, part, len(items), state, f"{part}: {len(items)} items")
+def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionItem], state: str) -> None:
+    """Print a part of a plan, item by item."""
+    emit_part(options, part, len(items), state, f"{part}: {len(items)} items")
     for index, item in enumerate(items):
         position = item.position
         record = {
@@ -58,21 +57,19 @@ def tell_items(options: argparse.Namespace, part: str, items: Sequence[MissionIt
             "longitude_deg": None if position is None else position.longitude_deg,
             **item.to_dict(),
         }
-        tell(options, "plan_item", record, f"{index:>5}  {item.name:32} {_place(item)}".rstrip())
+        emit(options, "plan_item", record, f"{index:>5}  {item.name:32} {_place(item)}".rstrip())
 
 
 async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace) -> None:
-    """Send what the file has; what it does not speak of stays as it is on the vehicle."""
+    """Upload the parts that the file has. Other parts on the vehicle stay unchanged."""
     for part in PARTS:
         content = getattr(plan, part)
         count = len(content.to_items())
         if count == 0:
             continue
         with progress_bar(part, "item") as show:
-            await getattr(vehicle, part).upload(content, patience_s=options.patience, on_progress=show)
-        tell_part(
-            options, part, count, "uploaded", f"{part}: {count} items are on vehicle {vehicle.system_id}"
-        )
+            await getattr(vehicle, part).upload(content, idle_timeout_s=options.patience, on_progress=show)
+        emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
 
 
 def _place(item: MissionItem) -> str:
@@ -84,30 +81,31 @@ def _place(item: MissionItem) -> str:
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The actions of the command, and their arguments."""
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
-    _add_parts(add_action(actions, "show", _show, "Show what the vehicle holds."))
-    download = add_action(actions, "download", _download, "Save what the vehicle holds to a file.")
+    _add_parts(add_action(actions, "show", _show, "Show the vehicle's mission, fence or rally points."))
+    download = add_action(actions, "download", _download, "Save the vehicle's plan to a file.")
     download.add_argument(
-        "file", type=writable_file, help=".plan (QGroundControl) or .waypoints, .txt (QGC WPL 110)"
+        "file",
+        type=writable_file,
+        help=".plan (QGroundControl), or .waypoints or .txt (QGC WPL 110, the mission only)",
     )
     add_force(download)
     upload = add_action(
         actions,
         "upload",
         _upload,
-        "Send the mission, fence and rally points of a file; what it does not have stays as it is.",
+        "Upload the mission, fence and rally points in a file. Parts that it does not have stay unchanged.",
     )
     upload.add_argument("file", help=".plan (QGroundControl), or a file that begins with QGC WPL 110")
-    check = add_action(actions, "check", _check, "Check a file without a vehicle.", talks=False)
+    check = add_action(actions, "check", _check, "Check a file without a vehicle.", connects=False)
     check.add_argument("file")
-    _add_parts(add_action(actions, "clear", _clear, "Remove what the vehicle holds."))
-    for name, run, text in (
-        ("start", _start, "Start the mission."),
-        ("pause", _pause, "Hold, and keep the place in the mission."),
-        ("resume", _resume, "Go on with the mission."),
-    ):
-        add_action(actions, name, run, text)
+    _add_parts(add_action(actions, "clear", _clear, "Clear the vehicle's mission, fence or rally points."))
+    start = command_action("mission start", lambda vehicle, _: vehicle.mission.start())
+    pause = command_action("mission pause", lambda vehicle, _: vehicle.mission.pause())
+    resume = command_action("mission resume", lambda vehicle, _: vehicle.mission.resume())
+    add_action(actions, "start", start, "Start the mission.")
+    add_action(actions, "pause", pause, "Pause the mission and hold.")
+    add_action(actions, "resume", resume, "Resume the mission.")
 
 
 def _add_parts(action: argparse.ArgumentParser) -> None:
@@ -124,23 +122,23 @@ def _add_parts(action: argparse.ArgumentParser) -> None:
 
 def _part(text: str) -> str:
     if text not in PARTS:
-        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(PARTS)}{did_you_mean(text, PARTS)}")
+        hint = did_you_mean(text, PARTS)
+        raise argparse.ArgumentTypeError(f"{text!r} is not one of {', '.join(PARTS)}{hint}")
     return text
 
 
-# ---------------------------------------------------------------------------------------- actions
 async def _show(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         for part in options.parts:
             items = (await _download_part(vehicle, part, options)).to_items()
-            tell_items(options, part, items, "on the vehicle")
+            emit_items(options, part, items, "on the vehicle")
     return DONE
 
 
 async def _download(options: argparse.Namespace) -> int:
     from aerokit.missions import Plan, write_plan_file, write_waypoint_file
 
-    check_new(options.file, options)
+    check_not_existing(options.file, options)
     async with connected(options) as vehicle:
         mission = await _download_part(vehicle, "mission", options)
         if Path(options.file).suffix == ".plan":
@@ -151,7 +149,7 @@ async def _download(options: argparse.Namespace) -> int:
         else:
             write_waypoint_file(options.file, mission)
     record = {"file": options.file, "what": "mission items", "count": len(mission)}
-    tell(options, "saved", record, f"{len(mission)} mission items in {options.file}")
+    emit(options, "saved", record, f"{len(mission)} mission items written to {options.file}")
     return DONE
 
 
@@ -165,39 +163,18 @@ async def _upload(options: argparse.Namespace) -> int:
 async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
     for part in PARTS:
-        tell_items(options, part, getattr(plan, part).to_items(), "in the file")
+        emit_items(options, part, getattr(plan, part).to_items(), "in the file")
     return DONE
 
 
 async def _clear(options: argparse.Namespace) -> int:
     async with connected(options, changes=True) as vehicle:
         for part in options.parts:
-            await getattr(vehicle, part).clear(patience_s=options.patience)
-            tell_part(options, part, 0, "cleared", f"{part}: cleared")
-    return DONE
-
-
-async def _start(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.mission.start()
-    tell_done(options, "mission start")
-    return DONE
-
-
-async def _pause(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.mission.pause()
-    tell_done(options, "mission pause")
-    return DONE
-
-
-async def _resume(options: argparse.Namespace) -> int:
-    async with connected(options, changes=True) as vehicle:
-        await vehicle.mission.resume()
-    tell_done(options, "mission resume")
+            await getattr(vehicle, part).clear(idle_timeout_s=options.patience)
+            emit_part(options, part, 0, "cleared", f"{part}: cleared")
     return DONE
 
 
 async def _download_part(vehicle: Vehicle, part: str, options: argparse.Namespace) -> Any:
     with progress_bar(part, "item") as show:
-        return await getattr(vehicle, part).download(patience_s=options.patience, on_progress=show)
+        return await getattr(vehicle, part).download(idle_timeout_s=options.patience, on_progress=show)

@@ -1,4 +1,4 @@
-"""What commands print: text for people, or with ``--json`` one JSON object a line for programs."""
+"""Output of commands as text or JSON lines, exit codes, and checks shared by commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.plain import plain, printable
+from aerokit._internal.formatting import printable, to_jsonable
 from aerokit.errors import (
     AerokitError,
     FileFormatError,
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 
 def add_json(command: argparse._ActionsContainer) -> None:
-    """Add ``--json``."""
     command.add_argument(
         "--json",
         action="store_true",
@@ -35,22 +34,22 @@ def add_json(command: argparse._ActionsContainer) -> None:
     )
 
 
-def tell(options: argparse.Namespace, kind: str, record: Mapping[str, object], text: str | None) -> None:
-    """Print one thing that is told.
+def emit(options: argparse.Namespace, kind: str, record: Mapping[str, object], text: str | None) -> None:
+    """Print one record: a JSON object with ``--json``, otherwise text.
 
     Args:
-        options: of the command, which say whether JSON is wanted.
-        kind: what it is, ``"parameter"``: the first key of the object, ``{"type": "parameter", …}``.
-        record: its fields as docs/command-line.md lists them; made JSON by :func:`aerokit._internal.plain.plain`.
-        text: the same for people; None: nothing.
+        options: the parsed options of the command.
+        kind: the record type, written first: ``{"type": "parameter", …}``.
+        record: fields, as listed in docs/command-line.md; converted by `aerokit._internal.formatting.to_jsonable`.
+        text: what to print without ``--json``; None prints nothing.
     """
     if options.json:
         assert "type" not in record, record
-        told = {"type": kind, **plain(record)}
+        fields = {"type": kind, **to_jsonable(record)}
         try:
-            print(json.dumps(told, ensure_ascii=False), flush=True)
+            print(json.dumps(fields, ensure_ascii=False), flush=True)
         except UnicodeEncodeError:
-            print(json.dumps(told), flush=True)
+            print(json.dumps(fields), flush=True)
     elif text is not None:
         _print(printable(text))
 
@@ -58,17 +57,17 @@ def tell(options: argparse.Namespace, kind: str, record: Mapping[str, object], t
 def _print(text: str) -> None:
     try:
         print(text, flush=True)
-    except UnicodeEncodeError:  # a terminal that has no such characters
+    except UnicodeEncodeError:  # the terminal's encoding lacks a character
         print(text.encode("ascii", "replace").decode(), flush=True)
 
 
-def tell_done(options: argparse.Namespace, action: str, text: str | None = None) -> None:
-    """Tell programs that an action is done that has nothing else to tell; people only what ``text`` says."""
-    tell(options, "done", {"action": action}, text)
+def emit_done(options: argparse.Namespace, action: str, text: str | None = None) -> None:
+    """Print the ``done`` record of an action that has no other result; without ``--json`` print only ``text``."""
+    emit(options, "done", {"action": action}, text)
 
 
-def tell_error(error: BaseException, code: int, *, as_json: bool) -> None:
-    """Say why a command failed: on stderr, and with ``--json`` as its last object, too."""
+def emit_error(error: BaseException, code: int, *, as_json: bool) -> None:
+    """Print an error to stderr, and with ``--json`` also as the last object on stdout."""
     text = _text(error)
     if as_json:
         record = {"type": "error", "error": type(error).__name__, "message": text, "exit_code": code}
@@ -82,95 +81,91 @@ def _text(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-DONE, FAILED, WRONG_ARGUMENTS, NOTHING_HEARD, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
-
+DONE, FAILED, WRONG_ARGUMENTS, NO_VEHICLE, TIMED_OUT, REFUSED, UNREADABLE, NOT_INSTALLED = range(8)
 INTERRUPTED = 130
 
 _MEANINGS = {
     DONE: "done",
-    FAILED: "failed, or the answer is no",
+    FAILED: "failed, or a check was negative",
     WRONG_ARGUMENTS: "wrong arguments",
-    NOTHING_HEARD: "no link or no vehicle",
-    TIMED_OUT: "no answer in time",
-    REFUSED: "the vehicle refused",
+    NO_VEHICLE: "no link or no vehicle",
+    TIMED_OUT: "timed out",
+    REFUSED: "refused by the vehicle",
     UNREADABLE: "a file cannot be read or written",
-    NOT_INSTALLED: "an extra is not installed",
+    NOT_INSTALLED: "an optional dependency is not installed",
     INTERRUPTED: "interrupted",
 }
 
 
 class NotInstalled(AerokitError):
-    """A command needs packages that come with an extra; the text names it."""
+    """A command needs an optional dependency. The message names the extra to install."""
 
 
+# Error class to exit code; the first match counts.
 _CODES: tuple[tuple[type[BaseException], int], ...] = (
     (KeyboardInterrupt, INTERRUPTED),
     (NotInstalled, NOT_INSTALLED),
     (FileFormatError, UNREADABLE),
     (InvalidArgument, WRONG_ARGUMENTS),
-    (LinkError, NOTHING_HEARD),
-    (HeartbeatTimeout, NOTHING_HEARD),
+    (LinkError, NO_VEHICLE),
+    (HeartbeatTimeout, NO_VEHICLE),
     (OperationTimeout, TIMED_OUT),
     (OperationRejected, REFUSED),
     (AerokitError, FAILED),
     (OSError, UNREADABLE),
 )
-"""The first that fits counts."""
 
 
 def exit_code(error: BaseException) -> int:
-    """The exit code of a command that ends by this error."""
     return next((code for kind, code in _CODES if isinstance(error, kind)), FAILED)
 
 
-def describe() -> str:
-    """All of them in one line, for ``--help``."""
+def exit_codes_help() -> str:
     return "Exit codes: " + ", ".join(f"{code} {text}" for code, text in _MEANINGS.items()) + "."
 
 
-def need(module: str, extra: str) -> Any:
-    """Import a module of an extra.
+def import_extra(module: str, extra: str) -> Any:
+    """Import a module that an extra provides.
 
     Raises:
-        NotInstalled: it is not there; the text says what to install.
+        NotInstalled: a package is missing; the message says what to install.
     """
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise NotInstalled(
-            f"this needs {error.name}, which is not installed: pip install 'aerokit-mavlink[{extra}]'"
+            f"{error.name} is required, but not installed: pip install 'aerokit-mavlink[{extra}]'"
         ) from None
 
 
 def add_force(command: argparse.ArgumentParser) -> None:
-    """Add ``--force``."""
-    command.add_argument("--force", action="store_true", help="replace a file that is there already")
+    command.add_argument("--force", action="store_true", help="replace an existing file")
 
 
-def check_new(file: str, options: argparse.Namespace) -> None:
-    """Look before anything is sent.
+def check_not_existing(file: str, options: argparse.Namespace) -> None:
+    """Check that the output file does not exist, before anything is sent.
 
     Raises:
-        FileExistsError: the file is there, and ``--force`` is not given.
+        FileExistsError: the file exists, and ``--force`` is not given.
     """
     if not options.force and Path(file).exists():
-        raise FileExistsError(errno.EEXIST, "is there already; --force replaces it", file)
+        raise FileExistsError(errno.EEXIST, "file exists; use --force to replace it", file)
 
 
-def make_new_recording(path: str) -> None:
-    """Make the file now, so that nobody else's is replaced.
+def create_recording(path: str) -> None:
+    """Create an empty recording with an exclusive open, so that no other file is replaced.
 
     Raises:
-        FileExistsError: the file is there.
+        FileExistsError: the file exists.
     """
     try:
         with open(path, "xb"):
             pass
     except FileExistsError as error:
-        raise FileExistsError(error.errno, "is there already; nothing was recorded", path) from None
+        raise FileExistsError(error.errno, "file exists; nothing was recorded", path) from None
 
 
 def remove_if_empty(path: str) -> None:
-    """Take a recording away that was made a moment ago, when nothing came of it."""
+    """Delete a recording that received nothing."""
     if not os.path.getsize(path):
         os.unlink(path)

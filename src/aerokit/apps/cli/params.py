@@ -7,12 +7,12 @@ import fnmatch
 import sys
 from typing import TYPE_CHECKING
 
-from aerokit._internal.wording import did_you_mean
+from aerokit._internal.formatting import did_you_mean
 from aerokit.apps.cli.arguments import assignment, writable_file
-from aerokit.apps.cli.completers import assignments, offer, parameter_names, parameters
-from aerokit.apps.cli.output import DONE, FAILED, add_force, check_new, tell
+from aerokit.apps.cli.completion import assignments, offer, parameter_names
+from aerokit.apps.cli.connecting import add_action, connected
+from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit
 from aerokit.apps.cli.terminal import progress_bar
-from aerokit.apps.cli.vehicle_command import add_action, connected
 from aerokit.errors import ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
-FORMATS = ("missionplanner", "mavproxy", "qgroundcontrol")
+_FORMATS = ("missionplanner", "mavproxy", "qgroundcontrol")
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The actions of the command, and their arguments."""
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     _add_reading(actions)
     _add_writing(actions)
@@ -35,26 +34,23 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listing = add_action(actions, "list", _list, "List parameters with their values.")
     pattern = listing.add_argument("pattern", nargs="?", default="*", help="names to list: 'BATT_*' (all)")
-    offer(pattern, parameters)
+    offer(pattern, parameter_names)
     listing.add_argument("--changed", action="store_true", help="only those that differ from their default")
     get = add_action(actions, "get", _get, "Read single parameters.")
-    offer(get.add_argument("names", nargs="+", metavar="NAME"), parameters)
+    offer(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
     save = add_action(actions, "save", _save, "Save all parameters to a file.")
     save.add_argument("file", type=writable_file)
     add_force(save)
-    save.add_argument("--format", choices=FORMATS, default=FORMATS[0], help="of the file (missionplanner)")
-    diff = add_action(actions, "diff", _diff, "Show where the vehicle differs from a file.")
+    save.add_argument("--format", choices=_FORMATS, default=_FORMATS[0], help="file format (missionplanner)")
+    diff = add_action(actions, "diff", _diff, "Compare the vehicle's parameters with a file.")
     diff.add_argument("file")
 
 
 def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    set_ = add_action(actions, "set", _set, "Set parameters, each confirmed by the vehicle.")
+    set_ = add_action(actions, "set", _set, "Set parameters. The vehicle confirms each.")
     offer(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
-    load = add_action(actions, "load", _load, "Set all parameters of a file that differ on the vehicle.")
+    load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
-
-
-# ---------------------------------------------------------------------------------------- actions
 
 
 async def _list(options: argparse.Namespace) -> int:
@@ -62,11 +58,11 @@ async def _list(options: argparse.Namespace) -> int:
         table = await _download(vehicle, options)
     if options.changed:
         table = table.changed_from_default()
-    found = [each for name, each in table.items() if fnmatch.fnmatch(name, options.pattern.upper())]
-    _tell_parameters(options, found)
+    found = [value for name, value in table.items() if fnmatch.fnmatch(name, options.pattern.upper())]
+    _emit_parameters(options, found)
     if not found and options.pattern != "*":
         hint = did_you_mean(options.pattern, table)
-        print(f"aerokit: none of {len(table)} parameters is called {options.pattern}{hint}", file=sys.stderr)
+        print(f"aerokit: none of {len(table)} parameters matches {options.pattern!r}{hint}", file=sys.stderr)
         return FAILED
     return DONE
 
@@ -74,19 +70,19 @@ async def _list(options: argparse.Namespace) -> int:
 async def _get(options: argparse.Namespace) -> int:
     async with connected(options) as vehicle:
         for name in options.names:
-            _tell_parameters(options, [await _read(vehicle, name, options)])
+            _emit_parameters(options, [await _read(vehicle, name, options)])
     return DONE
 
 
 async def _save(options: argparse.Namespace) -> int:
     from aerokit.parameters import write_parameter_file
 
-    check_new(options.file, options)
+    check_not_existing(options.file, options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
     write_parameter_file(options.file, table, format=options.format)
     record = {"file": options.file, "what": "parameters", "count": len(table)}
-    tell(options, "saved", record, f"{len(table)} parameters in {options.file}")
+    emit(options, "saved", record, f"{len(table)} parameters written to {options.file}")
     return DONE
 
 
@@ -96,18 +92,18 @@ async def _diff(options: argparse.Namespace) -> int:
     wanted = read_parameter_file(options.file)
     async with connected(options) as vehicle:
         await _download(vehicle, options)
-        differences = await vehicle.parameters.diff(wanted, patience_s=options.patience)
+        differences = await vehicle.parameters.diff(wanted, idle_timeout_s=options.patience)
     for difference in differences:
-        tell(options, "parameter_difference", difference.to_dict(), str(difference))
+        emit(options, "parameter_difference", difference.to_dict(), str(difference))
     record = {"file": options.file, "parameters": len(wanted), "different": len(differences)}
-    tell(options, "comparison", record, f"{len(differences)} of {len(wanted)} differ")
+    emit(options, "comparison", record, f"{len(differences)} of {len(wanted)} parameters differ")
     return DONE if not differences else FAILED
 
 
 async def _set(options: argparse.Namespace) -> int:
     async with connected(options, changes=True) as vehicle:
-        results = await vehicle.parameters.set_many(dict(options.values), patience_s=options.patience)
-    return _tell_results(options, results.values())
+        results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
+    return _emit_results(options, results.values())
 
 
 async def _load(options: argparse.Namespace) -> int:
@@ -117,63 +113,60 @@ async def _load(options: argparse.Namespace) -> int:
     async with connected(options, changes=True) as vehicle:
         await _download(vehicle, options)
         with progress_bar("parameters", "parameter") as show:
-            results = await vehicle.parameters.upload(wanted, patience_s=options.patience, on_progress=show)
+            results = await vehicle.parameters.upload(wanted, idle_timeout_s=options.patience, on_progress=show)
     if options.json:
-        return _tell_results(options, results.values())
-    return _tell_results(options, (each for each in results.values() if each.outcome != "unchanged"))
+        return _emit_results(options, results.values())
+    return _emit_results(options, (result for result in results.values() if result.outcome != "unchanged"))
 
 
 async def _download(vehicle: Vehicle, options: argparse.Namespace) -> ParameterTable:
     with progress_bar("parameters", "parameter") as show:
-        return await vehicle.parameters.download(patience_s=options.patience, on_progress=show)
+        return await vehicle.parameters.download(idle_timeout_s=options.patience, on_progress=show)
 
 
 async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Parameter:
     try:
-        return await vehicle.parameters.read(name, patience_s=options.patience)
+        return await vehicle.parameters.read(name, idle_timeout_s=options.patience)
     except (ParameterRejected, ParameterTimeout) as error:
-        if meant := _meant(name, error):
-            print(f"aerokit: no answer about {name!r}{meant}", file=sys.stderr)
+        if suggestion := _suggestion(name, error):
+            print(f"aerokit: could not read parameter {name!r}{suggestion}", file=sys.stderr)
         raise
 
 
-def _meant(name: str, error: Exception) -> str:
-    """What was perhaps meant, by the names that the simulated vehicles have."""
+def _suggestion(name: str, error: Exception) -> str:
+    """Suggest a similar name among the simulated vehicles' parameters, unless the error does so already."""
     names = parameter_names()
     return "" if "did you mean" in str(error) or name in names else did_you_mean(name, names)
 
 
-# --------------------------------------------------------------------------------------- printing
-
-
-def _tell_parameters(options: argparse.Namespace, parameters: Iterable[Parameter]) -> None:
+def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter]) -> None:
     for parameter in parameters:
         is_changed = parameter.default is not None and parameter.default != parameter.value
         default = f"  (default {_text(parameter.default)})" if is_changed else ""
         text = f"{parameter.name:16} {_text(parameter.value):<12}{default}".rstrip()
-        tell(options, "parameter", _record(parameter), text)
+        emit(options, "parameter", _record(parameter), text)
 
 
-def _tell_results(options: argparse.Namespace, results: Iterable[ParameterWrite]) -> int:
-    """One line each; FAILED when one of them has not the value that was asked for, rounding apart."""
+def _emit_results(options: argparse.Namespace, results: Iterable[ParameterWrite]) -> int:
+    """Print a line for each. Return FAILED if a value differs from the requested one by more than rounding."""
     code = DONE
     for result in results:
         if result.error is None:
             text = f"{result.name:16} {_text(result.value):<12} {result.outcome} {result.note}".rstrip()
         else:
-            text = f"{result.name:16} not set: {result.error}{_meant(result.name, result.error)}"
-        tell(options, "parameter_write", _record(result), text)
+            text = f"{result.name:16} not set: {result.error}{_suggestion(result.name, result.error)}"
+        emit(options, "parameter_write", _record(result), text)
         if result.error is not None or result.outcome == "clamped":
             code = FAILED
     return code
 
 
-def _record(told: Parameter | ParameterWrite) -> dict[str, object]:
-    """``type`` is what every record has in front."""
-    fields = told.to_dict()
+def _record(parameter: Parameter | ParameterWrite) -> dict[str, object]:
+    # "type" is the type of the record.
+    fields = parameter.to_dict()
     return {("value_type" if name == "type" else name): value for name, value in fields.items()}
 
 
 def _text(value: float | None) -> str:
-    """Integers whole, floats as far as 32 bits go."""
+    """Format integers whole, and floats with the precision of 32 bits."""
     return str(value) if isinstance(value, int) else f"{value:.9g}"

@@ -1,4 +1,4 @@
-"""``aerokit serve``: vehicles in the browser, and an HTTP and WebSocket API for other programs."""
+"""``aerokit serve``: vehicles in the browser, and an HTTP and WebSocket API."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import sys
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from aerokit.apps.cli.arguments import count
-from aerokit.apps.cli.output import DONE, FAILED, add_json, need, tell
+from aerokit.apps.cli.arguments import count, port
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
+from aerokit.apps.cli.output import DONE, FAILED, add_json, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
-from aerokit.apps.cli.vehicle_command import ENVIRONMENT, add_place, add_signing_key, signing_of
 from aerokit.errors import LinkOpenError
 
 if TYPE_CHECKING:
@@ -20,22 +20,16 @@ if TYPE_CHECKING:
     from aerokit.apps.serve import ServeApp
     from aerokit.connection.connection import Connection
 
-LOOPBACK = "127.0.0.1"
+_LOOPBACK = "127.0.0.1"
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The arguments of the command."""
     command.set_defaults(run=_run)
-    add_place(command, what="of the vehicles: ")
+    add_address(command, what="address of the vehicles: ")
     command.add_argument(
-        "--sim",
-        nargs="?",
-        type=count,
-        const=1,
-        metavar="N",
-        help="N simulated copters (1) instead, to look at it",
+        "--sim", nargs="?", type=count, const=1, metavar="N", help="serve N simulated copters (1) instead"
     )
-    add_signing_key(command, f"of vehicles that want signed messages (${ENVIRONMENT})")
+    add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     _add_web(command)
     add_json(command)
 
@@ -44,37 +38,27 @@ def _add_web(command: argparse.ArgumentParser) -> None:
     web = command.add_argument_group("web")
     web.add_argument(
         "--host",
-        default=LOOPBACK,
-        help=f"where to listen ({LOOPBACK}: this machine only); elsewhere, reading needs the token, too",
+        default=_LOOPBACK,
+        help=f"address to listen on ({_LOOPBACK}: this machine only); on others, reading needs the token too",
     )
-    web.add_argument("--port", type=_port, default=8080, help="TCP port, 0: any free one (8080)")
-    web.add_argument("--token-file", metavar="FILE", help="with the token (a random one at each start)")
-    web.add_argument("--read-only", action="store_true", help="take no orders, whoever gives them")
+    web.add_argument("--port", type=port, default=8080, help="TCP port; 0: any free port (8080)")
+    web.add_argument("--token-file", metavar="FILE", help="file with the token (a random token at each start)")
+    web.add_argument("--read-only", action="store_true", help="reject all orders")
     web.add_argument(
         "--allow-host",
         action="append",
         default=[],
         metavar="NAME",
-        help="by which browsers reach it, beside localhost and IP addresses; several times if need be",
+        help="host name that browsers may use, besides localhost and IP addresses (repeatable)",
     )
-    web.add_argument(
-        "--tiles", metavar="URL", help="tiles for the map: https://tiles.example/{z}/{x}/{y}.png (none)"
-    )
-    web.add_argument(
-        "--attribution", default="", metavar="TEXT", help="that the tile server wants to be shown"
-    )
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port: 0 to 65535")
-    return int(text)
+    web.add_argument("--tiles", metavar="URL", help="map tiles: https://tiles.example/{z}/{x}/{y}.png (none)")
+    web.add_argument("--attribution", default="", metavar="TEXT", help="attribution of the tiles, shown on the map")
 
 
 async def _run(options: argparse.Namespace) -> int:
-    uvicorn = need("uvicorn", "serve")
-    need("websockets", "serve")
-    serve = need("aerokit.apps.serve", "serve")
+    uvicorn = import_extra("uvicorn", "serve")
+    import_extra("websockets", "serve")
+    serve = import_extra("aerokit.apps.serve", "serve")
     async with _connection(options) as connection:
         app = serve.make_app(
             connection,
@@ -102,9 +86,7 @@ async def _connection(options: argparse.Namespace) -> AsyncIterator[Connection]:
             link = await stack.enter_async_context(simulated_link(fleet))
             yield await stack.enter_async_context(open_connection(link))
         else:
-            opening = open_connection(
-                options.address, baud=options.baud, signing=signing_of(options), reconnect=True
-            )
+            opening = open_connection(options.address, baud=options.baud, signing=signing_of(options), reconnect=True)
             yield await stack.enter_async_context(opening)
 
 
@@ -123,7 +105,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
-    """How uvicorn serves the application: bounded in what others may send and hold."""
+    """Return the uvicorn configuration, with limits on what clients may send and hold open."""
     return uvicorn.Config(
         app,
         host=host,
@@ -136,7 +118,7 @@ def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
         ws="websockets-sansio",
         ws_max_size=1024,
         ws_max_queue=4,
-        http=need("aerokit.apps.serve.guard", "serve").http_protocol(app.holds_token),
+        http=import_extra("aerokit.apps.serve.guard", "serve").http_protocol(app.has_token),
         timeout_keep_alive=20,
         timeout_graceful_shutdown=2,
     )
@@ -144,7 +126,7 @@ def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
 
 async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> int:
     server = _server_class(uvicorn)(config_of(uvicorn, app, options.host, options.port))
-    server.told = lambda port: _tell(options, app, port)
+    server.on_started = lambda port: _emit_serving(options, app, port)
 
     def stop() -> None:
         server.should_exit = True
@@ -152,44 +134,42 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
     with on_interrupt(stop):
         try:
             await server.serve()
-        except SystemExit:  # uvicorn's way of saying that it cannot listen
+        except SystemExit:  # uvicorn exits when it cannot listen
             raise LinkOpenError(
-                f"cannot listen on {options.host} port {options.port}: is it in use?"
+                f"cannot listen on {options.host} port {options.port}: it may be in use; choose another with --port"
             ) from None
     if not server.started:
         return FAILED
-    tell(options, "stopped", {}, "stopped")
+    emit(options, "stopped", {}, "stopped")
     return DONE
 
 
 def _server_class(uvicorn: Any) -> Any:
     class Server(uvicorn.Server):  # type: ignore[misc]
-        """Says where it listens; the signals are the command's."""
-
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
-            yield
+            yield  # the command handles signals
 
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)
             if self.started:
-                self.told(self.servers[0].sockets[0].getsockname()[1])
+                self.on_started(self.servers[0].sockets[0].getsockname()[1])
 
     return Server
 
 
-def _tell(options: argparse.Namespace, app: ServeApp, port: int) -> None:
-    name: str = LOOPBACK if options.host == "0.0.0.0" else "::1" if options.host == "::" else options.host
+def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None:
+    name: str = _LOOPBACK if options.host == "0.0.0.0" else "::1" if options.host == "::" else options.host
     name = f"[{name}]" if ":" in name else name
     url = f"http://{name}:{port}/"
-    # behind the # it stays in the browser: no server and no log ever sees it
+    # Browsers do not send the part after the #, so that the token never reaches a server log.
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"
     source = f"{options.sim} simulated" if options.sim else options.address
     record = {"url": url, "page": page, "token": app.token, "source": source, "read_only": options.read_only}
-    tell(options, "serving", record, f"{source} on {page}")
+    emit(options, "serving", record, f"{source} on {page}")
     if not _is_loopback(options.host):
         print(
-            "aerokit: others can reach this, and what goes over the network is not encrypted, the token included:"
-            " see docs/serve.md",
+            "aerokit: warning: other machines can connect, and the traffic is not encrypted, including the token"
+            " (docs/serve.md)",
             file=sys.stderr,
         )

@@ -1,4 +1,4 @@
-"""``aerokit status``: everything on a link: systems, components, what they are and do, and what is missing."""
+"""``aerokit status``: systems and components on a link, their state, and what is missing for flight."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.apps.cli.arguments import number
-from aerokit.apps.cli.link_command import add_link, add_seconds, await_vehicle, opened
-from aerokit.apps.cli.output import DONE, tell
+from aerokit.apps.cli.connecting import add_link, add_seconds, await_vehicle, opened
+from aerokit.apps.cli.output import DONE, emit
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavType
 from aerokit.mavlink.messages import BatteryStatus, GlobalPositionInt, GpsRawInt, SysStatus
@@ -26,15 +26,23 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.equipment import Battery, GpsReceiver
     from aerokit.vehicle.vehicle import Vehicle
 
-UNKNOWN = "not told"
+_UNKNOWN = "unknown"
+_NO_KEY = "; it signs its frames, and without its key (--signing-key FILE) it may ignore this computer"
+_FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
+# States that are requested once if the vehicle does not stream them, and the messages that carry them.
+_REQUESTED = (
+    ("sensors", SysStatus),
+    ("gps", GpsRawInt),
+    ("batteries", BatteryStatus),
+    ("position", GlobalPositionInt),
+)
+# Leaves time to restore the streams that were changed; otherwise the vehicle keeps their rates.
+_RELEASE_TIME_S = 0.5
+# Wait for a requested message after the vehicle has accepted the request.
+_MESSAGE_TIMEOUT_S = 0.3
 
-NO_KEY = "; its frames are signed and no key was given (--signing-key FILE): it may not listen to us"
 
-FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP")
-
-
-def about_vehicle(vehicle: Vehicle, missing: Sequence[str]) -> dict[str, Any]:
-    """The record of one vehicle."""
+def _vehicle_record(vehicle: Vehicle, missing: Sequence[str]) -> dict[str, Any]:
     version = vehicle.version.latest
     return {
         **overview(vehicle),
@@ -43,14 +51,13 @@ def about_vehicle(vehicle: Vehicle, missing: Sequence[str]) -> dict[str, Any]:
         "mode": vehicle.mode_name,
         "armed": vehicle.armed.latest,
         "missing": list(missing),
-        **_frame_of(vehicle.connection.heard.get((vehicle.system_id, vehicle.component_id))),
+        **_frame_of(vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))),
     }
 
 
-def vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
-    """The same for people."""
+def _vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     version = vehicle.version.latest
-    heartbeat = vehicle.connection.heard.get((vehicle.system_id, vehicle.component_id))
+    heartbeat = vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))
     frame = _frame_of(heartbeat)
     armed = {None: "armed or not: unknown", True: "ARMED", False: "disarmed"}[vehicle.armed.latest]
     landed = vehicle.landed_state.latest
@@ -58,18 +65,17 @@ def vehicle_lines(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     kind = "" if heartbeat is None else f", {_words(_name(MavType, heartbeat.type))}"
     is_locked = frame["signed"] and vehicle.connection.signing is None
     return [
-        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or 'of unknown version'}{kind}"
-        f"{NO_KEY if is_locked else ''}",
+        f"system {vehicle.system_id}: {vehicle.autopilot.firmware} {version or '(unknown version)'}{kind}"
+        f"{_NO_KEY if is_locked else ''}",
         f"  mode     {vehicle.mode_name}, {armed}{place}",
-        f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or UNKNOWN}",
-        f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or UNKNOWN}",
+        f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
+        f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
         f"  link     {_link(vehicle, frame)}",
-        *_aligned("missing", missing or ["nothing that is known"]),
+        *_aligned("missing", missing or ["nothing known"]),
     ]
 
 
-def component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
-    """Record and line of another component."""
+def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
     kind = kind_of(heartbeat, component_id)
     record = {
         "system_id": system_id,
@@ -83,15 +89,14 @@ def component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> t
     return record, f"system {system_id}, component {component_id}: {name}"
 
 
-def link_line(record: Mapping[str, Any]) -> str:
-    """The link as a whole."""
+def _link_line(record: Mapping[str, Any]) -> str:
     total = record["frames"] + record["frames_lost"]
     parts = [
         f"{record['address']}: {record['frames']} frames in {record['seconds']:.1f} s",
         f"{_percent(record['frames_lost'], total)} lost",
     ]
     if record["bad_bytes"]:
-        parts.append(f"{record['bad_bytes']} of {record['bytes']} bytes are no frame")
+        parts.append(f"{record['bad_bytes']} of {record['bytes']} bytes are not MAVLink")
     if record["unknown_messages"]:
         parts.append(f"{record['unknown_messages']} frames of unknown messages")
     return ", ".join(parts)
@@ -106,7 +111,7 @@ def _link(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
         f"last heartbeat {vehicle.heartbeat_age:.1f} s ago",
         f"{_percent(lost, received + lost)} of {received + lost} frames lost",
     ]
-    return ", ".join(parts if trip is None else [*parts, f"{trip * 1000:.0f} ms there and back"])
+    return ", ".join(parts if trip is None else [*parts, f"round trip {trip * 1000:.0f} ms"])
 
 
 def _frame_of(heartbeat: Heartbeat | None) -> dict[str, Any]:
@@ -118,8 +123,8 @@ def _frame_of(heartbeat: Heartbeat | None) -> dict[str, Any]:
 
 
 def _gps(receiver: GpsReceiver) -> str:
-    known = 0 <= receiver.fix_type < len(FIXES)
-    parts = [FIXES[receiver.fix_type] if known else f"fix {receiver.fix_type}"]
+    known = 0 <= receiver.fix_type < len(_FIXES)
+    parts = [_FIXES[receiver.fix_type] if known else f"fix {receiver.fix_type}"]
     if receiver.satellites is not None:
         parts.append(f"{receiver.satellites} satellites")
     if receiver.hdop is not None:
@@ -133,7 +138,7 @@ def _battery(battery: Battery) -> str:
         (battery.voltage_v, ".1f", "V"),
         (battery.current_a, ".1f", "A"),
     )
-    return ", ".join(f"{value:{form}} {unit}" for value, form, unit in values if value is not None) or UNKNOWN
+    return ", ".join(f"{value:{form}} {unit}" for value, form, unit in values if value is not None) or _UNKNOWN
 
 
 def _aligned(label: str, texts: Sequence[str]) -> list[str]:
@@ -155,99 +160,83 @@ def _name(enum: type[MavType | MavAutopilot], number: int) -> str:
         return str(number)
 
 
-ASKED_FOR = (
-    ("sensors", SysStatus),
-    ("gps", GpsRawInt),
-    ("batteries", BatteryStatus),
-    ("position", GlobalPositionInt),
-)
-"""What is asked for, once, if it has not come by itself: state and the message that tells it."""
-
-RELEASE_S = 0.5
-"""The streams that were wanted for a moment are given up before we leave: the vehicle would go on with them."""
-
-ANSWER_S = 0.3
-"""How long a message is waited for that the vehicle has accepted to send."""
-
-
 def add_arguments(command: argparse.ArgumentParser) -> None:
-    """The arguments of the command."""
     command.set_defaults(run=run_status)
     add_link(command)
-    add_seconds(command, "listen for so long after the first vehicle was heard (3)", 3.0)
+    add_seconds(command, "listen for S seconds after the first heartbeat (3)", 3.0)
     command.add_argument(
         "--patience",
         type=number(0.1, 3600),
         default=30.0,
         metavar="S",
-        help="give up when no vehicle is heard for so many seconds (30)",
+        help="fail if no vehicle is found within S seconds (30)",
     )
 
 
 async def run_status(options: argparse.Namespace) -> int:
-    """Listen, ask each vehicle for what it has not told, and tell."""
+    """Listen, request what is missing, and print the status."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
         try:
             await await_vehicle(connection, options, options.patience)
         except AerokitError:
-            _tell_others(connection, options, {})
+            _emit_components(connection, options, {})
             raise
         started = connection.now()
         await anyio.sleep(options.seconds)
         found = dict(vehicles)
-        reasons = await asyncio.gather(*map(_what_is_missing, found.values()))
-        _tell_link(connection, options, connection.now() - started)
+        reasons = await asyncio.gather(*map(_missing_for_flight, found.values()))
+        _emit_link(connection, options, connection.now() - started)
         for vehicle, missing in zip(found.values(), reasons, strict=True):
-            record = about_vehicle(vehicle, missing)
-            tell(options, "status", record, "\n".join(vehicle_lines(vehicle, missing)))
-        _tell_others(connection, options, found)
-        await anyio.sleep(RELEASE_S)
+            record = _vehicle_record(vehicle, missing)
+            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, missing)))
+        _emit_components(connection, options, found)
+        await anyio.sleep(_RELEASE_TIME_S)
     return DONE
 
 
-async def _what_is_missing(vehicle: Vehicle) -> list[str]:
-    """What it lacks to fly, after it was asked for what it does not send by itself."""
-    for state, message in ASKED_FOR:
+async def _missing_for_flight(vehicle: Vehicle) -> list[str]:
+    for state, message in _REQUESTED:
         cell = getattr(vehicle, state)
         if not cell.is_known:
             try:
-                await _ask(vehicle, message, cell)
+                await _request(vehicle, message, cell)
             except CommandTimeout as error:
-                return [str(error), *vehicle.missing_for_flight()]  # it answers nothing: to ask on takes long
+                # A vehicle that does not answer one request would time out on the others too.
+                return [str(error), *vehicle.missing_for_flight()]
     return list(dict.fromkeys([*await vehicle.why_not_armable(), *vehicle.missing_for_flight()]))
 
 
-async def _ask(vehicle: Vehicle, message: Any, cell: Any) -> None:
+async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:
     try:
         await vehicle.command(MavCmd.REQUEST_MESSAGE, message.ID)
     except CommandRejected:
         return
-    with anyio.move_on_after(ANSWER_S):
+    with anyio.move_on_after(_MESSAGE_TIMEOUT_S):
         await cell.wait_until(lambda _: True)
 
 
-def _tell_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
+def _emit_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
     statistics = list(connection.statistics())
     record = {
         "address": connection.link.address,
         "seconds": seconds,
-        "bytes": sum(each.bytes for each in statistics),
-        "frames": sum(each.frames for each in statistics),
-        "frames_lost": sum(source.lost for each in statistics for source in each.sources.values()),
-        "bad_bytes": sum(each.bad_bytes for each in statistics),
-        "unknown_messages": sum(each.unknown_ids for each in statistics),
-        "systems": sorted({system for system, _ in connection.heard}),
+        "bytes": sum(peer.bytes for peer in statistics),
+        "frames": sum(peer.frames for peer in statistics),
+        "frames_lost": sum(source.lost for peer in statistics for source in peer.sources.values()),
+        "bad_bytes": sum(peer.bad_bytes for peer in statistics),
+        "unknown_messages": sum(peer.unknown_ids for peer in statistics),
+        "systems": sorted({system for system, _ in connection.heartbeats}),
     }
-    tell(options, "link", record, link_line(record))
+    emit(options, "link", record, _link_line(record))
 
 
-def _tell_others(connection: Connection, options: argparse.Namespace, vehicles: dict[int, Vehicle]) -> None:
-    """What is no autopilot that was told of already: components of vehicles, ground stations."""
-    for source, heartbeat in sorted(connection.heard.items()):
+def _emit_components(connection: Connection, options: argparse.Namespace, vehicles: dict[int, Vehicle]) -> None:
+    """Print everything except the vehicles: their other components, and ground stations."""
+    for source, heartbeat in sorted(connection.heartbeats.items()):
         system_id, component_id = source
         if system_id in vehicles and vehicles[system_id].component_id == component_id:
             continue
-        record, text = component_line(heartbeat, system_id, component_id)
-        tell(options, "component", record, text)
+        record, text = _component_line(heartbeat, system_id, component_id)
+        emit(options, "component", record, text)

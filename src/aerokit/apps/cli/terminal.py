@@ -1,9 +1,12 @@
-"""A question at the terminal while the loop goes on: a vehicle minds when its ground station falls silent."""
+"""Terminal interaction that does not block the event loop: questions, Ctrl-C, countdowns and progress bars.
+
+The loop must keep running during a question: a vehicle starts a failsafe when the ground station's heartbeat
+stops.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 import sys
 import threading
@@ -17,24 +20,28 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
-    from aerokit.protocols.exchange import OnProgress, Progress
+    from aerokit.protocols.exchange import OnProgress, TransferProgress
+
+# Usually a vehicle answers sooner, and no countdown is needed.
+COUNTDOWN_DELAY_S = 1.0
+CLEAR_LINE = "\r\x1b[K"
 
 
-def is_somebody_there() -> bool:
-    """Whether questions can be asked at all."""
+def is_interactive() -> bool:
+    """Return True if stdin is a terminal."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
-async def agrees(question: str) -> bool:
-    """Whether somebody at the terminal says yes; the end of the input, and anything else, means no."""
-    _forget_typed()
+async def confirm(question: str) -> bool:
+    """Ask a yes/no question. Return True for "y" or "yes"; anything else, including end of input, is no."""
+    _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
-    answer = await _line()
+    answer = await _read_line()
     return answer.strip().lower() in ("y", "yes")
 
 
-def _forget_typed() -> None:
-    """What was typed before the question was there is no answer to it."""
+def _discard_typed_input() -> None:
+    """Discard typed input: it cannot be an answer to a question that was not shown yet."""
     try:
         import termios
     except ImportError:  # Windows
@@ -43,7 +50,7 @@ def _forget_typed() -> None:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
-async def _line() -> str:
+async def _read_line() -> str:
     loop = asyncio.get_running_loop()
     line: asyncio.Future[str] = loop.create_future()
 
@@ -67,9 +74,8 @@ async def _line() -> str:
 
 
 def _signals() -> tuple[signal.Signals, ...]:
-    """SIGHUP, the end of the terminal, where there is one and nobody (nohup) has switched it off."""
-    hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)
-    if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:
+    hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windows
+    if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:  # ignored under nohup
         return signal.SIGINT, signal.SIGTERM
     return signal.SIGINT, signal.SIGTERM, hang_up
 
@@ -78,9 +84,11 @@ def _signals() -> tuple[signal.Signals, ...]:
 def on_interrupt(
     callback: Callable[[], None], at_once: Callable[[int], object] = lambda number: None
 ) -> Iterator[None]:
-    """While the block lasts, Ctrl-C, SIGTERM and SIGHUP call ``callback`` on the running loop and do nothing else.
+    """Within the block, call ``callback`` on the running loop for SIGINT, SIGTERM and SIGHUP; they have no other
+    effect.
 
-    ``at_once(number)`` is called by the signal's handler before, also while something blocks the loop.
+    ``at_once(number)`` is called first, in the signal handler itself, so it also runs while the loop is
+    blocked.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
@@ -93,7 +101,7 @@ def on_interrupt(
     try:
         for number in signals:
             signal.signal(number, handle)
-    except ValueError:  # not on the main thread, where alone signals can be handled
+    except ValueError:  # signal handlers can be set only in the main thread
         yield
         return
     try:
@@ -103,19 +111,19 @@ def on_interrupt(
             signal.signal(number, handler)
 
 
-class Interruptible:
-    """Runs functions that Ctrl-C ends; each Ctrl-C ends the innermost one only."""
+class InterruptStack:
+    """A stack of running functions. Each interrupt cancels the innermost one only."""
 
     def __init__(self) -> None:
         self._scopes: list[anyio.CancelScope] = []
 
     def interrupt(self) -> None:
-        """End the innermost one that runs."""
+        """Cancel the innermost running function."""
         if self._scopes:
             self._scopes[-1].cancel()
 
     async def run(self, function: Callable[[], Awaitable[int]]) -> int | None:
-        """What the function gives, None when it was interrupted."""
+        """Run a function and return its result; None if it was interrupted."""
         scope = anyio.CancelScope()
         with scope:
             self._scopes.append(scope)
@@ -126,17 +134,13 @@ class Interruptible:
         return None
 
 
-AFTER_S = 1.0
-"""What is heard sooner is not worth a line."""
-
-CLEAR_LINE = "\r\x1b[K"
-
-
 @asynccontextmanager
 async def waiting(
     options: argparse.Namespace, address: str, seconds: float, what: str = "a heartbeat"
 ) -> AsyncIterator[None]:
-    """While the block lasts, say on stderr how many of these seconds are left: on a terminal, and not with --json."""
+    """Within the block, show on stderr how many of ``seconds`` remain. Only on a terminal, and not with
+    ``--json``.
+    """
     if options.json or not sys.stderr.isatty():
         yield
         return
@@ -152,7 +156,7 @@ async def waiting(
 async def _count_down(text: str, seconds: float) -> None:
     loop = asyncio.get_running_loop()
     until = loop.time() + seconds
-    await asyncio.sleep(AFTER_S)
+    await asyncio.sleep(COUNTDOWN_DELAY_S)
     try:
         while (left := until - loop.time()) > 0:
             print(f"{CLEAR_LINE}{text} … {left:.0f} s", end="", file=sys.stderr, flush=True)
@@ -161,13 +165,15 @@ async def _count_down(text: str, seconds: float) -> None:
         print(CLEAR_LINE, end="", file=sys.stderr, flush=True)
 
 
-class _Bar(tqdm):  # type: ignore[misc]  # it has no types
-    monitor_interval = 0  # else a thread stays behind, which looks after bars that are rarely updated
+class _Bar(tqdm):  # type: ignore[misc]  # tqdm has no annotations
+    monitor_interval = 0  # otherwise tqdm leaves its monitor thread behind
 
 
 @contextmanager
 def progress_bar(what: str, unit: str) -> Iterator[OnProgress]:
-    """Give the callback for ``on_progress``; ``unit`` is ``"B"`` for bytes, else the name of one thing."""
+    """Show a progress bar; yields the ``on_progress`` callback. ``unit`` is ``"B"`` for bytes, else the noun for
+    one item.
+    """
     is_bytes = unit == "B"
     with _Bar(
         desc=what,
@@ -175,21 +181,16 @@ def progress_bar(what: str, unit: str) -> Iterator[OnProgress]:
         unit_scale=is_bytes,
         unit_divisor=1024 if is_bytes else 1000,
         file=sys.stderr,
-        disable=None,  # where standard error is no terminal
+        disable=None,  # hides the bar when stderr is not a terminal
         leave=False,
         dynamic_ncols=True,
     ) as bar:
 
-        def show(progress: Progress) -> None:
+        def show(progress: TransferProgress) -> None:
             if progress.total is not None:
                 bar.total = progress.total
             bar.update(progress.done - bar.n)
             if progress.done == progress.total:
-                bar.refresh()  # whatever was shown last, and however short ago
+                bar.refresh()  # regardless of tqdm's minimum update interval
 
         yield show
-
-
-def file_size(path: str | os.PathLike[str]) -> int:
-    """Bytes in a file on this computer; OSError when it is not there."""
-    return os.path.getsize(path)

@@ -1,1 +1,1 @@
-"""``aerokit monitor``: the vehicles on a link, in a terminal. Needs the extra ``monitor`` (Textual)."""
+"""The terminal monitor. Needs the extra ``monitor`` (Textual)."""

@@ -1,4 +1,4 @@
-"""``Monitor``: the terminal application."""
+"""``Monitor``: the Textual application of ``aerokit monitor``."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from textual.screen import ModalScreen
 from textual.widgets import Button, Footer, Label, OptionList, RichLog, Static
 from textual.widgets.option_list import Option
 
-from aerokit.apps.monitor.lines import ARROWS, UNKNOWN, Canvas, row, state_lines
-from aerokit.apps.monitor.watch import Watch
-from aerokit.connection.opening import ONLOOKER, no_vehicle_reason, open_connection
-from aerokit.connection.tasks import Background
+from aerokit.apps.monitor.lines import ARROWS, UNKNOWN, Canvas, list_row, state_lines
+from aerokit.apps.monitor.model import MonitorModel
+from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import AerokitError
 from aerokit.vehicle.connect import vehicles_on
 
@@ -32,11 +32,16 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Link
     from aerokit.vehicle.vehicle import Vehicle
 
-__all__ = ["Monitor", "Question", "run_monitor"]
+__all__ = ["ConfirmScreen", "Monitor", "run_monitor"]
+
+REFRESH_INTERVAL_S = 0.25
+TRACK_STYLES = ("cyan", "magenta", "yellow", "green", "blue", "red")
+KEY_COMMANDS = {"hold": "HOLD", "land": "LAND", "return_to_launch": "RETURN TO LAUNCH"}
+"""Vehicle methods that keys call, and their names in the question."""
 
 
-class Question(ModalScreen[bool]):
-    """Gives True for "y" or the button Yes. Enter at once is No."""
+class ConfirmScreen(ModalScreen[bool]):
+    """A yes/no question. Returns True for "y" or the button Yes; Enter alone is No."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         ("y", "answer(True)", "Yes"),
@@ -45,20 +50,20 @@ class Question(ModalScreen[bool]):
         ("right", "app.focus_next", "Other"),
     ]
     CSS: ClassVar[str] = """
-    Question { align: center middle; }
-    Question Vertical { width: 50; height: auto; border: heavy $warning; background: $surface; padding: 1 2; }
-    Question Label { width: 100%; text-align: center; text-style: bold; }
-    Question Horizontal { height: auto; align: center middle; margin-top: 1; }
-    Question Button { margin: 0 2; }
+    ConfirmScreen { align: center middle; }
+    ConfirmScreen Vertical { width: 50; height: auto; border: heavy $warning; background: $surface; padding: 1 2; }
+    ConfirmScreen Label { width: 100%; text-align: center; text-style: bold; }
+    ConfirmScreen Horizontal { height: auto; align: center middle; margin-top: 1; }
+    ConfirmScreen Button { margin: 0 2; }
     """
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.text = text
-        """What is asked."""
+        """The question."""
 
     def compose(self) -> ComposeResult:
-        """The text and two buttons, No first and focused."""
+        """Yield the question and two buttons; No is first and focused."""
         with Vertical():
             yield Label(self.text, markup=False)
             with Horizontal():
@@ -66,47 +71,39 @@ class Question(ModalScreen[bool]):
                 yield Button("Yes (y)", id="yes", variant="warning")
 
     def on_mount(self) -> None:
-        """Enter is No."""
+        """Focus the button No."""
         self.query_one("#no").focus()
 
     def on_button_pressed(self, event: Button.Pressed) -> None:
-        """An answer."""
+        """Return the answer of a button."""
         self.dismiss(event.button.id == "yes")
 
     def action_answer(self, yes: bool) -> None:
-        """An answer by key."""
+        """Return the answer of a key."""
         self.dismiss(yes)
 
 
-PERIOD_S = 0.25
-
-TRACK_STYLES = ("cyan", "magenta", "yellow", "green", "blue", "red")
-
-ORDERS = {"hold": "HOLD", "land": "LAND", "return_to_launch": "RETURN TO LAUNCH"}
-"""Methods of a vehicle, and what a question calls them."""
-
-
 class Monitor(App[None]):
-    """Shows what a :class:`~aerokit.apps.monitor.watch.Watch` knows; orders go to the vehicle that was asked about."""
+    """Shows a :class:`~aerokit.apps.monitor.model.MonitorModel`. Commands go to the vehicle named in the question."""
 
     CSS_PATH: ClassVar[str | PurePath | list[str | PurePath] | None] = "monitor.tcss"
     ENABLE_COMMAND_PALETTE: ClassVar[bool] = False
     BINDINGS: ClassVar[list[BindingType]] = [
-        ("h", "order('hold')", "Hold"),
-        ("l", "order('land')", "Land"),
-        ("r", "order('return_to_launch')", "Return"),
+        ("h", "command('hold')", "Hold"),
+        ("l", "command('land')", "Land"),
+        ("r", "command('return_to_launch')", "Return"),
         ("q", "quit", "Quit"),
         Binding("ctrl+c", "quit", "Quit", show=False, priority=True),
     ]
 
-    def __init__(self, watch: Watch, orders: Background, name: str) -> None:
+    def __init__(self, model: MonitorModel, commands: BackgroundTasks, name: str) -> None:
         super().__init__()
-        self._watch, self._orders, self._name = watch, orders, name
-        self._began_at = watch.connection.now()
+        self._model, self._commands, self._name = model, commands, name
+        self._began_at = model.connection.now()
         self._listed: list[int] = []
 
     def compose(self) -> ComposeResult:
-        """Vehicles above, then state and map, then texts and rates."""
+        """Yield the vehicle list, state and map, texts and rates."""
         yield Static(id="title", markup=False)
         yield OptionList(id="vehicles")
         with Horizontal(id="middle"):
@@ -119,39 +116,39 @@ class Monitor(App[None]):
         yield Footer()
 
     def on_mount(self) -> None:
-        """Begin to look."""
+        """Set titles, and start periodic updates."""
         for name, title in (("state", "state"), ("map", "map"), ("texts", "texts and events")):
             self.query_one(f"#{name}").border_title = title
-        self.query_one("#rates_box").border_title = "messages a second"
+        self.query_one("#rates_box").border_title = "messages per second"
         self.query_one("#texts").can_focus = False
         self.query_one("#vehicles").focus()
-        self.look()
-        self.set_interval(PERIOD_S, self.look)
+        self.update_view()
+        self.set_interval(REFRESH_INTERVAL_S, self.update_view)
 
     @property
     def selected(self) -> Vehicle | None:
-        """The vehicle that the list stands on."""
+        """The highlighted vehicle; None if there is none."""
         place = self.screen_stack[0].query_one("#vehicles", OptionList).highlighted
-        return None if place is None else self._watch.vehicles[self._listed[place]]
+        return None if place is None else self._model.vehicles[self._listed[place]]
 
-    def look(self) -> None:
-        """Show how things are now."""
-        self._watch.look()
+    def update_view(self) -> None:
+        """Update all widgets from the model."""
+        self._model.update()
         base = self.screen_stack[0]
         self._list(base.query_one("#vehicles", OptionList))
-        show = {"title": self._title, "state": self._state, "map": self._map, "rates": self._rates}
-        for name, made in show.items():
-            base.query_one(f"#{name}", Static).update(made())
+        views = {"title": self._title, "state": self._state, "map": self._map, "rates": self._rates}
+        for name, make_view in views.items():
+            base.query_one(f"#{name}", Static).update(make_view())
         texts = base.query_one("#texts", RichLog)
-        while self._watch.lines:
-            texts.write(self._watch.lines.popleft())
+        while self._model.lines:
+            texts.write(self._model.lines.popleft())
 
     def on_option_list_option_highlighted(self) -> None:
-        """Another vehicle was selected."""
-        self.look()
+        """Show the newly selected vehicle."""
+        self.update_view()
 
-    def action_order(self, method: str) -> None:
-        """Ask whether the selected vehicle is to do that; the answer is about this one, whichever is selected then."""
+    def action_command(self, method: str) -> None:
+        """Ask for confirmation, then command the vehicle that is selected now."""
         vehicle = self.selected
         if vehicle is None:
             self.bell()
@@ -159,13 +156,13 @@ class Monitor(App[None]):
 
         def on_answer(yes: bool | None) -> None:
             if yes:
-                self._orders.start(partial(self._give, vehicle, method))
+                self._commands.start(partial(self._run_command, vehicle, method))
 
-        self.push_screen(Question(f"{ORDERS[method]}: vehicle {vehicle.system_id}?"), on_answer)
+        self.push_screen(ConfirmScreen(f"{KEY_COMMANDS[method]}: vehicle {vehicle.system_id}?"), on_answer)
 
-    async def _give(self, vehicle: Vehicle, method: str) -> None:
-        what, note = ORDERS[method].lower(), partial(self._watch.note, vehicle.system_id)
-        note(f"{what} was ordered", "bold")
+    async def _run_command(self, vehicle: Vehicle, method: str) -> None:
+        what, note = KEY_COMMANDS[method].lower(), partial(self._model.add_line, vehicle.system_id)
+        note(f"{what}: command sent", "bold")
         try:
             await getattr(vehicle, method)()
         except AerokitError as error:
@@ -174,18 +171,18 @@ class Monitor(App[None]):
             note(f"{what}: done", "bold green")
 
     def _list(self, options: OptionList) -> None:
-        vehicles = self._watch.vehicles
+        vehicles = self._model.vehicles
         for system_id in vehicles:
             if system_id not in self._listed:
                 self._listed.append(system_id)
-                options.add_option(Option(row(vehicles[system_id]), id=str(system_id)))
+                options.add_option(Option(list_row(vehicles[system_id]), id=str(system_id)))
         if self._listed and options.highlighted is None:
             options.highlighted = 0
         for place, system_id in enumerate(self._listed):
-            options.replace_option_prompt_at_index(place, row(vehicles[system_id]))
+            options.replace_option_prompt_at_index(place, list_row(vehicles[system_id]))
 
     def _title(self) -> Text:
-        connection, count = self._watch.connection, len(self._watch.vehicles)
+        connection, count = self._model.connection, len(self._model.vehicles)
         state = connection.link_state.latest
         text = Text(f"{self._name}  ", "bold", no_wrap=True, overflow="ellipsis")
         text.append(f"link {state.value if state else UNKNOWN}  {count} vehicle{'s' if count != 1 else ''}")
@@ -194,10 +191,10 @@ class Monitor(App[None]):
     def _state(self) -> Table | Text:
         vehicle = self.selected
         if vehicle is None:
-            waited = self._watch.connection.now() - self._began_at
+            waited = self._model.connection.now() - self._began_at
             return Text(
-                f"waiting for the heartbeat of a vehicle on {self._name}, for {waited:.0f} s\n\n"
-                f"{no_vehicle_reason(self._watch.connection, None)}"
+                f"waiting for a vehicle's heartbeat on {self._name} ({waited:.0f} s)\n\n"
+                f"{explain_no_vehicle(self._model.connection, None)}"
             )
         table = Table.grid(padding=(0, 1))
         for label, text in state_lines(vehicle):
@@ -205,46 +202,40 @@ class Monitor(App[None]):
         return table
 
     def _map(self) -> Text:
-        watch, widget = self._watch, self.screen_stack[0].query_one("#map", Static)
+        model, widget = self._model, self.screen_stack[0].query_one("#map", Static)
         homes = [
             (home, vehicle)
-            for vehicle in watch.vehicles.values()
-            if (home := vehicle.home.latest) is not None and watch.tracks.get(vehicle.system_id)
+            for vehicle in model.vehicles.values()
+            if (home := vehicle.home.latest) is not None and model.tracks.get(vehicle.system_id)
         ]
-        marks = [
-            (watch.metres(home.latitude_deg, home.longitude_deg), "H", "bold green") for home, _ in homes
-        ]
-        points = [point for track in watch.tracks.values() for point in track] + [mark[0] for mark in marks]
+        marks = [(model.metres(home.latitude_deg, home.longitude_deg), "H", "bold green") for home, _ in homes]
+        points = [point for track in model.tracks.values() for point in track] + [mark[0] for mark in marks]
         if not points:
-            return Text("no position is known", "dim")
+            return Text("no position known", "dim")
         canvas = Canvas(widget.content_size.width, widget.content_size.height, points)
-        for system_id, track in watch.tracks.items():
+        for system_id, track in model.tracks.items():
             for point in track:
                 canvas.dot(point, self._style_of(system_id))
-        for mark in [*marks, *map(self._mark_of, watch.tracks)]:
+        for mark in [*marks, *map(self._mark_of, model.tracks)]:
             canvas.mark(*mark)
         widget.border_subtitle = f"{canvas.width_m:.0f} m wide, north up"
         return canvas.text()
 
     def _mark_of(self, system_id: int) -> tuple[tuple[float, float], str, str]:
-        vehicle = self._watch.vehicles[system_id]
+        vehicle = self._model.vehicles[system_id]
         heading = vehicle.heading_deg.latest
         arrow = "?" if heading is None else ARROWS[round(heading / 45) % 8]
         style = f"bold {self._style_of(system_id)}" + (" reverse" if vehicle is self.selected else "")
-        return self._watch.tracks[system_id][-1], f"{arrow}{system_id}", style
+        return self._model.tracks[system_id][-1], f"{arrow}{system_id}", style
 
     def _style_of(self, system_id: int) -> str:
-        return (
-            TRACK_STYLES[self._listed.index(system_id) % len(TRACK_STYLES)]
-            if system_id in self._listed
-            else ""
-        )
+        return TRACK_STYLES[self._listed.index(system_id) % len(TRACK_STYLES)] if system_id in self._listed else ""
 
     def _rates(self) -> Text:
         vehicle = self.selected
         if vehicle is None:
             return Text(UNKNOWN, "dim")
-        lines = [Text(f"{hz:5.1f} {name}") for name, hz in self._watch.rates(vehicle.system_id)]
+        lines = [Text(f"{hz:5.1f} {name}") for name, hz in self._model.rates(vehicle.system_id)]
         return Text("\n", no_wrap=True, overflow="ellipsis").join(lines) if lines else Text(UNKNOWN, "dim")
 
 
@@ -253,43 +244,39 @@ async def run_monitor(
     *,
     baud: int = 57600,
     signing: Signing | None = None,
-    show: Callable[[Monitor], object] | None = None,
+    on_start: Callable[[Monitor], object] | None = None,
 ) -> int:
-    """Show the vehicles on a link until the user leaves.
+    """Show the vehicles on a link until the user quits.
 
     Args:
-        address: of the link; a lost one is opened again.
-        baud: of a serial port whose address says none.
-        signing: as of :func:`aerokit.open_connection`.
-        show: called with the application before it runs.
+        address: of the link; a lost link is reopened.
+        baud: baud rate of a serial port whose address has none.
+        signing: as in :func:`aerokit.open_connection`.
+        on_start: called with the application before it runs.
 
     Returns:
-        Exit code: 0, or 1 after a mistake in the application, which it has shown.
+        Exit code: 0, or 1 after an internal error, which the application has shown.
 
     Raises:
-        LinkOpenError: the link cannot be opened; the terminal was not touched.
-        AerokitError: what ended the connection meanwhile.
+        LinkOpenError: the link cannot be opened.
+        AerokitError: the error that ended the connection.
     """
     async with (
         open_connection(
-            address,
-            source_system=ONLOOKER,
-            baud=baud,
-            signing=signing,
-            reconnect=isinstance(address, str),
+            address, source_system=OBSERVER_SYSTEM_ID, baud=baud, signing=signing, reconnect=isinstance(address, str)
         ) as link,
         vehicles_on(link) as vehicles,
     ):
-        watch, orders = Watch(link, vehicles), Background(link.fail)
-        app = Monitor(watch, orders, str(link.link.address))
+        model, commands = MonitorModel(link, vehicles), BackgroundTasks(link.fail)
+        app = Monitor(model, commands, str(link.link.address))
         detach = link.on_end(lambda error: app.exit())
         try:
-            if show is not None:
-                show(app)
+            if on_start is not None:
+                on_start(app)
             await app.run_async()
             link.raise_if_ended()
             return app.return_code or 0
         finally:
             detach()
-            watch.close()
-            await orders.aclose()
+            model.close()
+            await commands.aclose()

@@ -1,4 +1,4 @@
-"""What is known of a vehicle as lines of text: what is old is dimmed and has its age, what is not known is "—"."""
+"""Text of a vehicle's state for the terminal: old values are dimmed and show their age, unknown values are "—"."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from aerokit._internal.plain import printable
+from aerokit._internal.formatting import printable
 from aerokit.events import SILENT_AFTER_S, LinkState
 
 if TYPE_CHECKING:
@@ -16,35 +16,32 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 UNKNOWN = "—"
-
-OLD_AFTER_S = SILENT_AFTER_S
-
+MAX_AGE_S = SILENT_AFTER_S
 FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
-
 LINK_STYLES = {LinkState.CONNECTED: "green", LinkState.SILENT: "bold yellow", LinkState.LOST: "bold red"}
+ARROWS = "↑↗→↘↓↙←↖"
+"""Arrows by heading, clockwise from north."""
+_DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
+_MIN_SPAN_M = 20.0
 
 
 def number(value: float | None, form: str = ".1f", unit: str = "") -> str:
-    """A number with its unit; None is not known."""
     return UNKNOWN if value is None else f"{value:{form}}{unit}"
 
 
 def cell_text(cell: StateCell[Any], show: Callable[[Any], str], style: str = "") -> Text:
-    """What a cell tells, with its age once it is old."""
     if not cell.is_known:
         return Text(UNKNOWN, "dim")
-    if cell.age <= OLD_AFTER_S:
+    if cell.age <= MAX_AGE_S:
         return Text(printable(show(cell.value)), style)
     return Text(f"{printable(show(cell.value))} ({age(cell.age)} old)", "dim italic")
 
 
 def age(seconds: float) -> str:
-    """Seconds in few characters."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
 def state_lines(vehicle: Vehicle) -> list[tuple[str, Text]]:
-    """Labels and what stands beside them."""
     armed = vehicle.armed
     style = "bold red" if armed.latest else "green"
     modes = cell_text(vehicle.mode, lambda mode: str(mode.name), "bold")
@@ -53,15 +50,15 @@ def state_lines(vehicle: Vehicle) -> list[tuple[str, Text]]:
     speeds = cell_text(vehicle.ground_speed_m_s, lambda speed: f"{speed:.1f} m/s")
     speeds.append("  climb ")
     speeds.append_text(cell_text(vehicle.climb_m_s, lambda climb: f"{climb:+.1f} m/s"))
-    places = cell_text(vehicle.position, lambda p: f"{p.latitude_deg:.6f} {p.longitude_deg:.6f}")
-    places.append("  heading ")
-    places.append_text(cell_text(vehicle.heading_deg, lambda heading: f"{heading:.0f}°"))
+    positions = cell_text(vehicle.position, lambda p: f"{p.latitude_deg:.6f} {p.longitude_deg:.6f}")
+    positions.append("  heading ")
+    positions.append_text(cell_text(vehicle.heading_deg, lambda heading: f"{heading:.0f}°"))
     return [
         ("mode", modes),
         ("missing", missing_text(vehicle)),
         ("attitude", cell_text(vehicle.attitude, _attitude)),
         ("altitude", cell_text(vehicle.position, _altitude)),
-        ("place", places),
+        ("position", positions),
         ("speed", speeds),
         ("battery", cell_text(vehicle.batteries, lambda batteries: " · ".join(map(_battery, batteries)))),
         ("GPS", cell_text(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
@@ -70,7 +67,6 @@ def state_lines(vehicle: Vehicle) -> list[tuple[str, Text]]:
 
 
 def link_line(vehicle: Vehicle) -> Text:
-    """How well it is heard: silence, frames lost, round trip."""
     state = vehicle.link_state.latest
     text = Text()
     if state is not None:
@@ -80,18 +76,14 @@ def link_line(vehicle: Vehicle) -> Text:
     quality = vehicle.link_quality
     text.append("  loss ")
     text.append_text(cell_text(quality, lambda report: number(report.loss_percent, ".1f", " %")))
-    text.append("  trip ")
+    text.append("  round trip ")
     text.append_text(
-        cell_text(
-            quality,
-            lambda report: number(report.round_trip_s and report.round_trip_s * 1000, ".0f", " ms"),
-        )
+        cell_text(quality, lambda report: number(report.round_trip_s and report.round_trip_s * 1000, ".0f", " ms"))
     )
     return text
 
 
 def missing_text(vehicle: Vehicle) -> Text:
-    """What it lacks to fly: the first thing, and how many more there are."""
     missing = vehicle.missing_for_flight()
     if not missing:
         return Text("nothing", "green")
@@ -99,8 +91,7 @@ def missing_text(vehicle: Vehicle) -> Text:
     return Text(printable(f"{missing[0]}{more}"), "yellow")
 
 
-def row(vehicle: Vehicle) -> Text:
-    """The vehicle in the list: one line."""
+def list_row(vehicle: Vehicle) -> Text:
     state = vehicle.link_state.latest
     text = Text(f"{vehicle.system_id:>3} ", "bold", no_wrap=True, overflow="ellipsis")
     text.append(f"{vehicle.autopilot.name} ")
@@ -109,9 +100,7 @@ def row(vehicle: Vehicle) -> Text:
     style = "bold red" if vehicle.armed.latest else ""
     text.append_text(cell_text(vehicle.armed, lambda is_armed: "ARMED" if is_armed else "disarmed", style))
     text.append(" ")
-    text.append_text(
-        cell_text(vehicle.position, lambda place: number(place.altitude_relative_m, ".1f", " m"))
-    )
+    text.append_text(cell_text(vehicle.position, lambda place: number(place.altitude_relative_m, ".1f", " m")))
     text.append(" ")
     text.append_text(cell_text(vehicle.batteries, lambda each: number(each[0].remaining_percent, "", " %")))
     if state is not LinkState.CONNECTED and state is not None:
@@ -125,7 +114,7 @@ def _attitude(attitude: Any) -> str:
 
 def _altitude(place: Any) -> str:
     above_home, above_sea = place.altitude_relative_m, place.altitude_amsl_m
-    return f"{number(above_home, '.1f', ' m')} above home, {number(above_sea, '.0f', ' m')} sea"
+    return f"{number(above_home, '.1f', ' m')} above home, {number(above_sea, '.0f', ' m')} AMSL"
 
 
 def _battery(battery: Any) -> str:
@@ -142,16 +131,8 @@ def _gps(receiver: Any) -> str:
     return f"{fix}, {number(receiver.satellites, '')} satellites, HDOP {number(receiver.hdop)}"
 
 
-ARROWS = "↑↗→↘↓↙←↖"
-"""Headings, clockwise from north."""
-
-_DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
-
-_LEAST_SPAN_M = 20.0
-
-
 class Canvas:
-    """``columns`` by ``rows`` characters on which all ``points`` (metres north, east) have a place; north is up."""
+    """A map of ``columns`` by ``rows`` characters that fits all ``points`` (metres north, east); north is up."""
 
     def __init__(self, columns: int, rows: int, points: Iterable[tuple[float, float]]) -> None:
         self._columns, self._rows = max(columns, 2), max(rows, 2)
@@ -159,7 +140,7 @@ class Canvas:
         self._middle = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
         across, up = 2 * (self._columns - 1), 4 * (self._rows - 1)
         self._metres_per_dot: float = max(
-            (max(easts) - min(easts)) / across, (max(norths) - min(norths)) / up, _LEAST_SPAN_M / across
+            (max(easts) - min(easts)) / across, (max(norths) - min(norths)) / up, _MIN_SPAN_M / across
         )
         self._dots: dict[tuple[int, int], int] = {}
         self._styles: dict[tuple[int, int], str] = {}
@@ -167,28 +148,25 @@ class Canvas:
 
     @property
     def width_m(self) -> float:
-        """Metres from the left edge to the right one."""
         return 2 * self._columns * self._metres_per_dot
 
     def dot(self, point: tuple[float, float], style: str) -> None:
-        """Part of a track."""
         across, down = self._place(point)
         cell = down // 4, across // 2
         self._dots[cell] = self._dots.get(cell, 0) | _DOTS[down % 4][across % 2]
         self._styles[cell] = style
 
     def mark(self, point: tuple[float, float], text: str, style: str) -> None:
-        """Characters from this place on, over dots and earlier marks."""
+        """Write characters at a point, over dots and earlier marks."""
         across, down = self._place(point)
         for number, character in enumerate(text):
             self._marks[down // 4, across // 2 + number] = character, style
 
     def text(self) -> Text:
-        """The lines, top first."""
         text = Text(no_wrap=True)
-        for row in range(self._rows):
+        for list_row in range(self._rows):
             for column in range(self._columns):
-                cell = row, column
+                cell = list_row, column
                 if cell in self._marks:
                     text.append(*self._marks[cell])
                 elif cell in self._dots:

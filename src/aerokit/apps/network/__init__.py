@@ -1,6 +1,7 @@
-"""Vehicles for programs on other machines, in whatever language: typed state as JSON, and who is on a network.
+"""Vehicle state as JSON over zenoh or MQTT, for programs in any language, and the names on a zenoh network.
 
-Frames, and with them the whole API, go over the addresses ``zenoh:`` and ``zenohin:``; see docs/network.md.
+MAVLink itself, and with it the whole API, goes over the addresses ``zenoh:`` and ``zenohin:``; see
+docs/network.md.
 """
 
 from __future__ import annotations
@@ -8,13 +9,6 @@ from __future__ import annotations
 from aerokit.apps.network.mqtt_publisher import mqtt_publisher
 from aerokit.apps.network.publisher import Publisher
 from aerokit.apps.network.publishing import Publishing, publishing
-from aerokit.apps.network.zenoh_publisher import found, zenoh_publisher
+from aerokit.apps.network.zenoh_publisher import discover, zenoh_publisher
 
-__all__ = [
-    "Publisher",
-    "Publishing",
-    "found",
-    "mqtt_publisher",
-    "publishing",
-    "zenoh_publisher",
-]
+__all__ = ["Publisher", "Publishing", "discover", "mqtt_publisher", "publishing", "zenoh_publisher"]

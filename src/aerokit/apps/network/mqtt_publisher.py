@@ -1,43 +1,133 @@
-"""``mqtt_publisher``: typed state at a broker of MQTT, by paho-mqtt on the program's event loop."""
+"""``mqtt_publisher``: vehicle state at an MQTT broker, with paho-mqtt on the program's event loop."""
 
 from __future__ import annotations
 
 import asyncio
+import errno
 import ssl
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
+from urllib.parse import unquote, urlsplit
 
 from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
-from aerokit.apps.network.broker import CONNECT_TIMEOUT_S, BrokerLink, parse_broker, publisher_over
-from aerokit.errors import LinkOpenError
-from aerokit.transport.link import needed
-from aerokit.transport.sockets import discard_unsent
-from aerokit.transport.zenoh.session import opened_in_a_thread
+from aerokit._internal.values import Snapshot
+from aerokit.apps.network.publisher import Publisher
+from aerokit.connection.tasks import run_shielded
+from aerokit.errors import InvalidArgument, LinkOpenError
+from aerokit.transport.address import host_and_port
+from aerokit.transport.link import BaseLink, import_optional, link_open_error
+from aerokit.transport.reconnecting import ReconnectingLink
+from aerokit.transport.sockets import discard_on_close
+from aerokit.transport.zenoh.keys import KeySpace, check_name
+from aerokit.transport.zenoh.session import open_in_thread
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from aerokit.apps.network.broker import BrokerAddress
-    from aerokit.apps.network.publisher import Publisher
+    from aerokit.errors import LinkLost
+    from aerokit.transport.link import Peer
 
+PORTS: dict[str, int] = {"mqtt": 1883, "mqtts": 8883}
+"""Scheme → default port."""
+CONNECT_TIMEOUT_S = 5.0
+MAX_WAITING = 32_768
+"""Maximum number of names with an unsent value; enough for all states of 255 vehicles."""
 KEEPALIVE_S = 5
-"""The broker is asked for a sign of life so often; without one until the next time the line is lost."""
-LOOK_AFTER_S = 1.0
+"""MQTT keep-alive. The connection is lost if the broker does not answer a ping within this time."""
+# Interval of loop_misc(), which sends pings and detects their loss.
+_POLL_INTERVAL_S = 1.0
 
 
-class MqttLink(BrokerLink):
-    """One connection to a broker, of MQTT 3.1.1: it publishes with QoS 0, and nothing is kept for later."""
+class BrokerAddress(Snapshot):
+    """Address of a broker, and the fleet and name to publish under. ``str`` and ``repr`` omit user and password."""
+
+    scheme: str
+    """``"mqtt"``, or ``"mqtts"`` for TLS."""
+    host: str
+    port: int
+    place: KeySpace
+    user: str | None = None
+    password: str | None = None
+
+    def __str__(self) -> str:
+        return f"{self.scheme}://{host_and_port(self.host, self.port)}/{self.place.fleet}/{self.place.name}"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
+
+
+def parse_broker(text: str, *schemes: str) -> BrokerAddress:
+    """Parse an address; ``schemes`` are those allowed, by default all.
+
+    Raises:
+        InvalidArgument: the address is invalid. The message omits it if it may contain a password.
+    """
+    allowed = schemes or tuple(PORTS)
+
+    def fail(reason: str) -> NoReturn:
+        shown = f"{scheme}://…" if "@" in text else text
+        raise InvalidArgument(
+            f"address = {shown!r} is not allowed: {reason}; expected"
+            f" {allowed[0]}://10.0.0.5:{PORTS[allowed[0]]}/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
+        )
+
+    scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
+    if scheme not in allowed:
+        if "@" in text:
+            scheme = "…"
+        fail(f"the scheme is not {' or '.join(f'{name}://' for name in allowed)}")
+    try:
+        parts = urlsplit(text.strip())
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        fail("host and port cannot be parsed")
+    if not host or port == 0:
+        fail("host or port is missing")
+    if parts.query or parts.fragment:
+        fail("MQTT addresses have no options")
+    fleet, _, name = parts.path.strip("/").partition("/")
+    try:
+        place = KeySpace(check_name("fleet", fleet), check_name("name", name))
+    except InvalidArgument:
+        fail("fleet and name must be up to 63 letters, digits, '_', '.' and '-', starting with a letter or digit")
+    user, password = (None if part is None else unquote(part) for part in (parts.username, parts.password))
+    return BrokerAddress(scheme, host, port or PORTS[scheme], place, user, password)
+
+
+class MqttLink(BaseLink):
+    """One connection to an MQTT 3.1.1 broker. It publishes with QoS 0.
+
+    The ``peer`` of :meth:`write` is the name of a state. While the broker accepts no data, the newest value of
+    each name waits. Waiting values are discarded when the connection ends.
+    """
 
     def __init__(self, where: BrokerAddress) -> None:
-        super().__init__(where)
+        super().__init__(str(where))
+        self._where = where
+        self._waiting: dict[str, bytes] = {}
         self._client: Any = None
         self._timer: asyncio.TimerHandle | None = None
         self._answered: asyncio.Future[str] | None = None
-        self._is_up = False  # the broker has taken it
+        self._is_up = False  # the broker has accepted the connection
         self._alive = where.place.root + "/alive"
 
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """Send a value, or keep it until the broker accepts data."""
+        name = str(peer)
+        if self._receiver is None or (name not in self._waiting and len(self._waiting) >= MAX_WAITING):
+            self._drop(1)
+            return
+        self._drop(int(name in self._waiting))
+        self._waiting[name] = data
+        self._send_waiting()
+
+    def _refused(self, error: OSError) -> LinkOpenError:
+        is_refused = error.errno == errno.ECONNREFUSED
+        hint = "nothing listens there; is the broker running, and is this its port?" if is_refused else ""
+        return link_open_error(self.address, error, hint)
+
     async def _connect(self) -> None:
-        mqtt = needed(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
+        mqtt = import_optional(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
         where, loop = self._where, asyncio.get_running_loop()
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, reconnect_on_failure=False)
         client.connect_timeout = CONNECT_TIMEOUT_S
@@ -46,14 +136,14 @@ class MqttLink(BrokerLink):
             client.username_pw_set(where.user, where.password)
         self._answered = loop.create_future()
 
-        def work() -> Any:  # looks the name up, connects, shakes hands: all of it blocks
+        def connect() -> Any:  # name resolution, connection and TLS handshake block
             if where.scheme == "mqtts":
                 client.tls_set_context(ssl.create_default_context())
             client.connect(where.host, where.port, KEEPALIVE_S)
             return client
 
         try:
-            await opened_in_a_thread(work, _cut)
+            await open_in_thread(connect, _close_socket)
         except OSError as error:
             raise self._refused(error) from error
         if (sock := client.socket()) is None:
@@ -62,13 +152,13 @@ class MqttLink(BrokerLink):
         client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
-        self._look_after(client)
-        # wait_for may swallow a cancellation
+        self._poll(client)
+        # wait_for can swallow a cancellation.
         await asyncio.wait((self._answered,), timeout=CONNECT_TIMEOUT_S)
         if self._answered.done():
             refusal = self._answered.result()
         else:
-            refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it a broker of MQTT?)"
+            refusal = f"no answer within {CONNECT_TIMEOUT_S:g} s (is it an MQTT broker?)"
         if not refusal and client.socket() is None:
             refusal = "the broker closed the connection"
         if refusal:
@@ -82,9 +172,9 @@ class MqttLink(BrokerLink):
             name = next(iter(self._waiting))
             client.publish(self._where.place.state(name), self._waiting.pop(name))
         if client is self._client is not None and client.want_write() and (sock := client.socket()):
-            asyncio.get_running_loop().add_writer(sock, self._go_on, client, sock)
+            asyncio.get_running_loop().add_writer(sock, self._continue_writing, client, sock)
 
-    def _go_on(self, client: Any, sock: Any) -> None:
+    def _continue_writing(self, client: Any, sock: Any) -> None:
         client.loop_write()
         if client is self._client and not client.want_write():
             asyncio.get_running_loop().remove_writer(sock)
@@ -95,14 +185,14 @@ class MqttLink(BrokerLink):
             client.loop_read()
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
-        except Exception as error:  # paho 2.1 raises whatever a malformed packet makes it run into
-            _cut(client)
-            self._on_disconnect(client, None, None, f"it sent no MQTT: {error}", None)
+        except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
+            _close_socket(client)
+            self._on_disconnect(client, None, None, f"malformed MQTT packet: {error}", None)
 
-    def _look_after(self, client: Any) -> None:
-        client.loop_misc()  # asks for signs of life, and closes without one
+    def _poll(self, client: Any) -> None:
+        client.loop_misc()
         if client is self._client:
-            self._timer = asyncio.get_running_loop().call_later(LOOK_AFTER_S, self._look_after, client)
+            self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll, client)
 
     def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         self._answer(f"the broker refuses: {reason}" if reason.is_failure else "")
@@ -116,8 +206,8 @@ class MqttLink(BrokerLink):
         loop = asyncio.get_running_loop()
         loop.remove_reader(sock)
         loop.remove_writer(sock)
-        if client is self._client:  # lost: what the system holds must not arrive when the network is back
-            discard_unsent(sock)
+        if client is self._client:  # lost: unsent data must not arrive when the network is back
+            discard_on_close(sock)
 
     def _answer(self, text: str) -> None:
         if self._answered is not None and not self._answered.done():
@@ -132,41 +222,67 @@ class MqttLink(BrokerLink):
             if client.is_connected() and not client.want_write():
                 client.publish(self._alive, b"offline", retain=True)
                 client.disconnect()
-            _cut(client)
+            _close_socket(client)
         self._released.set()
 
 
-def _cut(client: Any) -> None:
-    """Close what is still open, without a goodbye."""
+def _close_socket(client: Any) -> None:
+    """Close the socket if it is open, without DISCONNECT."""
     sock = client.socket()
     if sock is not None:
         if client.on_socket_close is not None:
             client.on_socket_close(client, None, sock)
             client.on_socket_close = None
-        discard_unsent(sock)
+        discard_on_close(sock)
         sock.close()
+
+
+class _NullReceiver:
+    # `ReconnectingLink` logs what happens to the connection.
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        pass
+
+    def link_lost(self, error: LinkLost) -> None:
+        pass
+
+
+class _LinkPublisher(Publisher):
+    def __init__(self, link: ReconnectingLink) -> None:
+        self._link = link
+
+    def __repr__(self) -> str:
+        return f"<publisher on {self._link.address}>"
+
+    def put(self, name: str, data: bytes) -> None:
+        self._link.write(data, name)
 
 
 @checked
 @async_block
 async def mqtt_publisher(address: str) -> AsyncIterator[Publisher]:
-    """Connect to a broker of MQTT for the time of the block.
+    """Connect to an MQTT broker, while the block lasts.
 
-    States go to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0 and not retained. ``aerokit/FLEET/NAME/alive``
-    is retained: "online", and "offline" after the block or when the broker misses this program. A connection that is
-    lost is opened again; what is put meanwhile is dropped. The event loop must know ``add_reader``: on Windows only
-    ``asyncio.SelectorEventLoop`` does.
+    States are published to the topics ``aerokit/FLEET/NAME/state/…``, with QoS 0, not retained.
+    ``aerokit/FLEET/NAME/alive`` is retained: "online", and "offline" after the block or when the broker loses
+    this program. A lost connection is reopened; values published meanwhile are dropped. The event loop must
+    support ``add_reader``: on Windows only ``asyncio.SelectorEventLoop`` does.
 
     Args:
-        address: ``"mqtt://10.0.0.5:1883/fleet/alpha"``, ``"mqtt://user:password@…"``; ``mqtts`` by TLS (port 8883).
+        address: ``"mqtt://10.0.0.5:1883/fleet/alpha"``, ``"mqtt://user:password@…"``; ``mqtts`` for TLS (port
+            8883).
 
     Returns:
-        What :func:`publishing` takes.
+        A publisher for :func:`publishing`.
 
     Raises:
-        InvalidArgument: this is no address of a broker of MQTT.
-        LinkOpenError: the broker cannot be reached or refuses, or paho-mqtt is not installed.
+        InvalidArgument: the address is invalid.
+        LinkOpenError: the broker cannot be reached or refuses the connection, or paho-mqtt is not installed.
     """
     where = parse_broker(address, "mqtt", "mqtts")
-    async with publisher_over(lambda: MqttLink(where)) as publisher:
-        yield publisher
+    link = ReconnectingLink(lambda: MqttLink(where))
+    await link.open(_NullReceiver())
+    try:
+        yield _LinkPublisher(link)
+    finally:
+        link.close()
+        await run_shielded(link.wait_closed())

@@ -1,4 +1,4 @@
-"""``Publisher``: where typed state goes; zenoh, MQTT, or whatever else takes a name and bytes."""
+"""``Publisher``: the interface of networks to which state is published."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 
 
 class Publisher(ABC):
-    """Puts bytes under a name on some network: zenoh, MQTT, or what a program brings a client of."""
+    """Publishes bytes under a name. Implement it for other networks than zenoh and MQTT."""
 
     @abstractmethod
     def put(self, name: str, data: bytes) -> None:
-        """Put ``data`` under ``name`` ("1/position"), at once or not at all: it must not block and not raise."""
+        """Publish ``data`` under ``name`` ("1/position"), immediately or never. It must not block or raise."""

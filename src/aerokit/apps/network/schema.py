@@ -1,4 +1,4 @@
-"""The JSON schema of published states, made of their types: ``python -m aerokit.apps.network.schema``."""
+"""The JSON schema of published states, generated from their types: ``python -m aerokit.apps.network.schema``."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from aerokit.vehicle.state.states import States
 from aerokit.vehicle.state.table import documentation
 
 _ABOUT = (
-    "What aerokit publishes of a vehicle (docs/network.md). Units are in the names of fields. null: not known. A reader"
-    " must take fields and states that it does not know, for they are added without another version."
+    "States of a vehicle that aerokit publishes (docs/network.md). Units are in the names of fields. null: unknown."
+    " Readers must accept unknown fields and states, because they are added without a new version."
 )
 _PLAIN: dict[Any, dict[str, Any]] = {
     bool: {"type": "boolean"},
@@ -42,21 +42,19 @@ ENUMS: dict[str, type[Enum]] = {
     "MissionProgress.state": enums.MissionState,
     "Power.flags": enums.MavPowerStatus,
 }
-"""Integers that are published by their names in the standard (`aerokit._internal.values`), where the number has one."""
+"""Integers that are published by their MAVLink enum names, if the number has one."""
 
 
 def document() -> dict[str, Any]:
-    """The schema (draft 2020-12): one of the messages below ``oneOf``, told apart by ``state``."""
+    """Return the schema (draft 2020-12): ``oneOf`` the messages, distinguished by ``state``."""
     values: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
     texts = documentation()
     hints = typing.get_type_hints(States)
     states = {
-        name: _message(
-            name, texts[name][1], _named(name) or _schema_of(typing.get_args(hints[name])[0], values)
-        )
+        name: _message(name, texts[name][1], _named(name) or _schema_of(typing.get_args(hints[name])[0], values))
         for name in texts
     }
-    states["link"] = _message("link", "Whether frames of it come at all, and how many.", _LINK)
+    states["link"] = _message("link", "State and statistics of the link to the vehicle.", _LINK)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "aerokit state",
@@ -70,7 +68,7 @@ _COUNT = {"type": "integer", "minimum": 0}
 _LINK: dict[str, Any] = {
     "type": "object",
     "properties": {
-        "state": {"type": ["string", "null"], "enum": [*(each.value for each in LinkState), None]},
+        "state": {"type": ["string", "null"], "enum": [*(state.value for state in LinkState), None]},
         "heartbeat_age_s": {"type": ["number", "null"]},
         "frames_received": _COUNT,
         "frames_lost": _COUNT,
@@ -80,14 +78,14 @@ _LINK: dict[str, Any] = {
 
 
 _MESSAGE: dict[str, Any] = {
-    "description": "what all of them have",
+    "description": "fields of all messages",
     "type": "object",
     "properties": {
         "version": {"const": VERSION},
         "system_id": {"type": "integer", "minimum": 1, "maximum": 255},
         "state": {"type": "string"},
-        "age_s": {"type": "number", "minimum": 0, "description": "seconds since the vehicle told it"},
-        "unix_s": {"type": "number", "description": "by the clock of who publishes it"},
+        "age_s": {"type": "number", "minimum": 0, "description": "seconds since the value was received"},
+        "unix_s": {"type": "number", "description": "time of publication, by the publisher's clock"},
     },
     "required": ["version", "system_id", "state", "value", "age_s", "unix_s"],
 }
@@ -103,29 +101,31 @@ def _message(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _schema_of(kind: Any, values: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Of what :func:`aerokit._internal.plain.plain` makes of a value of this type."""
+    """Return the schema of a value of this type, as :func:`aerokit._internal.formatting.to_jsonable` converts it."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        return {"anyOf": [_schema_of(each, values) for each in arguments]}
+        return {"anyOf": [_schema_of(argument, values) for argument in arguments]}
     if origin in (tuple, list):
         if len(arguments) == 2 and arguments[1] is ...:
             return {"type": "array", "items": _schema_of(arguments[0], values)}
-        members = [_schema_of(each, values) for each in arguments]
+        members = [_schema_of(argument, values) for argument in arguments]
         return {"type": "array", "prefixItems": members, "minItems": len(members), "maxItems": len(members)}
     if isinstance(kind, type) and issubclass(kind, Snapshot):
         if kind.__name__ not in values:
-            values[kind.__name__] = {}  # of one that has itself inside
+            values[kind.__name__] = {}  # placeholder for recursive types
             values[kind.__name__] = _object(kind, values)
         return {"$ref": f"#/$defs/{kind.__name__}"}
     return dict(_PLAIN[kind])
 
 
 def _named(name: str) -> dict[str, Any] | None:
-    """Of an integer that has names: its name, or a list of those of its bits; the number where it has none."""
+    """Return the schema of an integer with names: the name, a list of names for flags, or the number if it has no
+    name.
+    """
     enum = ENUMS.get(name)
     if enum is None:
         return None
-    names = {"enum": [each.name for each in enum]}
+    names = {"enum": [member.name for member in enum]}
     several = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
     return {"description": f"of {enum.__name__}", "anyOf": [names, *several, {"type": "integer"}]}
 
@@ -147,15 +147,11 @@ def _object(kind: type[Snapshot], values: dict[str, dict[str, Any]]) -> dict[str
 
 
 def rendered() -> str:
-    """The file docs/state.schema.json: a line for each state and each type."""
-    whole = document()
-    lines = [
-        f" {json.dumps(key)}: {_json(value)},"
-        for key, value in whole.items()
-        if key not in ("oneOf", "$defs")
-    ]
-    states = ",\n".join(f"  {_json(each)}" for each in whole["oneOf"])
-    kinds = ",\n".join(f"  {_json(name)}: {_json(each)}" for name, each in whole["$defs"].items())
+    """Return the content of docs/state.schema.json, with one line for each state and type."""
+    schema = document()
+    lines = [f" {json.dumps(key)}: {_json(value)}," for key, value in schema.items() if key not in ("oneOf", "$defs")]
+    states = ",\n".join(f"  {_json(state)}" for state in schema["oneOf"])
+    kinds = ",\n".join(f"  {_json(name)}: {_json(definition)}" for name, definition in schema["$defs"].items())
     return "\n".join(["{", *lines, f' "oneOf": [\n{states}\n ],', f' "$defs": {{\n{kinds}\n }}', "}", ""])
 
 

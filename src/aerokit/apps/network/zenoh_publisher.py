@@ -1,4 +1,4 @@
-"""``zenoh_publisher``: typed state on a zenoh network."""
+"""``zenoh_publisher``: vehicle state on a zenoh network."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from aerokit.apps.network.publisher import Publisher
 from aerokit.errors import InvalidArgument
 from aerokit.transport.address import parse_address
 from aerokit.transport.create import network_options
-from aerokit.transport.zenoh.keys import Place, check_name
+from aerokit.transport.zenoh.keys import KeySpace, check_name
 from aerokit.transport.zenoh.session import NetworkOptions, close_session, open_session
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
-CLOSE_TIMEOUT_S = 2.0
+_CLOSE_SESSION_TIMEOUT_S = 2.0
 
 
 class _ZenohPublisher(Publisher):
-    """On the keys ``aerokit/FLEET/NAME/state/…``."""
+    """Publishes to the keys ``aerokit/FLEET/NAME/state/…``."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: KeySpace) -> None:
         self._place = place
         self._drop: Any = None
         self._session: Any = None
@@ -36,39 +36,34 @@ class _ZenohPublisher(Publisher):
         self._session = session
 
     def put(self, name: str, data: bytes) -> None:
-        with contextlib.suppress(Exception):  # zenoh's own: the session has ended
-            self._session.put(
-                self._place.state(name),
-                data,
-                encoding="application/json",
-                congestion_control=self._drop,
-            )
+        with contextlib.suppress(Exception):  # zenoh's own error: the session has ended
+            self._session.put(self._place.state(name), data, encoding="application/json", congestion_control=self._drop)
 
 
 @checked
 @async_block
 async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
-    """Open a session on a zenoh network for the time of the block.
+    """Open a session on a zenoh network, while the block lasts.
 
-    What is put is dropped where it meets a queue that is full, and while there is no network.
+    Data is dropped if a queue is full, or keys is no network.
 
     Args:
         address: ``"zenoh://fleet/alpha"``, with the options of :doc:`addresses </addresses>`.
 
     Returns:
-        What :func:`publishing` takes.
+        A publisher for :func:`publishing`.
 
     Raises:
-        InvalidArgument: this is no address of a zenoh network.
-        LinkOpenError: there is no network, or eclipse-zenoh is not installed.
+        InvalidArgument: the address is invalid.
+        LinkOpenError: keys is no network, or eclipse-zenoh is not installed.
     """
     where = parse_address(address)
     if where.kind not in ("zenoh", "zenohin"):
         raise InvalidArgument(
-            f"address = {address!r} is not allowed: it is not on a network, as zenoh://fleet/alpha is"
+            f"address = {address!r} is not allowed: expected a zenoh address like zenoh://fleet/alpha"
         )
     fleet, _, name = where.path.partition("/")
-    publisher = _ZenohPublisher(Place(fleet, name))
+    publisher = _ZenohPublisher(KeySpace(fleet, name))
     session = await open_session(address, network_options(where), publisher.prepare)
     try:
         yield publisher
@@ -76,11 +71,11 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
         closed = asyncio.Event()
         close_session(session, closed.set)
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(closed.wait(), CLOSE_TIMEOUT_S)
+            await asyncio.wait_for(closed.wait(), _CLOSE_SESSION_TIMEOUT_S)
 
 
 @checked
-async def found(
+async def discover(
     fleet: str,
     *,
     connect: Sequence[str] = (),
@@ -88,34 +83,34 @@ async def found(
     config: str = "",
     wait: float = 1.0,
 ) -> list[str]:
-    """The names of a fleet that are on a zenoh network now: what ``zenoh://FLEET/NAME`` can be opened for.
+    """Return the names of a fleet that are on a zenoh network, and can be opened as ``zenoh://FLEET/NAME``.
 
     Args:
-        fleet: its name.
-        connect: endpoints of routers and peers, ``["tcp/10.0.0.5:7447"]``; none, and nothing to listen on: whoever is
-            found by multicast.
+        fleet: name of the fleet.
+        connect: endpoints of routers and peers, ``["tcp/10.0.0.5:7447"]``; without ``connect`` and ``listen``,
+            multicast.
         listen: endpoints to listen on.
-        config: a configuration file of zenoh's own.
-        wait: seconds to look, above 0; on a network that is found by multicast, a second is not much.
+        config: path of a zenoh configuration file.
+        wait: seconds to search, above 0; multicast discovery can take more than a second.
 
     Returns:
         The names, sorted.
 
     Raises:
-        InvalidArgument: an argument is wrong.
-        LinkOpenError: there is no network, or eclipse-zenoh is not installed.
+        InvalidArgument: an argument is invalid.
+        LinkOpenError: keys is no network, or eclipse-zenoh is not installed.
     """
     check_name("fleet", fleet)
-    there: set[str] = set()
+    keys: set[str] = set()
     declared: list[Any] = []
 
     def prepare(zenoh: Any, session: Any) -> None:
-        def hear(sample: Any) -> None:  # on a thread of zenoh's; a set is changed whole
+        def on_sample(sample: Any) -> None:  # on a zenoh thread; set.add and set.discard are atomic
             key = str(sample.key_expr)
-            (there.add if sample.kind == zenoh.SampleKind.PUT else there.discard)(key)
+            (keys.add if sample.kind == zenoh.SampleKind.PUT else keys.discard)(key)
 
-        everybody = Place(fleet, "*").alive()
-        declared.append(session.liveliness().declare_subscriber(everybody, hear, history=True))
+        all_names = KeySpace(fleet, "*").alive()
+        declared.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
 
     options = NetworkOptions(tuple(connect), tuple(listen), "", config)
     session = await open_session(f"zenoh://{fleet}", options, prepare)
@@ -126,4 +121,4 @@ async def found(
         declared.clear()
         close_session(session, closed.set)
     await closed.wait()
-    return sorted({key.split("/")[2] for key in there})
+    return sorted({key.split("/")[2] for key in keys})

@@ -1,4 +1,4 @@
-"""The operations of the HTTP API: a table, from which the routes and the OpenAPI document are made."""
+"""The HTTP API: a table of operations, from which the routes and the OpenAPI document are made."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 from starlette.responses import Response
 
 from aerokit import __version__
-from aerokit._internal.plain import plain
-from aerokit.apps.serve.orders import ORDERS, SET_PARAMETER, Given, OrderKind, Orders
+from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.serve.orders import ORDERS, SET_PARAMETER, OrderRecord, OrderRunner, OrderType
 from aerokit.apps.serve.requests import (
-    Problem,
-    body_of,
-    is_asked,
+    HttpProblem,
     json_response,
     problem_response,
+    query_flag,
+    read_body,
     seen_at,
     system_id_of,
 )
@@ -31,33 +31,33 @@ if TYPE_CHECKING:
 
     from starlette.requests import Request
 
-    from aerokit.apps.serve.guard import Keys
-    from aerokit.apps.serve.orders import Argument
-    from aerokit.apps.serve.watch import Watch
+    from aerokit.apps.serve.guard import AccessControl
+    from aerokit.apps.serve.orders import OrderArgument
+    from aerokit.apps.serve.served_vehicles import ServedVehicles
     from aerokit.missions import Mission
     from aerokit.vehicle.vehicle import Vehicle
 
-_ABOUT = """State, missions, parameters and orders of vehicles that speak MAVLink (docs/serve.md of aerokit).
+_ABOUT = """State, missions, parameters and orders of MAVLink vehicles (docs/serve.md of aerokit).
 
-Fields have their units in their names; what a vehicle has not told is missing or null, never 0. An order is awaited:
-its answer says that the vehicle has done it, or why not. It runs on when the client goes away. `Idempotency-Key`
-makes it safe to ask again: an order is given once."""
+Field names contain the units. Unknown values are missing or null, never 0. A request with an order waits until the
+vehicle has executed it or failed; the order continues if the client disconnects. With the same `Idempotency-Key` a
+request can be repeated safely: the order runs once."""
 
 _QUERY = {
-    "refresh": "ask the vehicle again, instead of what is known; needs the token",
-    "wait": "false: answer 202 at once when the order is under way; its result comes on the stream and at /api/orders",
+    "refresh": "true: read from the vehicle again; needs the token",
+    "wait": "false: return 202 as soon as the order runs; its result is on the stream and at /api/orders",
 }
 
 _FAILURES = {
     "400": "wrong arguments; nothing was sent",
     "401": "the token is missing or wrong",
-    "403": "orders are switched off, or the page of another site asks",
-    "404": "no such vehicle has been heard, or there is nothing of that name",
-    "409": "the vehicle refused, somebody else took over, or it is busy",
+    "403": "the server is read-only, or the request comes from a page of another site",
+    "404": "no such vehicle or resource",
+    "409": "the vehicle refused or is busy, or another party took control",
     "413": "the body is too large",
-    "415": "the body is no JSON",
-    "503": "the vehicle is silent, or the link has gone",
-    "504": "not done in time",
+    "415": "the body is not JSON",
+    "503": "the vehicle is silent, or the link is lost",
+    "504": "timed out",
 }
 
 _HEADERS = (
@@ -65,19 +65,49 @@ _HEADERS = (
         "Idempotency-Key",
         True,
         "string",
-        "of this order alone, 8 to 64 characters; asked again, it is not given again",
+        "unique key of the order, 8 to 64 characters; a repeated request does not run it again",
     ),
     (
         "Aerokit-Seen-At",
         False,
         "number",
-        "at_s of the state on the stream that the order is given upon: refused when old",
+        "at_s of the newest state message that the client has; an order is refused if that is too old",
     ),
 )
+_PROBLEM: dict[str, Any] = {
+    "type": "object",
+    "description": "RFC 9457; `error` is the class of the error, `reasons` are the vehicle's reasons.",
+    "required": ["type", "title", "status", "detail", "error"],
+    "properties": {
+        "type": {"type": "string"},
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string"},
+        "error": {"type": "string"},
+        "reasons": {"type": "array", "items": {"type": "string"}},
+        "order": {"$ref": "#/components/schemas/Order"},
+    },
+}
+_ORDER: dict[str, Any] = {
+    "type": "object",
+    "required": ["key", "system_id", "order", "arguments", "given_unix_s", "state"],
+    "properties": {
+        "key": {"type": "string"},
+        "system_id": {"type": "integer"},
+        "order": {"type": "string"},
+        "arguments": {"type": "object"},
+        "given_unix_s": {"type": "number"},
+        "state": {"enum": ["running", "done", "failed"]},
+        "result": {},
+        "problem": {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]},
+    },
+}
+# With wait=false, wait this long, so that an order that is refused locally is answered with the reason.
+_REFUSAL_TIMEOUT_S = 0.2
 
 
 def document(operations: Iterable[Operation], root_path: str = "") -> dict[str, Any]:
-    """The document; ``root_path`` is where the application is mounted."""
+    """Return the OpenAPI document; ``root_path`` is the path where the application is mounted."""
     paths: dict[str, Any] = {}
     for operation in operations:
         paths.setdefault(operation.path, {})[operation.method.lower()] = _operation(operation)
@@ -102,16 +132,16 @@ def _operation(operation: Operation) -> dict[str, Any]:
         "summary": operation.summary,
         "parameters": [*_parameters(operation)],
         "responses": {
-            "200": {"description": "done" if is_order else "what is known", "content": _json(answer)},
+            "200": {"description": "done" if is_order else "the current values", "content": _json(answer)},
             **_failures(operation),
         },
     }
     if not operation.is_open:
         found["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
     if operation.order is not None:
-        found["responses"]["202"] = {"description": "under way (wait=false)", "content": _json(answer)}
+        found["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
         found["requestBody"] = {
-            "required": any(each.is_required for each in operation.order.arguments.values()),
+            "required": any(argument.is_required for argument in operation.order.arguments.values()),
             "content": _json(_body(operation.order)),
         }
     return found
@@ -119,9 +149,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
 
 def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
     for name in re.findall(r"{(\w+)}", operation.path):
-        schema = (
-            {"type": "integer", "minimum": 1, "maximum": 255} if name == "system_id" else {"type": "string"}
-        )
+        schema = {"type": "integer", "minimum": 1, "maximum": 255} if name == "system_id" else {"type": "string"}
         yield {"name": name, "in": "path", "required": True, "schema": schema}
     for name in operation.query:
         schema = {"type": "boolean"}
@@ -148,16 +176,16 @@ def _failures(operation: Operation) -> dict[str, Any]:
     }
 
 
-def _body(kind: OrderKind) -> dict[str, Any]:
+def _body(kind: OrderType) -> dict[str, Any]:
     return {
         "type": "object",
-        "properties": {name: _schema(each) for name, each in kind.arguments.items()},
-        "required": [name for name, each in kind.arguments.items() if each.is_required],
+        "properties": {name: _schema(argument) for name, argument in kind.arguments.items()},
+        "required": [name for name, argument in kind.arguments.items() if argument.is_required],
         "additionalProperties": False,
     }
 
 
-def _schema(argument: Argument) -> dict[str, Any]:
+def _schema(argument: OrderArgument) -> dict[str, Any]:
     kind = argument.type if isinstance(argument.type, str) else list(argument.type)
     return {"type": kind, "description": argument.text}
 
@@ -170,8 +198,8 @@ def _stream() -> dict[str, Any]:
     return {
         "operationId": "stream",
         "summary": "WebSocket: JSON messages hello, state, event, order",
-        "description": "Subprotocol aerokit.v1; browsers give the token as a second one, bearer.TOKEN. A slow client"
-        " gets the newest state; of events, `missed` says how many it did not get.",
+        "description": "Subprotocol aerokit.v1; browsers pass the token as a second one, bearer.TOKEN. A slow client"
+        " gets the newest state; `missed` counts the events that were dropped.",
         "parameters": [
             {
                 "name": "rate_hz",
@@ -185,94 +213,63 @@ def _stream() -> dict[str, Any]:
     }
 
 
-_PROBLEM: dict[str, Any] = {
-    "type": "object",
-    "description": "RFC 9457; `error` is the kind of failure, `reasons` what the vehicle gave for it.",
-    "required": ["type", "title", "status", "detail", "error"],
-    "properties": {
-        "type": {"type": "string"},
-        "title": {"type": "string"},
-        "status": {"type": "integer"},
-        "detail": {"type": "string"},
-        "error": {"type": "string"},
-        "reasons": {"type": "array", "items": {"type": "string"}},
-        "order": {"$ref": "#/components/schemas/Order"},
-    },
-}
-
-_ORDER: dict[str, Any] = {
-    "type": "object",
-    "required": ["key", "system_id", "order", "arguments", "given_unix_s", "state"],
-    "properties": {
-        "key": {"type": "string"},
-        "system_id": {"type": "integer"},
-        "order": {"type": "string"},
-        "arguments": {"type": "object"},
-        "given_unix_s": {"type": "number"},
-        "state": {"enum": ["running", "done", "failed"]},
-        "result": {},
-        "problem": {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]},
-    },
-}
-
 Handler = Callable[["Request"], Awaitable[Response]]
-
-AT_ONCE_S = 0.2
-"""What is refused without asking the vehicle is told in the answer, also when that is not to wait."""
 
 
 @dataclass(frozen=True)
 class Operation:
-    """One method of one path; ``name`` is its operationId. ``order``: what its body is."""
+    """One method of one path. ``name`` is its operationId, ``order`` the type of its body."""
 
     method: str
     path: str
     name: str
     summary: str
     handler: Handler
-    order: OrderKind | None = None
+    order: OrderType | None = None
     query: tuple[str, ...] = ()
     is_open: bool = False
-    """Whether it is answered without a token: it says nothing of vehicles."""
+    """True if it needs no token, because it reveals nothing about vehicles."""
 
 
-class Api:
-    """Answers requests from what is known, and gives orders."""
-
-    def __init__(self, watch: Watch, orders: Orders, keys: Keys, settings: dict[str, Any]) -> None:
-        self._watch, self._orders, self._keys, self._settings = watch, orders, keys, settings
+class HttpApi:
+    def __init__(
+        self, served: ServedVehicles, orders: OrderRunner, access: AccessControl, settings: dict[str, Any]
+    ) -> None:
+        self._served, self._orders, self._access, self._settings = served, orders, access, settings
         self._locks: dict[Vehicle, asyncio.Lock] = {}
         self._missions: dict[Vehicle, tuple[Mission, float]] = {}
 
     def operations(self) -> tuple[Operation, ...]:
-        """All of them."""
         one, named = "/api/vehicles/{system_id}", "/api/vehicles/{system_id}/parameters/{name}"
         get = partial(Operation, "GET")
         return (
             get("/api", "about", "Version and settings of this server", self._about, is_open=True),
             get("/api/openapi.json", "openapi", "This document", self._openapi, is_open=True),
-            get("/api/vehicles", "vehicles", "The vehicles that have been heard", self._list),
-            get(one, "vehicle", "All that is known of a vehicle, with ages", self._vehicle),
-            get(f"{one}/texts", "texts", "What it has said, the newest last", self._texts),
+            get("/api/vehicles", "vehicles", "All vehicles", self._list),
+            get(one, "vehicle", "The state of a vehicle, with ages", self._vehicle),
+            get(f"{one}/texts", "texts", "Its status texts, the newest last", self._texts),
             get(f"{one}/mission", "mission", "Its mission", self._mission, query=("refresh",)),
+            get(f"{one}/parameters", "parameters", "All its parameters", self._parameters, query=("refresh",)),
+            get(named, "parameter", "One parameter, read from the vehicle", self._parameter),
+            get("/api/events", "events", "Recent events, the newest last", self._events),
             get(
-                f"{one}/parameters", "parameters", "All its parameters", self._parameters, query=("refresh",)
+                "/api/orders",
+                "orders",
+                "Orders and their results, the newest last",
+                self._list_orders,
             ),
-            get(named, "parameter", "One parameter, asked of it now", self._parameter),
-            get("/api/events", "events", "The last events, the newest last", self._events),
-            get("/api/orders", "orders", "Orders and what came of them, the newest last", self._list_orders),
             get("/api/orders/{key}", "order", "One order, by its Idempotency-Key", self._order),
             *(self._order_operation("POST", f"{one}/{kind.name}", kind) for kind in ORDERS),
             self._order_operation("PUT", named, SET_PARAMETER),
         )
 
     def endpoint(self, operation: Operation) -> Handler:
-        """The operation as Starlette calls it: nobody gets in without the token that it needs."""
+        """Return the Starlette endpoint of an operation, with the check of the token."""
 
         async def answer(request: Request) -> Response:
             try:
                 if not operation.is_open:
-                    self._keys.check(request.headers, is_order=operation.order is not None)
+                    self._access.check(request.headers, is_order=operation.order is not None)
                 return await operation.handler(request)
             except Exception as error:
                 answer = problem_response(error)
@@ -282,11 +279,9 @@ class Api:
 
         return answer
 
-    def _order_operation(self, method: str, path: str, kind: OrderKind) -> Operation:
+    def _order_operation(self, method: str, path: str, kind: OrderType) -> Operation:
         name = kind.name.replace("/", "_")
-        return Operation(method, path, name, kind.summary, partial(self._give, kind), kind, ("wait",))
-
-    # ------------------------------------------------------------------------------------- reading
+        return Operation(method, path, name, kind.summary, partial(self._run_order, kind), kind, ("wait",))
 
     async def _about(self, request: Request) -> Response:
         return json_response({"aerokit": __version__, **self._settings})
@@ -295,7 +290,7 @@ class Api:
         return json_response(document(self.operations(), request.scope.get("root_path", "")))
 
     async def _list(self, request: Request) -> Response:
-        return json_response({"vehicles": [_summary(each) for each in self._watch.vehicles.values()]})
+        return json_response({"vehicles": [_summary(vehicle) for vehicle in self._served.vehicles.values()]})
 
     async def _vehicle(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
@@ -304,7 +299,7 @@ class Api:
         return json_response({**overview(vehicle), "modes": modes})
 
     async def _texts(self, request: Request) -> Response:
-        return json_response({"texts": self._watch.texts(self._vehicle_of(request).system_id)})
+        return json_response({"texts": self._served.texts(self._vehicle_of(request).system_id)})
 
     async def _mission(self, request: Request) -> Response:
         vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
@@ -313,14 +308,14 @@ class Api:
                 self._missions[vehicle] = (await vehicle.mission.download(), vehicle.connection.now())
             mission, read_at = self._missions[vehicle]
         items = [
-            {"index": index, "name": item.name, "position": plain(item.position), **plain(item)}
+            {"index": index, "name": item.name, "position": to_jsonable(item.position), **to_jsonable(item)}
             for index, item in enumerate(mission)
         ]
-        age_s = plain(vehicle.connection.now() - read_at)
+        age_s = to_jsonable(vehicle.connection.now() - read_at)
         return json_response({"items": items, "current": vehicle.mission.current.latest, "age_s": age_s})
 
     def _has_mission(self, vehicle: Vehicle) -> bool:
-        """Whether it was read, and has as many items still; another station may have changed them all the same."""
+        # Detects a changed number of items only; MAVLink does not report other changes.
         mission, _ = self._missions.get(vehicle, (None, 0.0))
         count = vehicle.mission.count.latest
         return mission is not None and count in (None, len(mission))
@@ -329,62 +324,58 @@ class Api:
         vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
             table = await vehicle.parameters.download(refresh=is_new)
-        return json_response({"parameters": [plain(table[name]) for name in sorted(table)]})
+        return json_response({"parameters": [to_jsonable(table[name]) for name in sorted(table)]})
 
     async def _parameter(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
         try:
-            return json_response(plain(await vehicle.parameters.read(request.path_params["name"])))
+            return json_response(to_jsonable(await vehicle.parameters.read(request.path_params["name"])))
         except ParameterRejected as error:
-            raise Problem(404, "ParameterRejected", str(error)) from None
+            raise HttpProblem(404, "ParameterRejected", str(error)) from None
 
     async def _events(self, request: Request) -> Response:
-        return json_response({"events": list(self._watch.events)})
+        return json_response({"events": list(self._served.events)})
 
     async def _list_orders(self, request: Request) -> Response:
-        return json_response({"orders": [each.record() for each in self._orders.all()]})
+        return json_response({"orders": [record.to_dict() for record in self._orders.all()]})
 
     async def _order(self, request: Request) -> Response:
-        return json_response(self._orders.get(request.path_params["key"]).record())
+        return json_response(self._orders.get(request.path_params["key"]).to_dict())
 
-    # -------------------------------------------------------------------------------------- orders
-
-    async def _give(self, kind: OrderKind, request: Request) -> Response:
+    async def _run_order(self, kind: OrderType, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
-        waits, arguments = is_asked(request, "wait", default=True), await body_of(request)
+        waits, arguments = query_flag(request, "wait", default=True), await read_body(request)
         kind.check(arguments)
         if kind is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
         key = request.headers.get("idempotency-key", "").strip().strip('"')
-        given = self._orders.give(vehicle, kind, arguments, key, seen_at(request))
-        await _ended(given, None if waits else AT_ONCE_S)
-        if given.problem is not None:
+        record = self._orders.submit(vehicle, kind, arguments, key, seen_at(request))
+        await _wait_ended(record, None if waits else _REFUSAL_TIMEOUT_S)
+        if record.problem is not None:
             return json_response(
-                {**given.problem, "order": given.record()},
-                given.problem["status"],
+                {**record.problem, "order": record.to_dict()},
+                record.problem["status"],
                 "application/problem+json",
             )
-        return json_response(given.record(), 200 if given.state == "done" else 202)
-
-    # -------------------------------------------------------------------------------------- inside
+        return json_response(record.to_dict(), 200 if record.state == "done" else 202)
 
     def _vehicle_of(self, request: Request) -> Vehicle:
-        return self._watch.vehicle(system_id_of(request))
+        return self._served.vehicle(system_id_of(request))
 
     def _is_refresh(self, request: Request) -> bool:
-        """What is asked of the vehicle once more costs its link something: only who may order it may have it."""
-        is_new = is_asked(request, "refresh", default=False)
+        # Reading from the vehicle uses its link, so it needs the token, like an order.
+        is_new = query_flag(request, "refresh", default=False)
         if is_new:
-            self._keys.check(request.headers, needs_token=True)
+            self._access.check(request.headers, needs_token=True)
         return is_new
 
     def _lock(self, vehicle: Vehicle) -> asyncio.Lock:
-        """One transfer at a time, whose result all get who asked."""
+        # One transfer at a time; concurrent requests share its result.
         return self._locks.setdefault(vehicle, asyncio.Lock())
 
 
-async def _ended(given: Given, timeout_s: float | None) -> None:
-    waiting = asyncio.ensure_future(given.ended.wait())
+async def _wait_ended(record: OrderRecord, timeout_s: float | None) -> None:
+    waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)
     finally:

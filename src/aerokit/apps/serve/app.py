@@ -12,16 +12,15 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
-from aerokit.apps.serve.api import Api
-from aerokit.apps.serve.guard import Guard, Keys, content_policy
-from aerokit.apps.serve.orders import Orders
-from aerokit.apps.serve.requests import Problem, problem_response
-from aerokit.apps.serve.stream import Stream
-from aerokit.apps.serve.watch import Watch
+from aerokit.apps.serve.api import HttpApi
+from aerokit.apps.serve.guard import AccessControl, SecurityMiddleware, content_policy
+from aerokit.apps.serve.orders import OrderRunner
+from aerokit.apps.serve.requests import HttpProblem, problem_response
+from aerokit.apps.serve.served_vehicles import ServedVehicles
+from aerokit.apps.serve.stream import StateStream
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
-    from types import TracebackType
 
     from starlette.requests import Request
     from starlette.types import Receive, Scope, Send
@@ -35,50 +34,56 @@ KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".s
 
 
 class ServeApp:
-    """An ASGI application. ``async with app:`` ends what it does at the end of the block, or ``await app.aclose()``."""
+    """The ASGI application. Use ``async with app:``, or call ``await app.aclose()`` at the end."""
 
     def __init__(
-        self, watch: Watch, keys: Keys, token: str, settings: dict[str, Any], hosts: Collection[str]
+        self,
+        served: ServedVehicles,
+        access: AccessControl,
+        token: str,
+        settings: dict[str, Any],
+        hosts: Collection[str],
     ) -> None:
         self.token = token
-        """What orders, and reading where it is not open, have to be given."""
-        self._keys = keys
-        self._watch, self._orders = watch, Orders(watch)
-        api = Api(watch, self._orders, keys, settings)
-        stream = Stream(watch, self._orders, keys)
+        """Token that orders need; also reading, unless ``open_reading``."""
+        self._access = access
+        self._served, self._orders = served, OrderRunner(served)
+        api = HttpApi(served, self._orders, access, settings)
+        stream = StateStream(served, self._orders, access)
         operations = api.operations()
         app = Starlette(
             routes=[
-                *(Route(each.path, api.endpoint(each), methods=[each.method]) for each in operations),
+                *(
+                    Route(operation.path, api.endpoint(operation), methods=[operation.method])
+                    for operation in operations
+                ),
                 WebSocketRoute("/api/stream", stream.endpoint),
                 *_static_routes(),
             ],
-            exception_handlers={HTTPException: _problem, Exception: _mistake},
+            exception_handlers={HTTPException: _http_problem, Exception: _server_error},
         )
         app.router.redirect_slashes = False
         self.routes: tuple[BaseRoute, ...] = tuple(app.routes)
-        """Of the page, the HTTP operations and the stream."""
-        self._app = Guard(app, hosts, settings["tiles"])
+        """Routes of the page, the HTTP operations and the stream."""
+        self._app = SecurityMiddleware(app, hosts, settings["tiles"])
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request, as ASGI has it."""
+        """Handle one ASGI connection."""
         await self._app(scope, receive, send)
 
-    def holds_token(self, headers: list[tuple[bytes, bytes]]) -> bool:
-        """Whether a request with these headers, as ASGI has them, holds the token."""
-        return self._keys.holds_token(Headers(raw=headers))
+    def has_token(self, headers: list[tuple[bytes, bytes]]) -> bool:
+        """Return True if ASGI headers contain the token."""
+        return self._access.has_token(Headers(raw=headers))
 
     async def aclose(self) -> None:
-        """End it: orders that are under way are cancelled as actions of the library are, which ends in holding."""
+        """Close the application. Running orders are cancelled, so their vehicles hold."""
         await self._orders.aclose()
-        await self._watch.aclose()
+        await self._served.aclose()
 
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exception: object) -> None:
         await self.aclose()
 
 
@@ -92,24 +97,24 @@ def make_app(
     tiles: str | None = None,
     attribution: str = "",
 ) -> ServeApp:
-    """Serve vehicles to browsers and other programs, in the loop that is running: to be mounted, or run by uvicorn.
+    """Make an ASGI application that serves vehicles, to be mounted or run with uvicorn in the running loop.
 
     Args:
-        source: a connection, all of whose vehicles are served as they are heard; one vehicle; or system id → vehicle.
-            What opened them closes them, after the application.
-        token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~; None: a random one, which is in ``app.token``.
-        read_only: take no orders, whoever gives them.
-        open_reading: let everyone read who can reach it; orders need the token all the same.
-        hosts: names under which browsers may reach it, beside ``localhost`` and IP addresses.
-        tiles: template of a tile server's URL, ``https://tiles.example/{z}/{x}/{y}.png``; None: no tiles are fetched.
-        attribution: text that the tile server wants to be shown.
+        source: a connection, whose vehicles are served as they appear; one vehicle; or a mapping from system id
+            to vehicle. The caller closes them, after the application.
+        token: 16 to 256 characters of A-Z, a-z, 0-9, - . _ ~; None: a random token, in ``app.token``.
+        read_only: reject all orders.
+        open_reading: allow reading without the token; orders always need it.
+        hosts: host names that browsers may use, besides ``localhost`` and IP addresses.
+        tiles: URL template of a tile server, ``https://tiles.example/{z}/{x}/{y}.png``; None: no tiles.
+        attribution: attribution of the tiles, shown on the map.
 
     Raises:
-        InvalidArgument: an argument that cannot be right.
+        InvalidArgument: an argument is invalid.
         ConnectionClosed, LinkLost: the connection has ended.
     """
     token = secrets.token_urlsafe(24) if token is None else token
-    keys = Keys(token, open_reading=open_reading, read_only=read_only)
+    access = AccessControl(token, open_reading=open_reading, read_only=read_only)
     content_policy(tiles)
     settings = {
         "read_only": read_only,
@@ -117,11 +122,11 @@ def make_app(
         "tiles": tiles,
         "attribution": attribution,
     }
-    return ServeApp(Watch(source), keys, token, settings, hosts)
+    return ServeApp(ServedVehicles(source), access, token, settings, hosts)
 
 
 def _static_routes() -> list[Route]:
-    """The files of the page, read once: nothing else can be asked for."""
+    # Read once: no request can reach other files.
     routes = []
     for path in sorted(STATIC.iterdir()):
         if path.suffix in KINDS:
@@ -137,13 +142,11 @@ def _file(data: bytes, kind: str) -> Any:
     return answer
 
 
-async def _problem(request: Request, error: Exception) -> Response:
+async def _http_problem(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    problem = Problem(
-        error.status_code, "NotFound" if error.status_code == 404 else "HttpError", error.detail
-    )
+    problem = HttpProblem(error.status_code, "NotFound" if error.status_code == 404 else "HttpError", error.detail)
     return problem_response(problem)
 
 
-async def _mistake(request: Request, error: Exception) -> Response:
+async def _server_error(request: Request, error: Exception) -> Response:
     return problem_response(error)

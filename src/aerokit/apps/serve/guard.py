@@ -1,4 +1,4 @@
-"""Who may ask: host and origin of a request, the token, and what browsers are told to forbid themselves."""
+"""Access control: token, Host and Origin of requests, security headers, and limits on connections."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from aerokit.apps.serve.requests import Problem, problem_response
+from aerokit.apps.serve.requests import HttpProblem, problem_response
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
@@ -21,76 +21,74 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 PROTOCOL = "aerokit.v1"
-"""The WebSocket subprotocol that is spoken."""
-
+"""The WebSocket subprotocol."""
 _TOKEN_PREFIX = "bearer."
-
-SHORTEST_TOKEN = 16
-
+MIN_TOKEN_LENGTH = 16
 _TOKEN_CHARACTERS = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-._~")
+MAX_ANONYMOUS_CONNECTIONS = 64
+"""Limit for connections that have not shown the token. One more closes the oldest of the address with most of
+them.
+"""
+REQUEST_TIMEOUT_S = 10.0
+"""Seconds from the first byte of a request, or from the start of the connection, to the end of its headers."""
 
 
 def check_token(token: str) -> str:
-    """Raise InvalidArgument unless it can stand in headers and is not short; its value is in no text."""
-    if not (SHORTEST_TOKEN <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
+    """Return the token; raise InvalidArgument if it is too short, or not valid in a header. The message does not
+    contain it.
+    """
+    if not (MIN_TOKEN_LENGTH <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
         raise InvalidArgument(
-            f"a token has {SHORTEST_TOKEN} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this one has {len(token)},"
-            " or others"
+            f"a token must have {MIN_TOKEN_LENGTH} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this one has"
+            f" {len(token)}{'' if set(token) <= _TOKEN_CHARACTERS else ', some of them invalid'}"
         )
     return token
 
 
-class Keys:
-    """Checks the token of a request: ``Authorization: Bearer …``, or for WebSockets a subprotocol ``bearer.…``."""
+class AccessControl:
+    """Checks the token of requests: ``Authorization: Bearer …``, or for WebSockets a subprotocol ``bearer.…``."""
 
     def __init__(self, token: str, *, open_reading: bool, read_only: bool) -> None:
         self._token = check_token(token).encode()
         self._open_reading = open_reading
         self.read_only: bool = read_only
 
-    def holds_token(self, headers: Headers) -> bool:
-        """Whether the token is in these headers."""
+    def has_token(self, headers: Headers) -> bool:
         given = _token_of(headers)
-        return given is not None and hmac.compare_digest(
-            given.encode("utf-8", "surrogateescape"), self._token
-        )
+        return given is not None and hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token)
 
     def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
-        """Raise Problem, 401 or 403, unless this may be asked."""
+        """Raise HttpProblem 401 or 403 if the request is not allowed."""
         if is_order and self.read_only:
-            raise Problem(403, "ReadOnly", "this server takes no orders; nothing was sent")
+            raise HttpProblem(403, "ReadOnly", "this server is read-only and accepts no orders; nothing was sent")
         given = _token_of(headers)
         if given is None and self._open_reading and not (is_order or needs_token):
             return
-        if not self.holds_token(headers):
+        if not self.has_token(headers):
             what = "the token is missing" if given is None else "the token is wrong"
             headers_back = {"WWW-Authenticate": 'Bearer realm="aerokit"'}
-            raise Problem(401, "Unauthorized", f"{what}; nothing was sent", headers_back)
+            raise HttpProblem(401, "Unauthorized", f"{what}; nothing was sent", headers_back)
 
 
 def _token_of(headers: Headers) -> str | None:
     scheme, _, token = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return token.strip()
-    for each in headers.get("sec-websocket-protocol", "").split(","):
-        if each.strip().startswith(_TOKEN_PREFIX):
-            return each.strip()[len(_TOKEN_PREFIX) :]
+    for protocol in headers.get("sec-websocket-protocol", "").split(","):
+        if protocol.strip().startswith(_TOKEN_PREFIX):
+            return protocol.strip()[len(_TOKEN_PREFIX) :]
     return None
 
 
 def content_policy(tiles: str | None) -> str:
-    """The Content-Security-Policy of all answers; pictures of a tile server are let in by its origin."""
+    """Return the Content-Security-Policy of all responses; it allows images from the tile server."""
     pictures = "'self'"
     if tiles is not None:
         place = urlsplit(tiles)
         is_place = place.scheme in ("http", "https") and place.hostname and "@" not in place.netloc
-        if (
-            not is_place
-            or any(f"{{{each}}}" not in tiles for each in "xyz")
-            or set(tiles) & set(" \t\n\"';,<>\\")
-        ):
+        if not is_place or any(f"{{{axis}}}" not in tiles for axis in "xyz") or set(tiles) & set(" \t\n\"';,<>\\"):
             raise InvalidArgument(
-                f"tiles = {tiles!r} is no URL of tiles: https://tiles.example/{{z}}/{{x}}/{{y}}.png"
+                f"tiles = {tiles!r} is not a tile URL like https://tiles.example/{{z}}/{{x}}/{{y}}.png"
             )
         pictures += f" {place.scheme}://{place.netloc}"
     return (
@@ -99,11 +97,11 @@ def content_policy(tiles: str | None) -> str:
     )
 
 
-class Guard:
-    """ASGI middleware: refuses other hosts and origins, and adds the headers that every answer has.
+class SecurityMiddleware:
+    """ASGI middleware that rejects foreign hosts and origins, and adds security headers to every response.
 
-    A Host that is an IP address or ``localhost`` cannot be a name that somebody else points here (DNS rebinding);
-    other names have to be in ``hosts``. A request that a browser makes for another site says so by its Origin.
+    A Host that is an IP address or ``localhost`` cannot be a foreign name that resolves to this machine (DNS
+    rebinding); other names must be in ``hosts``. Browsers send the Origin of the page that makes a request.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], tiles: str | None) -> None:
@@ -119,7 +117,6 @@ class Guard:
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request, or hand it on."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -131,7 +128,7 @@ class Guard:
 
         try:
             self._check(Headers(scope=scope))
-        except Problem as problem:
+        except HttpProblem as problem:
             if scope["type"] == "websocket":
                 await receive()
                 await send({"type": "websocket.close", "code": 1008})
@@ -143,15 +140,12 @@ class Guard:
     def _check(self, headers: Headers) -> None:
         host = headers.get("host", "")
         if not self._is_own(host):
-            raise Problem(421, "WrongHost", "this server is not known by that name (--allow-host)")
+            raise HttpProblem(421, "WrongHost", f"Host {host[:100]!r} is not allowed; add it with --allow-host")
         origins = headers.getlist("origin")
         if any(urlsplit(origin).netloc.lower() != host.lower() for origin in origins):
-            raise Problem(403, "WrongOrigin", "pages of other sites may not ask here")
-        if (
-            headers.get("sec-fetch-site", "none") == "cross-site"
-            and headers.get("sec-fetch-mode") != "navigate"
-        ):
-            raise Problem(403, "WrongOrigin", "pages of other sites may not ask here")
+            raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
+        if headers.get("sec-fetch-site", "none") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
+            raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
 
     def _is_own(self, host: str) -> bool:
         try:
@@ -164,43 +158,37 @@ class Guard:
         return True
 
 
-MAX_STRANGERS = 64
-"""Connections that have not shown the token. One more ends the oldest one of the address that has most of them."""
-
-REQUEST_TIMEOUT_S = 10.0
-"""Seconds from the first byte of a request, or from the connection's beginning, to the end of its headers."""
-
 RawHeaders = list[tuple[bytes, bytes]]
 
 
-def http_protocol(holds_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
-    """Make the ``http`` class of a `uvicorn.Config`.
+def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
+    """Return the ``http`` class for `uvicorn.Config`, which limits anonymous connections.
 
-    Connections whose requests hold the token are never ended for others, so that there is always a place for the owner.
+    Connections whose requests contain the token are never closed for others, so that the owner always gets in.
     """
-    strangers: dict[_HttpConnection, None] = {}
+    anonymous: dict[_HttpConnection, None] = {}
 
     class HttpConnection(_HttpConnection):
-        _strangers = strangers
+        _anonymous = anonymous
 
-        def _holds_token(self) -> bool:
-            return holds_token(self.headers)
+        def _has_token(self) -> bool:
+            return has_token(self.headers)
 
     return HttpConnection
 
 
 class _HttpConnection(H11Protocol):
-    _strangers: dict[_HttpConnection, None]
+    _anonymous: dict[_HttpConnection, None]
     _timer: asyncio.TimerHandle | None = None
 
-    def _holds_token(self) -> bool:
+    def _has_token(self) -> bool:
         raise NotImplementedError
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self._strangers[self] = None
-        if len(self._strangers) > MAX_STRANGERS:
-            self._end(_oldest_of_the_most_frequent(self._strangers))
+        self._anonymous[self] = None
+        if len(self._anonymous) > MAX_ANONYMOUS_CONNECTIONS:
+            self._end(_oldest_of_the_most_frequent(self._anonymous))
         self._await_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -215,13 +203,13 @@ class _HttpConnection(H11Protocol):
     def handle_events(self) -> None:
         before = self.scope
         super().handle_events()
-        if self.scope is not before:  # the headers of a request are there
+        if self.scope is not before:  # the headers of a new request are complete
             self._stop_timer()
-            if self._holds_token():
-                self._strangers.pop(self, None)
+            if self._has_token():
+                self._anonymous.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        self._forget()  # the application counts its sockets
+        self._forget()  # the application limits WebSockets itself
         super().handle_websocket_upgrade(event)
 
     def _await_request(self) -> None:
@@ -234,7 +222,7 @@ class _HttpConnection(H11Protocol):
 
     def _forget(self) -> None:
         self._stop_timer()
-        self._strangers.pop(self, None)
+        self._anonymous.pop(self, None)
 
     @staticmethod
     def _end(connection: _HttpConnection) -> None:
@@ -244,8 +232,9 @@ class _HttpConnection(H11Protocol):
 
 def _oldest_of_the_most_frequent(connections: Iterable[_HttpConnection]) -> _HttpConnection:
     connections = list(connections)
-    counts = Counter(_host(each) for each in connections)
-    return max(connections, key=lambda each: counts[_host(each)])  # of equal ones the first
+    counts = Counter(_host(connection) for connection in connections)
+    # max returns the first of equals, the oldest.
+    return max(connections, key=lambda connection: counts[_host(connection)])
 
 
 def _host(connection: H11Protocol) -> object:

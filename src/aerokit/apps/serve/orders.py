@@ -1,4 +1,4 @@
-"""Orders to vehicles: a table of them, and ``Orders``, which runs each once, in a task of the server."""
+"""Orders to vehicles: the table of order types, and ``OrderRunner``, which runs each order once."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.plain import plain
-from aerokit.apps.serve.requests import Problem, problem_of
-from aerokit.connection.tasks import Background
+from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.serve.requests import HttpProblem, problem_of
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument
 from aerokit.events import LinkState
 from aerokit.position import Position
@@ -19,24 +19,25 @@ from aerokit.position import Position
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from aerokit.apps.serve.watch import Watch
+    from aerokit.apps.serve.served_vehicles import ServedVehicles
     from aerokit.vehicle.vehicle import Vehicle
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-MOST_RUNNING = 16
-"""Of one vehicle at a time; orders that bring it to rest are taken all the same."""
-MOST_KEPT = 500
-MOST_KEYS = 100_000
-"""Of orders whose result is not kept any more: they are not given again either."""
-LATE_S = 5.0
-"""An order whose giver saw the vehicle's state longer ago is not given."""
+MAX_RUNNING = 16
+"""Maximum number of running orders for each vehicle; orders that make it safe are always accepted."""
+MAX_RESULTS = 500
+"""Maximum number of orders whose results are stored."""
+MAX_USED_KEYS = 100_000
+"""Maximum number of older keys that are remembered, so that they are not used again."""
+STATE_MAX_AGE_S = 5.0
+"""An order is refused if the state that its client has seen is older."""
 _KEY = re.compile(r"[A-Za-z0-9._~-]{8,64}")
 
 
 @dataclass(frozen=True)
-class Argument:
-    """One field of an order's body: its JSON type, and what it means."""
+class OrderArgument:
+    """One field of an order's body: its JSON type and description."""
 
     type: str | tuple[str, ...]
     text: str
@@ -44,74 +45,75 @@ class Argument:
 
 
 @dataclass(frozen=True)
-class OrderKind:
-    """One order: what it takes, and how it is given. ``rests``: it is tried on a silent vehicle, too."""
+class OrderType:
+    """One type of order: its arguments, and the function that runs it.
+
+    ``is_safe``: it brings the vehicle to rest, and is therefore tried on a silent vehicle too.
+    """
 
     name: str
     summary: str
-    give: Callable[[Vehicle, dict[str, Any]], Awaitable[object]]
-    arguments: Mapping[str, Argument] = field(default_factory=dict)
-    rests: bool = False
+    run: Callable[[Vehicle, dict[str, Any]], Awaitable[object]]
+    arguments: Mapping[str, OrderArgument] = field(default_factory=dict)
+    is_safe: bool = False
 
-    def check(self, given: Mapping[str, Any]) -> None:
-        """Raise InvalidArgument unless these are its arguments; their values are checked by the library."""
-        for name in given:
+    def check(self, values: Mapping[str, Any]) -> None:
+        """Check the names of arguments; raise InvalidArgument. The library checks the values."""
+        for name in values:
             if name not in self.arguments:
                 known = ", ".join(self.arguments) or "none"
-                raise InvalidArgument(f"{self.name}: {name[:40]!r} is no argument; there are: {known}")
+                raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {known}")
         for name, argument in self.arguments.items():
-            if isinstance(given.get(name), bool):  # Python's True is 1, a flight mode
-                raise InvalidArgument(f"{self.name}: {name} = {given[name]} is no {argument.type}")
-            if argument.is_required and given.get(name) is None:
-                raise InvalidArgument(f"{self.name}: {name} is missing ({argument.text})")
+            if isinstance(values.get(name), bool):  # Python's True is 1, which is a valid flight mode number
+                raise InvalidArgument(f"{self.name}: {name} = {values[name]} is not of type {argument.type}")
+            if argument.is_required and values.get(name) is None:
+                raise InvalidArgument(f"{self.name}: argument {name} is missing ({argument.text})")
 
 
-async def _go_to(vehicle: Vehicle, given: dict[str, Any]) -> None:
-    place = {name: given.pop(name) for name in tuple(given) if name in _PLACE}
-    await vehicle.go_to(Position(**place), **given)
+async def _go_to(vehicle: Vehicle, values: dict[str, Any]) -> None:
+    position = {name: values.pop(name) for name in tuple(values) if name in _POSITION}
+    await vehicle.go_to(Position(**position), **values)
 
 
-async def _set_parameter(vehicle: Vehicle, given: dict[str, Any]) -> object:
-    return await vehicle.parameters.set(given["name"], given["value"])
+async def _set_parameter(vehicle: Vehicle, values: dict[str, Any]) -> object:
+    return await vehicle.parameters.set(values["name"], values["value"])
 
 
-_PLACE = {
-    "latitude_deg": Argument("number", "degrees, WGS 84", True),
-    "longitude_deg": Argument("number", "degrees, WGS 84", True),
-    "altitude_relative_m": Argument("number", "metres above home; the present altitude when none is given"),
-    "altitude_amsl_m": Argument("number", "metres above the sea, instead"),
+_POSITION = {
+    "latitude_deg": OrderArgument("number", "degrees, WGS 84", True),
+    "longitude_deg": OrderArgument("number", "degrees, WGS 84", True),
+    "altitude_relative_m": OrderArgument("number", "metres above home; without an altitude, the current one"),
+    "altitude_amsl_m": OrderArgument("number", "metres above sea level, as an alternative"),
 }
 _GO_TO = {
-    **_PLACE,
-    "speed_m_s": Argument("number", "metres per second"),
-    "heading_deg": Argument("number", "where the nose is to point, clockwise from north"),
+    **_POSITION,
+    "speed_m_s": OrderArgument("number", "metres per second"),
+    "heading_deg": OrderArgument("number", "heading of the nose, clockwise from north"),
 }
-_ALTITUDE = {"altitude_m": Argument("number", "metres above home, above 0, at most 10,000", True)}
-_MODE = {"mode": Argument(("string", "integer"), "the autopilot's own name of it, or its number", True)}
-_ITEM = {"item": Argument("integer", "from this item on, counted from 0 (0)")}
-_VALUE = {"value": Argument("number", "finite", True)}
+_ALTITUDE = {"altitude_m": OrderArgument("number", "metres above home, above 0, at most 10,000", True)}
+_MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or number of the mode", True)}
+_ITEM = {"item": OrderArgument("integer", "first item, counted from 0 (0)")}
+_VALUE = {"value": OrderArgument("number", "finite", True)}
 
 ORDERS = (
-    OrderKind("arm", "Arm the motors: propellers may start to turn", lambda v, a: v.arm()),
-    OrderKind("disarm", "Stop the motors, on the ground", lambda v, a: v.disarm(), rests=True),
-    OrderKind("take_off", "Take off and climb", lambda v, a: v.take_off(**a), _ALTITUDE),
-    OrderKind("go_to", "Go to a place", _go_to, _GO_TO),
-    OrderKind("hold", "Stop and stay", lambda v, a: v.hold(), rests=True),
-    OrderKind("land", "Land where it is", lambda v, a: v.land(), rests=True),
-    OrderKind(
-        "return_to_launch", "Return to the launch place", lambda v, a: v.return_to_launch(), rests=True
-    ),
-    OrderKind("mode", "Change the flight mode", lambda v, a: v.set_mode(a["mode"]), _MODE),
-    OrderKind("mission/start", "Fly the mission", lambda v, a: v.mission.start(**a), _ITEM),
-    OrderKind("mission/pause", "Pause the mission", lambda v, a: v.mission.pause(), rests=True),
-    OrderKind("mission/resume", "Go on with the mission", lambda v, a: v.mission.resume()),
+    OrderType("arm", "Arm the motors: propellers may start to turn", lambda v, a: v.arm()),
+    OrderType("disarm", "Stop the motors, on the ground", lambda v, a: v.disarm(), is_safe=True),
+    OrderType("take_off", "Take off and climb", lambda v, a: v.take_off(**a), _ALTITUDE),
+    OrderType("go_to", "Go to a position", _go_to, _GO_TO),
+    OrderType("hold", "Stop and hold position", lambda v, a: v.hold(), is_safe=True),
+    OrderType("land", "Land at the current position", lambda v, a: v.land(), is_safe=True),
+    OrderType("return_to_launch", "Return to the launch position", lambda v, a: v.return_to_launch(), is_safe=True),
+    OrderType("mode", "Change the flight mode", lambda v, a: v.set_mode(a["mode"]), _MODE),
+    OrderType("mission/start", "Fly the mission", lambda v, a: v.mission.start(**a), _ITEM),
+    OrderType("mission/pause", "Pause the mission", lambda v, a: v.mission.pause(), is_safe=True),
+    OrderType("mission/resume", "Resume the mission", lambda v, a: v.mission.resume()),
 )
-SET_PARAMETER = OrderKind("set_parameter", "Set a parameter", _set_parameter, _VALUE)
+SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)
 
 
 @dataclass(eq=False)
-class Given:
-    """One order that was given, and what has come of it."""
+class OrderRecord:
+    """One order and its result."""
 
     key: str
     system_id: int
@@ -123,123 +125,118 @@ class Given:
     problem: dict[str, Any] | None = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def record(self) -> dict[str, Any]:
-        """It as the API shows it."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields that the API shows."""
         names = ("key", "system_id", "order", "arguments", "given_unix_s", "state", "result", "problem")
         return {name: getattr(self, name) for name in names}
 
     def is_same(self, system_id: int, order: str, arguments: Mapping[str, Any]) -> bool:
-        """Whether this order is that one, given again."""
+        """Return True if a request repeats this order."""
         return (self.system_id, self.order, self.arguments) == (system_id, order, arguments)
 
 
-class Orders:
-    """Gives each order once. Its task is the server's: a client that goes away changes nothing about a flight."""
+class OrderRunner:
+    """Runs each order once, in a task of the server: a disconnecting client does not affect it."""
 
-    def __init__(self, watch: Watch) -> None:
-        self._watch = watch
-        self._kept: OrderedDict[str, Given] = OrderedDict()
-        self._spent: OrderedDict[str, None] = OrderedDict()
-        self._background = Background(_nothing)
+    def __init__(self, served: ServedVehicles) -> None:
+        self._served = served
+        self._records: OrderedDict[str, OrderRecord] = OrderedDict()
+        self._used_keys: OrderedDict[str, None] = OrderedDict()
+        self._background = BackgroundTasks(lambda error: None)
 
-    def give(
-        self, vehicle: Vehicle, kind: OrderKind, arguments: dict[str, Any], key: str, seen_at_s: float | None
-    ) -> Given:
-        """Give an order, or return what was given by this key before. The kind has checked its arguments.
+    def submit(
+        self, vehicle: Vehicle, kind: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
+    ) -> OrderRecord:
+        """Start an order, or return the one with this key. The arguments have been checked by ``kind.check``.
 
         Raises:
-            Problem: no key, or one that was used for another order; the giver saw an old state. Nothing was sent.
-            BusyError, HeartbeatTimeout, ConnectionClosed, LinkLost: as the texts say. Nothing was sent.
+            HttpProblem: the key is missing, or was used for another order; the client has seen an old state.
+            BusyError: too many orders are running.
+            HeartbeatTimeout: the vehicle is silent.
+            ConnectionClosed, LinkLost: the connection has ended.
         """
         if not _KEY.fullmatch(key):
-            raise Problem(
+            raise HttpProblem(
                 400,
                 "KeyMissing",
-                "an order needs a header Idempotency-Key of its own: 8 to 64 of A-Z a-z 0-9 . _ ~ -",
+                "an order needs a unique Idempotency-Key header: 8 to 64 characters of A-Z a-z 0-9 . _ ~ -",
             )
-        before = self._kept.get(key)
+        before = self._records.get(key)
         if before is not None and before.is_same(vehicle.system_id, kind.name, arguments):
             return before
-        if before is not None or key in self._spent:
-            raise Problem(409, "KeyUsed", "this Idempotency-Key was used before; nothing was sent")
+        if before is not None or key in self._used_keys:
+            raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
         self._check(vehicle, kind, seen_at_s)
-        given = Given(key, vehicle.system_id, kind.name, arguments, vehicle.connection.unix_time())
-        self._keep(given)
-        self._background.start(lambda: self._run(vehicle, kind, given), f"aerokit serve {kind.name}")
-        self._tell(given)
-        return given
+        record = OrderRecord(key, vehicle.system_id, kind.name, arguments, vehicle.connection.unix_time())
+        self._store(record)
+        self._background.start(lambda: self._run(vehicle, kind, record), f"aerokit serve {kind.name}")
+        self._publish(record)
+        return record
 
-    def all(self) -> list[Given]:
-        """Those whose results are kept, the oldest first."""
-        return list(self._kept.values())
+    def all(self) -> list[OrderRecord]:
+        """Return the stored orders, the oldest first."""
+        return list(self._records.values())
 
-    def get(self, key: str) -> Given:
-        """The order of this key.
-
-        Raises:
-            Problem: 404, there is none.
-        """
-        if key not in self._kept:
-            raise Problem(
-                404, "NoSuchOrder", "there is no order of this key, or its result is not kept any more"
-            )
-        return self._kept[key]
+    def get(self, key: str) -> OrderRecord:
+        """Return the order with this key; raise HttpProblem 404 if there is none."""
+        if key not in self._records:
+            raise HttpProblem(404, "NoSuchOrder", "no order has this key, or its result is no longer stored")
+        return self._records[key]
 
     async def aclose(self) -> None:
-        """Cancel those that are under way: the vehicle holds, as for any action of the library that is cancelled."""
+        """Cancel running orders; the vehicle holds, as after any cancelled action."""
         await self._background.aclose()
 
-    def _check(self, vehicle: Vehicle, kind: OrderKind, seen_at_s: float | None) -> None:
+    def _check(self, vehicle: Vehicle, kind: OrderType, seen_at_s: float | None) -> None:
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
-        if seen_at_s is not None and not 0 <= now - seen_at_s <= LATE_S:
-            raise Problem(
+        if seen_at_s is not None and not 0 <= now - seen_at_s <= STATE_MAX_AGE_S:
+            raise HttpProblem(
                 409,
                 "Late",
-                "the state that this order was given upon is too old; nothing was sent: look, and order again",
+                f"the client's state of the vehicle is older than {STATE_MAX_AGE_S:g} s; nothing was sent: check the"
+                " current state, then repeat the order",
             )
-        if kind.rests:
+        if kind.is_safe:
             return
         if vehicle.link_state.latest is not LinkState.CONNECTED:
             raise HeartbeatTimeout(
-                f"{kind.name}: vehicle {vehicle.system_id} is not heard"
+                f"{kind.name}: vehicle {vehicle.system_id} is silent"
                 f" (last heartbeat {vehicle.heartbeat_age:.1f} s ago); nothing was sent"
             )
-        running = [each for each in self._kept.values() if each.state == "running"]
-        if sum(each.system_id == vehicle.system_id for each in running) >= MOST_RUNNING:
+        running = [record for record in self._records.values() if record.state == "running"]
+        if sum(record.system_id == vehicle.system_id for record in running) >= MAX_RUNNING:
             raise BusyError(
-                f"{MOST_RUNNING} orders to vehicle {vehicle.system_id} are under way; nothing was sent"
+                f"{MAX_RUNNING} orders to vehicle {vehicle.system_id} are already running; nothing was sent"
             )
 
-    def _keep(self, given: Given) -> None:
-        self._kept[given.key] = given
-        for key in [key for key, each in self._kept.items() if each.state != "running"]:
-            if len(self._kept) <= MOST_KEPT:
+    def _store(self, record: OrderRecord) -> None:
+        self._records[record.key] = record
+        for key in [key for key, other in self._records.items() if other.state != "running"]:
+            if len(self._records) <= MAX_RESULTS:
                 break
-            del self._kept[key]
-            self._spent[key] = None
-        while len(self._spent) > MOST_KEYS:
-            self._spent.popitem(last=False)
+            del self._records[key]
+            self._used_keys[key] = None
+        while len(self._used_keys) > MAX_USED_KEYS:
+            self._used_keys.popitem(last=False)
 
-    async def _run(self, vehicle: Vehicle, kind: OrderKind, given: Given) -> None:
+    async def _run(self, vehicle: Vehicle, kind: OrderType, record: OrderRecord) -> None:
         try:
-            given.result = plain(await kind.give(vehicle, dict(given.arguments)))
-            given.state = "done"
+            record.result = to_jsonable(await kind.run(vehicle, dict(record.arguments)))
+            record.state = "done"
         except asyncio.CancelledError:
-            given.state = "failed"
-            given.problem = problem_of(Problem(503, "Ended", "the server ended; what can be held, holds"))
+            record.state = "failed"
+            record.problem = problem_of(
+                HttpProblem(503, "Ended", "the server ended; a vehicle that was moving is commanded to hold")
+            )
             raise
         except Exception as error:
-            given.state, given.problem = "failed", problem_of(error)
-            if given.problem["status"] == 500:
-                logger.exception("order %s to vehicle %d", given.order, given.system_id)
+            record.state, record.problem = "failed", problem_of(error)
+            if record.problem["status"] == 500:
+                logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
-            given.ended.set()
-            self._tell(given)
+            record.ended.set()
+            self._publish(record)
 
-    def _tell(self, given: Given) -> None:
-        self._watch.publish({"type": "order", **given.record()})
-
-
-def _nothing(error: Exception) -> None:
-    pass
+    def _publish(self, record: OrderRecord) -> None:
+        self._served.publish({"type": "order", **record.to_dict()})

@@ -1,4 +1,4 @@
-"""What requests bring: bodies of bounded size, and the values in them, checked."""
+"""Reading of requests, with bounded sizes and checked values, and responses as JSON."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     from starlette.requests import Request
 
+# Error class to HTTP status; the first match counts.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (InvalidArgument, 400),
     (HeartbeatTimeout, 503),
@@ -36,11 +37,12 @@ _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (ValueUnknownError, 409),
     (RemoteProtocolError, 502),
 )
-"""The first that fits counts, as for the exit codes of the command line."""
+MAX_BODY_SIZE = 16_384
+BODY_TIMEOUT_S = 10.0
 
 
-class Problem(Exception):
-    """A request that is answered by a problem object; ``kind`` is a word for programs."""
+class HttpProblem(Exception):
+    """A request failed. The response is a problem object; ``kind`` identifies the problem for programs."""
 
     def __init__(self, status: int, kind: str, text: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(text)
@@ -50,19 +52,21 @@ class Problem(Exception):
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """``error`` (the kind), ``status``, ``title``, ``detail``, and ``reasons`` where the vehicle gave some."""
-    if isinstance(error, Problem):
+    """Return the problem object (RFC 9457) of an error, with ``error``, ``detail``, and ``reasons`` given by the
+    vehicle.
+    """
+    if isinstance(error, HttpProblem):
         status, kind = error.status, error.kind
     else:
         kind = type(error).__name__
-        status = next((status for each, status in _STATUS if isinstance(error, each)), 500)
-    is_known = isinstance(error, (AerokitError, Problem))
+        status = next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
+    is_public = isinstance(error, (AerokitError, HttpProblem))
     found: dict[str, Any] = {
         "type": "about:blank",
         "title": kind,
         "status": status,
         "error": kind,
-        "detail": str(error) if is_known else "a mistake in the server; its log has more",
+        "detail": str(error) if is_public else "internal server error; see the server's log",
     }
     if reasons := getattr(error, "reasons", ()):
         found["reasons"] = list(reasons)
@@ -70,9 +74,8 @@ def problem_of(error: Exception) -> dict[str, Any]:
 
 
 def problem_response(error: Exception, **more: object) -> Response:
-    """The answer to a request that failed by this error."""
     found = {**problem_of(error), **more}
-    headers = error.headers if isinstance(error, Problem) else None
+    headers = error.headers if isinstance(error, HttpProblem) else None
     return json_response(found, found["status"], "application/problem+json", headers)
 
 
@@ -82,39 +85,35 @@ def json_response(
     media_type: str = "application/json",
     headers: dict[str, str] | None = None,
 ) -> Response:
-    """An answer that nobody keeps: what it says is true now."""
+    """Return a response with a JSON body that must not be cached."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False)
     return Response(text, status, {"Cache-Control": "no-store", **(headers or {})}, media_type)
 
 
-LARGEST_BODY = 16_384
-
-BODY_TIMEOUT_S = 10.0
-
-
-async def body_of(request: Request) -> dict[str, Any]:
-    """The JSON object in the body; an empty one when there is no body.
+async def read_body(request: Request) -> dict[str, Any]:
+    """Read the JSON object in the body; an empty body is an empty object.
 
     Raises:
-        Problem: 400 no JSON object, 408 it does not come, 413 it is too large, 415 it says that it is something else.
+        HttpProblem: 400 not a JSON object, 408 timed out, 413 too large, 415 not declared as JSON.
     """
     try:
         data = await asyncio.wait_for(_read(request), BODY_TIMEOUT_S)
     except asyncio.TimeoutError:
-        raise Problem(408, "BodyTimeout", "the body did not come; nothing was sent") from None
+        raise HttpProblem(
+            408, "BodyTimeout", f"the body was not received within {BODY_TIMEOUT_S:g} s; nothing was sent"
+        ) from None
     if not data:
         return {}
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        raise Problem(415, "NotJson", "a body has Content-Type: application/json; nothing was sent")
+        raise HttpProblem(415, "NotJson", "the body must have Content-Type: application/json; nothing was sent")
     try:
         found = json.loads(data, parse_constant=_refuse, object_pairs_hook=_object)
-        json.dumps(
-            found, ensure_ascii=False, allow_nan=False
-        ).encode()  # 1e999 and half a character are told to nobody
+        # Rejects infinity (1e999) and lone surrogates, which could not be sent to other clients.
+        json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
     except (ValueError, RecursionError) as error:
-        raise Problem(400, "NotJson", f"the body is no JSON: {error}; nothing was sent") from None
+        raise HttpProblem(400, "NotJson", f"the body is not valid JSON: {error}; nothing was sent") from None
     if not isinstance(found, dict):
-        raise Problem(400, "NotJson", "the body is no JSON object; nothing was sent")
+        raise HttpProblem(400, "NotJson", "the body is not a JSON object; nothing was sent")
     return found
 
 
@@ -122,32 +121,31 @@ async def _read(request: Request) -> bytes:
     data = bytearray()
     async for part in request.stream():
         data += part
-        if len(data) > LARGEST_BODY:
-            raise Problem(413, "TooLarge", f"a body has at most {LARGEST_BODY} bytes; nothing was sent")
+        if len(data) > MAX_BODY_SIZE:
+            raise HttpProblem(413, "TooLarge", f"the body is larger than {MAX_BODY_SIZE} bytes; nothing was sent")
     return bytes(data)
 
 
 def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a JSON number")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError("a name stands in an object twice")
+        raise ValueError("an object has a duplicate name")
     return found
 
 
-def is_asked(request: Request, name: str, *, default: bool) -> bool:
-    """A query parameter that is true or false."""
+def query_flag(request: Request, name: str, *, default: bool) -> bool:
     text = request.query_params.get(name, "true" if default else "false")
     if text not in ("true", "false"):
-        raise Problem(400, "WrongQuery", f"{name} is true or false")
+        raise HttpProblem(400, "WrongQuery", f"{name} must be true or false")
     return text == "true"
 
 
 def seen_at(request: Request) -> float | None:
-    """The ``at_s`` of the state that the giver of an order had before him, if he says so."""
+    """Return the header Aerokit-Seen-At: the ``at_s`` of the state that the client has seen; None without it."""
     text = request.headers.get("aerokit-seen-at")
     if text is None:
         return None
@@ -156,13 +154,13 @@ def seen_at(request: Request) -> float | None:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise Problem(400, "WrongHeader", "Aerokit-Seen-At is the at_s of a state message; nothing was sent")
+        raise HttpProblem(400, "WrongHeader", "Aerokit-Seen-At must be the at_s of a state message; nothing was sent")
     return value
 
 
 def system_id_of(request: Request) -> int:
-    """Which vehicle is meant."""
+    """Return the system id in the path; raise HttpProblem 404 if it is invalid."""
     text = request.path_params["system_id"]
     if not (text.isascii() and text.isdigit() and len(text) <= 3 and 1 <= int(text) <= 255):
-        raise Problem(404, "NotHeard", "a vehicle's id is a number from 1 to 255; nothing was sent")
+        raise HttpProblem(404, "NotHeard", "a system id is a number from 1 to 255; nothing was sent")
     return int(text)

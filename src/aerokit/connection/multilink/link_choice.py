@@ -1,9 +1,4 @@
-"""``LinkChoice``: over which of several links a system is spoken to, and whom it is believed to be behind the others.
-
-Sans-IO: what is heard, measured and asked comes in with its time.
-
-Sans-IO: what is heard, measured and asked comes in with its time.
-"""
+"""``LinkChoice``: which of several links is used for a system, and which of them lead to the same vehicle. Sans-IO."""
 
 from __future__ import annotations
 
@@ -13,24 +8,24 @@ from typing import TYPE_CHECKING
 from aerokit.connection.multilink.vehicle_clock import VehicleClock
 
 if TYPE_CHECKING:
-    from aerokit.connection.components import HardwareId
+    from aerokit.connection.multilink.vehicle_clock import HardwareId
 
-SILENT_S = 1.0
-"""Of a link over which questions are answered twice a second."""
+# Silence after which a link is not alive. Probes are answered twice a second.
+PROBED_TIMEOUT_S = 1.0
 
-QUIET_S = 2.5
-"""Of a link over which little may come: two heartbeats are missing."""
+# The same for a link without answers, or a costly one: two missing heartbeats.
+UNPROBED_TIMEOUT_S = 2.5
 
-PROOFS = 3
-"""So many times in a row must the clock be the same before a second link is believed to lead to the same vehicle."""
+# Consecutive matching clock samples that prove that a second link leads to the same vehicle.
+MIN_CLOCK_MATCHES = 3
 
-UNNAMED_AFTER = 3
-"""Who has told the time so often since the question for the hardware id, and not the id, does not tell it."""
+# A vehicle that answers this many TIMESYNC probes, but not the request for its hardware id, does not support it.
+MAX_TIMES_WITHOUT_HARDWARE = 3
 
-MOST_QUESTIONS = 20
+MAX_HARDWARE_REQUESTS = 20
 
-PROVEN_BY_COPIES = 3
-"""So many frames must have come over it and over the link in use."""
+# Frames received both over a link and over the link in use that prove that they lead to the same vehicle.
+MIN_COPIES = 3
 
 
 class Candidate:
@@ -39,240 +34,228 @@ class Candidate:
     def __init__(self, link: int, *, is_costly: bool, now: float) -> None:
         self.link = link
         self.is_costly = is_costly
-        self.heard_at: float = now
+        self.received_at: float = now
         self.answered_at: float = -math.inf
         self.shared_at: float = -math.inf
-        self.is_there: bool = True
+        self.is_available: bool = True
         self.is_stalled: bool = False
         self.loss: float | None = None
-        """Share of frames lost, 0 to 1, over the last seconds; None: not known yet."""
+        """Share of frames lost over the last seconds, 0 to 1; None: unknown."""
         self.round_trip_s: float | None = None
-        """None: nothing was answered yet."""
+        """None before the first answer."""
         self.is_proven: bool = False
+        """True if the link is known to lead to the vehicle."""
         self.was_proven: bool = False
-        """Whether it was proven before the vehicle rebooted or its clock was doubted."""
+        """True if it was proven before the vehicle rebooted, or before its clock was doubted."""
         self.is_doubted: bool = False
-        """Whether somebody else speaks in this system's name there."""
+        """True if another vehicle with the same system id seems to be behind the link."""
         self.hardware: HardwareId | None = None
-        """What was told over it; None: nothing yet."""
+        """Hardware id received over the link; None before that."""
         self.is_other_hardware: bool = False
-        """Whether that is another one's than the vehicle's: neither its clock nor copies outweigh it."""
-        self._asked_hardware = self._times_since = 0
-        self._agreed = self._disagreed = self._copies = 0
+        """True if that is another vehicle's; neither clock nor copies can then prove the link."""
+        self._hardware_requests = self._times_since_request = 0
+        self._clock_matches = self._clock_mismatches = self._copies = 0
         self._counted = (0, 0)
 
-    def note_counts(self, received: int, lost: int, now: float) -> None:
-        """So many frames came over it in all, and so many did not."""
+    def record_counts(self, received: int, lost: int, now: float) -> None:
         before, self._counted = self._counted, (received, lost)
         if received > before[0]:
-            self.heard_at = now
-        came, missing = received - before[0], max(0, lost - before[1])
-        if came > 0 or missing:
-            share = missing / (max(came, 0) + missing)
-            weight = 1 - 0.85 ** (max(came, 0) + missing)  # the last dozen of frames counts most
+            self.received_at = now
+        arrived, missing = received - before[0], max(0, lost - before[1])
+        if arrived > 0 or missing:
+            share = missing / (max(arrived, 0) + missing)
+            weight = 1 - 0.85 ** (max(arrived, 0) + missing)  # about the last dozen frames dominate
             self.loss = share if self.loss is None else self.loss + weight * (share - self.loss)
 
-    def note_round_trip(self, seconds: float, now: float) -> None:
-        """A question was answered over it."""
-        self.answered_at = self.heard_at = now
+    def record_round_trip(self, seconds: float, now: float) -> None:
+        self.answered_at = self.received_at = now
         before = self.round_trip_s
         self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
 
-    def note_clock(self, is_the_same: bool, *, may_prove: bool) -> None:
-        """The time that is told over it is the vehicle's, or another one's."""
-        if is_the_same:
-            self._agreed, self._disagreed = self._agreed + 1, 0
+    def record_clock(self, matches: bool, *, may_prove: bool) -> None:
+        if matches:
+            self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
         else:
-            self._agreed, self._disagreed = 0, self._disagreed + 1
-        if self._agreed >= PROOFS and may_prove and not self.is_other_hardware:
+            self._clock_matches, self._clock_mismatches = 0, self._clock_mismatches + 1
+        if self._clock_matches >= MIN_CLOCK_MATCHES and may_prove and not self.is_other_hardware:
             self.is_proven, self.is_doubted = True, False
-        elif self._disagreed >= PROOFS:
+        elif self._clock_mismatches >= MIN_CLOCK_MATCHES:
             self._doubt()
 
-    def note_copy(self, now: float) -> None:
-        """The same frame came over it and over the link in use."""
+    def record_copy(self, now: float) -> None:
         self.shared_at = now
         self._copies += 1
-        if self._copies >= PROVEN_BY_COPIES and not self.is_other_hardware:
+        if self._copies >= MIN_COPIES and not self.is_other_hardware:
             self.is_proven, self.is_doubted = True, False
 
-    def forget_proof(self) -> None:
-        """The vehicle has rebooted: what was shown of its clock does not count any more."""
+    def reset_proof(self) -> None:
+        """Forget all evidence after the vehicle rebooted."""
         self.was_proven = self.was_proven or self.is_proven
         self.is_proven = self.is_other_hardware = False
         self.hardware = None
-        self._asked_hardware = self._times_since = 0
-        self._agreed = self._disagreed = self._copies = 0
+        self._hardware_requests = self._times_since_request = 0
+        self._clock_matches = self._clock_mismatches = self._copies = 0
 
-    def ask_hardware(self) -> bool:
-        """Whether to ask for its hardware id now, as well as for its time."""
+    def request_hardware(self) -> bool:
+        """Return True if the hardware id is to be requested now, and count the request."""
         if (
             self.hardware is not None
             or self.answered_at == -math.inf
-            or self._asked_hardware >= MOST_QUESTIONS
+            or self._hardware_requests >= MAX_HARDWARE_REQUESTS
         ):
             return False
-        self._asked_hardware += 1
+        self._hardware_requests += 1
         return True
 
     @property
-    def may_tell_hardware(self) -> bool:
-        """Whether it was asked for its hardware id, and the answer may still come."""
-        return self._asked_hardware > 0 and self._times_since < UNNAMED_AFTER
+    def is_hardware_pending(self) -> bool:
+        return self._hardware_requests > 0 and self._times_since_request < MAX_TIMES_WITHOUT_HARDWARE
 
-    def note_hardware(self, *, is_another: bool) -> None:
-        """It and the vehicle have told their hardware ids."""
-        if is_another:
+    def record_hardware(self, *, is_other: bool) -> None:
+        """Record whether the hardware id received over the link contradicts the vehicle's."""
+        if is_other:
             self._doubt()
             self.was_proven = False
         elif self.is_other_hardware:
             self.is_doubted = False
-        self.is_other_hardware = is_another
+        self.is_other_hardware = is_other
 
-    def note_time(self) -> None:
-        """It has told its time, so that it could have told its hardware id."""
-        if self._asked_hardware:
-            self._times_since += 1
+    def record_time(self) -> None:
+        """Count a TIMESYNC answer after a request for the hardware id."""
+        if self._hardware_requests:
+            self._times_since_request += 1
 
-    def forgive_clock(self) -> None:
-        """The vehicle's clock has stood still: that this link told another time meanwhile is no evidence."""
-        self._disagreed = 0
+    def reset_mismatches(self) -> None:
+        self._clock_mismatches = 0
 
     def _doubt(self) -> None:
         self.was_proven = self.was_proven or self.is_proven
         self.is_proven, self.is_doubted = False, True
 
     def is_alive(self, now: float) -> bool:
-        """Whether something comes over it, and what is written leaves."""
-        answers = now - self.answered_at <= 2 * QUIET_S
-        silent_after_s = SILENT_S if answers and not self.is_costly else QUIET_S
-        return self.is_there and not self.is_stalled and now - self.heard_at <= silent_after_s
+        """Return True if frames arrive over the link, and written data leaves."""
+        is_answering = now - self.answered_at <= 2 * UNPROBED_TIMEOUT_S
+        timeout_s = PROBED_TIMEOUT_S if is_answering and not self.is_costly else UNPROBED_TIMEOUT_S
+        return self.is_available and not self.is_stalled and now - self.received_at <= timeout_s
 
-    def why_not(self) -> str:
-        """Why it is not used any more."""
+    def failure(self) -> str:
+        """Return the reason why the link is no longer used, for events."""
         if self.is_other_hardware:
             return "another vehicle"
-        return "lost" if not self.is_there else "stalled" if self.is_stalled else "silent"
+        return "lost" if not self.is_available else "stalled" if self.is_stalled else "silent"
 
     @property
     def cost_s(self) -> float:
-        """How long an order and its answer take, with what is lost on the way."""
+        """Expected time for a command and its answer, retries after losses included."""
         loss = min(0.9, self.loss or 0.0)
         return ((0.1 if self.round_trip_s is None else self.round_trip_s) + 0.05) / (1 - loss) ** 2
 
 
-SHARED_S = 5.0
-"""Links have carried the same frames within this time: what comes over either is of one stream."""
+# Two links that carried the same frame within this time carry one stream.
+SHARED_MAX_AGE_S = 5.0
 
-ALIKE = 0.5
-"""Another link must be better than by this factor before a good one is left for it."""
+# A working link is replaced only if the cost of another one stays below this share of its cost for MIN_BETTER_S.
+MAX_COST_RATIO = 0.5
+MIN_BETTER_S = 3.0
 
 JITTER_S = 0.05
 
-STEADY_S = 3.0
-"""And for so long."""
-
-PATIENCE_S = 10.0
-"""So long at most it is waited for a moment in which no order is under way: set-points may come without end."""
+# Maximum wait for a moment without a command in transit: set-points may be sent continuously.
+MAX_SWITCH_DELAY_S = 10.0
 
 
 class LinkChoice:
     """The links to one system, and the one in use.
 
-    ``needs_proof`` is of systems with an autopilot: what comes over a second link is believed, and orders go there,
-    only when it has shown to be the same vehicle, by its clock or by carrying the same frames. Who tells another
-    hardware id than the vehicle is not the same, whatever its clock.
+    Systems with an autopilot need proof (``needs_proof``): frames of a second link are accepted, and commands sent over
+    it, only after it is proven to lead to the same vehicle, by its clock or by carrying the same frames. A different
+    hardware id disproves it, whatever its clock.
     """
 
-    needs_proof: bool
-
-    clock: VehicleClock
-
     def __init__(self, *, needs_proof: bool) -> None:
-        self.needs_proof = needs_proof
+        self.needs_proof: bool = needs_proof
         self.candidates: dict[int, Candidate] = {}
-        self.clock = VehicleClock()
+        self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
-        """The vehicle's, as it was told over the link that was in use then."""
+        """The vehicle's hardware id, as received over the link that was in use then."""
         self._hardware_link = -1
         self.used: Candidate | None = None
         self.former: Candidate | None = None
-        """The one before, until its answers have come."""
+        """The link used before; it may still deliver answers."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
-        """What comes over the link in use before this time was sent before the last that came over the former one."""
+        """Telemetry received before this time is older than the last that arrived over the former link."""
         self._better: Candidate | None = None
         self._better_since = 0.0
-        self._ordered_at = -math.inf
+        self._command_at = -math.inf
 
-    def heard(self, link: int, now: float, *, is_costly: bool) -> Candidate:
-        """A heartbeat came over a link."""
+    def record_heartbeat(self, link: int, now: float, *, is_costly: bool) -> Candidate:
         candidate = self.candidates.get(link)
         if candidate is None:
             candidate = self.candidates[link] = Candidate(link, is_costly=is_costly, now=now)
-        candidate.heard_at = now
+        candidate.received_at = now
         return candidate
 
-    def begin_with(self, candidate: Candidate) -> None:
-        """The first autopilot of this system was heard there, which is who has to be the same behind other links."""
+    def start_with(self, candidate: Candidate) -> None:
+        """Make this link, which received the system's first autopilot, the reference for all others."""
         self.needs_proof = True
         if candidate is not self.used:
-            self.used = None  # a camera's, for example
+            self.used = None  # it leads to another component, e.g. a camera
             self.candidates = {candidate.link: candidate}
 
-    def note_answer(self, link: int, at: float, told_s: float, round_trip_s: float, now: float) -> None:
-        """The system has told its time over a link; ``at`` is when, by our clock."""
+    def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
+        """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is the time of that by our clock."""
         candidate = self.candidates[link]
-        is_stale = self.used is not None and self.used.answered_at < candidate.answered_at
-        candidate.note_round_trip(round_trip_s, now)
+        is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
+        candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
-            if not self.clock.note(at, told_s, round_trip_s):
-                self._hardware_link = (
-                    link  # another one may have been switched on in its place, and tells it there
-                )
+            if not self.clock.add(at, vehicle_s, round_trip_s):
+                # Another vehicle may have been switched on in its place; its hardware id is then accepted.
+                self._hardware_link = link
                 for other in self.candidates.values():
-                    other.forget_proof()
+                    other.reset_proof()
             elif not self.clock.is_steady:
                 for other in self.candidates.values():
-                    other.forgive_clock()
+                    other.reset_mismatches()
         else:
-            candidate.note_time()
-            agrees = self.clock.agrees(at, told_s, round_trip_s)
-            if not agrees and is_stale:
-                # The link in use may be dead, and the vehicle may have stood still or rebooted since.
-                agrees = True if self._recognises(candidate, now) else None
-            if agrees is not None:
-                candidate.note_clock(agrees, may_prove=not self._waits_for_hardware(candidate))
+            candidate.record_time()
+            matches = self.clock.matches(at, vehicle_s, round_trip_s)
+            if not matches and is_used_silent:
+                # The link in use may be dead, and the vehicle may have paused or rebooted since.
+                matches = True if self._is_same_by_hardware(candidate, now) else None
+            if matches is not None:
+                candidate.record_clock(matches, may_prove=not self._awaits_hardware(candidate))
 
-    def note_hardware(self, link: int, told: HardwareId) -> None:
-        """The system has told its hardware id over a link; over the one in use it is the vehicle's.
+    def record_hardware(self, link: int, hardware: HardwareId) -> None:
+        """Record a hardware id received over a link.
 
-        Unless another link has told the vehicle's before: then the one in use leads to somebody else.
+        Over the link in use it is the vehicle's, unless the vehicle's was received over another link before: then the
+        link in use leads to another vehicle.
         """
         candidate = self.candidates[link]
-        if told.is_told or candidate.hardware is None:
-            candidate.hardware = told
+        if hardware.has_value or candidate.hardware is None:
+            candidate.hardware = hardware
         if candidate is self.used:
             self._adopt_hardware(candidate)
-        for each in self.candidates.values():
-            if self.hardware is not None and each.hardware is not None:
-                each.note_hardware(is_another=self.hardware.contradicts(each.hardware))
+        for other in self.candidates.values():
+            if self.hardware is not None and other.hardware is not None:
+                other.record_hardware(is_other=self.hardware.contradicts(other.hardware))
 
     def may_be_used(self, candidate: Candidate) -> bool:
-        """Whether what is behind it is the same system."""
+        """Return True if the link leads to the same system."""
         if candidate.is_other_hardware:
             return False
         return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof
 
     def is_shared(self, candidate: Candidate, now: float) -> bool:
-        """Whether it carries the frames that the link in use carries."""
-        return now - candidate.shared_at <= SHARED_S
+        """Return True if the link carries the same frames as the link in use."""
+        return now - candidate.shared_at <= SHARED_MAX_AGE_S
 
     def choose(self, now: float) -> str | None:
-        """Look whether another link is to be used from now on; why, if so."""
+        """Select the link to use. Return the reason if it changes."""
         alive = sorted(
             (each for each in self.candidates.values() if self.may_be_used(each) and each.is_alive(now)),
-            key=lambda each: (each.is_costly, each.cost_s),
+            key=lambda candidate: (candidate.is_costly, candidate.cost_s),
         )
         if not alive:
             return None
@@ -280,62 +263,60 @@ class LinkChoice:
         if used is None:
             return self._change(best, "first heard", now)
         if used not in alive:
-            return self._change(best, used.why_not(), now)
-        is_better = best.is_costly < used.is_costly or best.cost_s < ALIKE * used.cost_s
+            return self._change(best, used.failure(), now)
+        is_better = best.is_costly < used.is_costly or best.cost_s < MAX_COST_RATIO * used.cost_s
         if best is used or not is_better:
             self._better = None
         elif best is not self._better:
             self._better, self._better_since = best, now
-        elif now - self._better_since >= STEADY_S and not self._must_wait(used, now):
+        elif now - self._better_since >= MIN_BETTER_S and not self._must_wait(used, now):
             return self._change(best, "cheaper" if best.is_costly < used.is_costly else "better", now)
         return None
 
-    def ordered(self, now: float) -> None:
-        """An order is sent over the link in use now."""
-        self._ordered_at = now
+    def record_command(self, now: float) -> None:
+        self._command_at = now
 
-    def asks_hardware(self, candidate: Candidate, *, is_wanted: bool) -> bool:
-        """Whether to ask over this link for the hardware id, together with the time.
+    def should_request_hardware(self, candidate: Candidate, *, is_attached: bool) -> bool:
+        """Return True if the hardware id is to be requested over this link, and count the request.
 
-        Over the one in use a vehicle object asks by itself (``is_wanted``).
+        A vehicle object (``is_attached``) itself requests it over the link in use.
         """
         if candidate is not self.used:
-            return not candidate.is_proven and candidate.ask_hardware()
-        return len(self.candidates) > 1 and not is_wanted and candidate.ask_hardware()
+            return not candidate.is_proven and candidate.request_hardware()
+        return len(self.candidates) > 1 and not is_attached and candidate.request_hardware()
 
-    def _recognises(self, candidate: Candidate, now: float) -> bool:
-        """Whether its hardware id alone proves it: it was proven before the reboot, and is the only one alive."""
+    def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
+        """Return True if the hardware id is proof enough: proven before the reboot, and the only link alive."""
         is_same = (
-            self.hardware is not None
-            and candidate.hardware is not None
-            and self.hardware.confirms(candidate.hardware)
+            self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
         alive = [each for each in self.candidates.values() if each.is_alive(now)]
         return candidate.was_proven and is_same and alive == [candidate]
 
-    def _waits_for_hardware(self, candidate: Candidate) -> bool:
-        is_known = self.hardware is not None and candidate.hardware is not None
-        return candidate.may_tell_hardware and not is_known
+    def _awaits_hardware(self, candidate: Candidate) -> bool:
+        has_both = self.hardware is not None and candidate.hardware is not None
+        return candidate.is_hardware_pending and not has_both
 
     def _adopt_hardware(self, used: Candidate) -> None:
-        told = used.hardware
-        if told is None or not told.is_told:
+        hardware = used.hardware
+        if hardware is None or not hardware.has_value:
             return
-        if self.hardware is None or self._hardware_link == used.link or not self.hardware.contradicts(told):
-            self.hardware, self._hardware_link = told, used.link
+        is_from_same_link = self._hardware_link == used.link
+        if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
+            self.hardware, self._hardware_link = hardware, used.link
 
     def _must_wait(self, used: Candidate, now: float) -> bool:
-        """An order may be under way over the link in use: it would arrive after what is ordered over the other one."""
-        on_the_way_s = (used.round_trip_s or 0.0) + JITTER_S
-        waited_s = now - self._better_since - STEADY_S
-        return now - self._ordered_at <= on_the_way_s and waited_s <= PATIENCE_S
+        """Return True while a command in transit over the link in use could arrive after one over the other link."""
+        transit_s = (used.round_trip_s or 0.0) + JITTER_S
+        waited_s = now - self._better_since - MIN_BETTER_S
+        return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
 
     def _change(self, to: Candidate, reason: str, now: float) -> str:
         former = self.used
         if former is not None:
             longer_s = ((to.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
-            self.fresh_after = former.heard_at + longer_s + JITTER_S
-            # The one behind the other link is the same as was behind this one.
+            self.fresh_after = former.received_at + longer_s + JITTER_S
+            # Both links lead to the same vehicle, otherwise the new one would not be used.
             former.is_proven = not former.is_other_hardware
         self.former, self.used, self.changed_at, self._better = former, to, now, None
         self._adopt_hardware(to)

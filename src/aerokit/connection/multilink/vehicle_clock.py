@@ -1,83 +1,81 @@
-"""``VehicleClock``: a system's time since boot as it is told over each link, which shows that it is one system.
+"""``VehicleClock`` and ``HardwareId``: evidence that two links lead to the same vehicle.
 
-The time in a TIMESYNC answer runs since boot on ArduPilot and PX4: two vehicles that were given the same system id do
-not tell the same time, to within the milliseconds in which an answer comes.
+The time in a TIMESYNC answer counts from boot on ArduPilot and PX4. Two vehicles with the same system id therefore
+differ by more than the round-trip time.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
 
-SAMPLES = 20
+if TYPE_CHECKING:
+    from aerokit.mavlink.messages import AutopilotVersion
+
+MAX_SAMPLES = 20
 TOLERANCE_S = 0.1
-DRIFT = 0.02
-"""How wrong the speed may be: a simulation is not always as fast as it says."""
-MOST_DRIFT_S = 0.5
-"""And what comes of it at most: else anybody's clock would be right after a silence that was long enough."""
-REAL = 0.05
-"""So near to 1 the speed is 1: a real vehicle's. Over a long silence an error of measuring would become seconds."""
-SPAN_S = 1.0
-FASTEST = 200.0
-"""No simulation is faster than this."""
-MAX_PAUSE_S = 10.0
-"""A simulation that stood still for longer is taken for a vehicle that has rebooted."""
-SPEED_MAX_AGE_S = 5.0
-"""So long after a pause or a reboot the clock is taken to run as fast as before, until it was measured anew."""
+MAX_SPEED_ERROR = 0.02  # simulations do not keep their nominal speed exactly
+MAX_DRIFT_S = 0.5  # otherwise any clock would match after a long enough silence
+REAL_TIME_TOLERANCE = 0.05  # a speed within this of 1 is 1; a measurement error would add up over a long silence
+MIN_SPAN_S = 1.0
+MAX_SPEED = 200.0  # of a simulation
+MAX_PAUSE_S = 10.0  # a simulation that was paused for longer counts as rebooted
+SPEED_MAX_AGE_S = 5.0  # validity of the previous speed after a pause or reboot
 
 
 class VehicleClock:
-    """Times are ours in seconds; ``told_s`` is the vehicle's own."""
+    """Clock of one vehicle. ``at`` is our time, ``vehicle_s`` the vehicle's, in seconds."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[float, float]] = deque(maxlen=SAMPLES)
+        self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
-        """Whether what was told last is what was expected."""
-        self._former_speed: tuple[float, float] | None = None  # and when it was measured
+        """True if the last sample was as expected."""
+        self._former_speed: tuple[float, float] | None = None  # speed, time of measurement
 
-    def note(self, at: float, told_s: float, round_trip_s: float) -> bool:
-        """Told over the link in use; False when it does not go on: the vehicle has rebooted.
+    def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
+        """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
 
-        A clock that has stood still for a moment goes on, but later than expected.
+        A clock that was paused for a moment continues, but later than expected.
         """
-        goes_on = not self._samples or self._goes_on(at, told_s, round_trip_s)
-        self.is_steady = goes_on and self._fits(at, told_s, round_trip_s) is not False
+        continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
+        self.is_steady = continues and self._fits(at, vehicle_s, round_trip_s) is not False
         if not self.is_steady:
             if (speed := self._measured_speed) is not None:
                 self._former_speed = speed, at
             self._samples.clear()
-        self._samples.append((at, told_s))
-        return goes_on
+        self._samples.append((at, vehicle_s))
+        return continues
 
-    def agrees(self, at: float, told_s: float, round_trip_s: float) -> bool | None:
-        """Whether it is the time that this vehicle should have by now; ``at`` is the middle of the round trip.
+    def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
+        """Return True if a sample from another link is this clock's time; ``at`` is the middle of the round trip.
 
-        None as long as its speed is not known: that of a simulation may be any. The speed from before a pause or a
-        reboot confirms, and refutes nothing.
+        None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause or
+        reboot can confirm a sample, but not contradict it.
         """
-        fits = self._fits(at, told_s, round_trip_s)
+        fits = self._fits(at, vehicle_s, round_trip_s)
         return None if not fits and self._measured_speed is None else fits
 
-    def _fits(self, at: float, told_s: float, round_trip_s: float) -> bool | None:
+    def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
         speed = self._speed
         if speed is None:
             return None
         last_at, last = self._samples[-1]
         tolerance = self._tolerance_s(at, round_trip_s, speed)
-        return abs(last + speed * (at - last_at) - told_s) <= tolerance
+        return abs(last + speed * (at - last_at) - vehicle_s) <= tolerance
 
-    def _goes_on(self, at: float, told_s: float, round_trip_s: float) -> bool:
+    def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         last_at, last = self._samples[-1]
         speed = self._measured_speed
         if speed is None:
-            most = FASTEST * (at - last_at + TOLERANCE_S + round_trip_s)
-            return -TOLERANCE_S - round_trip_s <= told_s - last <= most
+            longest = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
+            return -TOLERANCE_S - round_trip_s <= vehicle_s - last <= longest
         tolerance = self._tolerance_s(at, round_trip_s, speed)
         expected = speed * (at - last_at)
-        least = max(0.0, expected - MAX_PAUSE_S * max(1.0, speed))
-        return least - tolerance <= told_s - last <= expected + tolerance
+        shortest = max(0.0, expected - MAX_PAUSE_S * max(1.0, speed))
+        return shortest - tolerance <= vehicle_s - last <= expected + tolerance
 
     def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
-        drift_s = min(DRIFT * abs(at - self._samples[-1][0]), MOST_DRIFT_S)
+        drift_s = min(MAX_SPEED_ERROR * abs(at - self._samples[-1][0]), MAX_DRIFT_S)
         return (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
 
     @property
@@ -92,7 +90,41 @@ class VehicleClock:
         if not self._samples:
             return None
         (first_at, first), (last_at, last) = self._samples[0], self._samples[-1]
-        if last_at - first_at < SPAN_S:
+        if last_at - first_at < MIN_SPAN_S:
             return None
         speed = (last - first) / (last_at - first_at)
-        return 1.0 if abs(speed - 1) <= REAL else speed
+        return 1.0 if abs(speed - 1) <= REAL_TIME_TOLERANCE else speed
+
+
+class HardwareId(NamedTuple):
+    """Hardware id from AUTOPILOT_VERSION; all zeros mean none.
+
+    ArduPilot sends the processor's serial number as ``uid2`` (on Linux and in simulation the machine id), and no
+    ``uid``. PX4 sends both; in simulation they are a constant and the system id. Equal or missing ids prove nothing.
+    https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
+    """
+
+    uid2: bytes
+    """18 bytes; not present in MAVLink 1."""
+    uid: int
+
+    @classmethod
+    def from_message(cls, message: AutopilotVersion) -> HardwareId:
+        """Return the hardware id in an AUTOPILOT_VERSION."""
+        return cls(bytes(message.uid2), message.uid)
+
+    @property
+    def has_value(self) -> bool:
+        """True unless all fields are zero."""
+        return bool(self.uid or any(self.uid2))
+
+    def contradicts(self, other: HardwareId) -> bool:
+        """Return True if both have the same field with different values. ``uid2`` takes precedence."""
+        if any(self.uid2) and any(other.uid2):
+            return self.uid2 != other.uid2
+        return bool(self.uid and other.uid) and self.uid != other.uid
+
+    def confirms(self, other: HardwareId) -> bool:
+        """Return True if ``uid2`` or ``uid`` is equal and nothing contradicts."""
+        is_same = (any(self.uid2) and self.uid2 == other.uid2) or (bool(self.uid) and self.uid == other.uid)
+        return is_same and not self.contradicts(other)

@@ -1,7 +1,175 @@
-"""Flight logs in the formats of other programs: MCAP, CSV, Parquet, GPX, KML; see docs/convert.md."""
+"""Conversion of flight logs to MCAP, CSV, Parquet, GPX and KML; see docs/convert.md."""
 
 from __future__ import annotations
 
-from aerokit.logs.convert.converting import FORMATS, Conversion, convert
+import os
+import shutil
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from aerokit._internal.values import Snapshot
+from aerokit.errors import FileFormatError, InvalidArgument
+from aerokit.logs.convert.mcap import McapWriter
+from aerokit.logs.convert.tables import CsvTable, FlightTableWriter, MessageTablesWriter, ParquetTable
+from aerokit.logs.convert.tracks import GpxWriter, KmlWriter
+from aerokit.logs.flights.flight_controllers import BinReader, UlogReader
+from aerokit.logs.flights.records import TlogReader
+from aerokit.protocols.exchange import TransferProgress
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.logs.flights.records import LogReader, LogRecord
+    from aerokit.protocols.exchange import OnProgress
 
 __all__ = ["FORMATS", "Conversion", "convert"]
+
+
+LOG_READERS: dict[str, type[LogReader]] = {".tlog": TlogReader, ".bin": BinReader, ".ulg": UlogReader}
+"""Suffix of a log → its reader."""
+
+
+class _Writer(Protocol):
+    written: int
+
+    def write(self, record: LogRecord) -> None: ...
+    def close(self) -> None: ...
+    def discard(self) -> None: ...
+
+
+FORMATS: dict[str, Callable[[Path, LogReader], _Writer]] = {
+    ".mcap": McapWriter,
+    ".csv": partial(FlightTableWriter, kind=CsvTable),
+    ".parquet": partial(FlightTableWriter, kind=ParquetTable),
+    ".gpx": GpxWriter,
+    ".kml": KmlWriter,
+}
+"""Suffix of a file → its writer."""
+FOLDERS: dict[str, Callable[[Path, LogReader], _Writer]] = {
+    "csv": partial(MessageTablesWriter, kind=CsvTable),
+    "parquet": partial(MessageTablesWriter, kind=ParquetTable),
+}
+"""Format of the tables in a folder → writer."""
+
+
+class Conversion(Snapshot):
+    """The result of a conversion."""
+
+    target: Path
+    """The file or folder."""
+    entries: int
+    """Number of records read from the log: messages or rows."""
+    written: int
+    """Number of messages, rows or points written. An ``.mcap`` gets several messages for one record: itself, and
+    each state that it changes. A flight table or track gets rows or points for positions only.
+    """
+    bytes: int
+    """Total size of the written files."""
+    begins_at: float
+    """UTC of the first record, in seconds since 1970."""
+    ends_at: float
+    """UTC of the last record, in seconds since 1970."""
+    notes: tuple[str, ...]
+    """Problems with the log, and data that is missing for that reason."""
+
+
+def convert(
+    log: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    tables: str = "csv",
+    force: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Conversion:
+    """Convert a flight log; a damaged log, as far as it can be read.
+
+    The target appears when it is complete. Blocks; needs no event loop.
+
+    Args:
+        log: a ``.tlog`` of a ground station, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
+        target: a file, ``.mcap``, ``.csv``, ``.parquet``, ``.gpx`` or ``.kml``; without a suffix, a folder with
+            one table for each message type.
+        tables: format of the tables in a folder: ``"csv"`` or ``"parquet"``.
+        force: replace existing files; other files in a folder are kept.
+        on_progress: called from time to time with the bytes that were read.
+
+    Raises:
+        InvalidArgument: the format is unknown, or the target exists.
+        FileFormatError: the file is not a log, or nothing can be read.
+        OSError: a file cannot be read or written.
+        ModuleNotFoundError: a package of the extra ``convert`` is not installed.
+    """
+    source, to = Path(log), Path(target)
+    make_writer = _writer_for(to, tables)
+    reader_class = LOG_READERS.get(source.suffix.lower())
+    if reader_class is None:
+        raise FileFormatError(f"{source} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
+    if not force and to.exists() and not (to.is_dir() and not to.suffix and not any(to.iterdir())):
+        raise InvalidArgument(f"{to} exists; use force (--force) to replace it")
+    if to.exists() and to.is_dir() != (not to.suffix):
+        kinds = ("folder", "file") if to.is_dir() else ("file", "folder")
+        raise InvalidArgument(f"{to} is a {kinds[0]}, and cannot be replaced by a {kinds[1]}")
+    on_bytes = _byte_callback(source, on_progress)
+    # In the target's directory, so that it can be renamed.
+    with tempfile.TemporaryDirectory(dir=to.parent, prefix=f".{to.name}.") as folder:
+        part = Path(folder) / to.name
+        if not to.suffix:
+            part.mkdir()
+        log_reader = reader_class(source)
+        entries, begins_at, ends_at, written = _copy(log_reader, make_writer(part, log_reader), on_bytes)
+        size = _move(part, to)
+    return Conversion(to, entries, written, size, begins_at, ends_at, tuple(log_reader.notes))
+
+
+def _writer_for(to: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
+    formats: dict[str, Any] = FORMATS if to.suffix else FOLDERS
+    key = to.suffix.lower() if to.suffix else tables
+    if key not in formats:
+        raise InvalidArgument(
+            f"unknown format {key!r}; files: {', '.join(FORMATS)}; tables in folders: {' or '.join(FOLDERS)}"
+        )
+    writer: Callable[[Path, LogReader], _Writer] = formats[key]
+    return writer
+
+
+def _copy(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
+    entries, begins_at, ends_at = 0, 0.0, 0.0
+    try:
+        for entry in log.entries(on_bytes):
+            if not entries:
+                begins_at = ends_at = entry.unix_s
+            entries += 1
+            ends_at = max(ends_at, entry.unix_s)
+            writer.write(entry)
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
+    return entries, begins_at, ends_at, writer.written
+
+
+def _byte_callback(source: Path, on_progress: OnProgress | None) -> Callable[[int], object]:
+    total, started = source.stat().st_size, time.monotonic()
+    if on_progress is None:
+        return lambda done: None
+    return lambda done: on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
+
+
+def _move(part: Path, to: Path) -> int:
+    """Flush the files to disk, and give them their final names. Return their total size."""
+    files = sorted(part.iterdir()) if part.is_dir() else [part]
+    for file in files:
+        with file.open("rb") as opened:
+            os.fsync(opened.fileno())  # otherwise a power cut could leave an empty file
+    size = sum(file.stat().st_size for file in files)
+    if not part.is_dir():
+        part.replace(to)
+    elif not to.exists():
+        shutil.move(part, to)
+    else:
+        for file in files:
+            file.replace(to / file.name)
+    return size

@@ -1,4 +1,4 @@
-"""MCAP for the Foxglove viewer: the topics that ``aerokit bridge foxglove`` serves live, and the log's own entries."""
+"""MCAP for Foxglove: the topics of ``aerokit bridge foxglove``, and the records of the log."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from aerokit.logs.flights.entries import Entry, Log
+    from aerokit.logs.flights.records import LogReader, LogRecord
 
-_MOVES = frozenset(("position", "attitude"))
+_POSE_STATES = frozenset(("position", "attitude"))
 
 
-class McapFile:
-    """Writes a log as ``.mcap``; one message of a topic for each entry that told it."""
+class McapWriter:
+    """Writes a log as ``.mcap``, with one message for each record of a topic."""
 
-    def __init__(self, path: Path, log: Log) -> None:
+    def __init__(self, path: Path, log: LogReader) -> None:
         self._log = log
         self._file = path.open("wb")
         self._writer = import_module("mcap.writer").Writer(self._file)
@@ -32,60 +32,57 @@ class McapFile:
         self._map = topics.MapFrame()
         self.written: int = 0
 
-    def take(self, entry: Entry) -> None:
-        """Write what an entry of the log tells."""
-        message, system_id = entry.message, entry.system_id
+    def write(self, record: LogRecord) -> None:
+        message, system_id = record.message, record.system_id
         if message is not None:
             kind = STANDARD[message.ID]
-            name = topics.raw_topic_name(system_id, entry.component_id, kind)
+            name = topics.raw_topic_name(system_id, record.component_id, kind)
             self._put(
-                entry.unix_s,
+                record.unix_s,
                 name,
                 topics.raw_fields(message),
-                lambda: topics.raw_topic(system_id, entry.component_id, kind),
+                lambda: topics.raw_topic(system_id, record.component_id, kind),
             )
         else:
-            name = f"/log/{entry.table}"
-            self._put(entry.unix_s, name, topics.state_fields(entry.fields), lambda: self._own_topic(entry))
-        if entry.states:
-            self._take_states(entry)
+            name = f"/log/{record.table}"
+            self._put(record.unix_s, name, topics.state_fields(record.fields), lambda: self._record_topic(record))
+        if record.states:
+            self._write_states(record)
 
     def close(self) -> None:
-        """End the file."""
         self._writer.finish()
         self._file.close()
 
-    def abandon(self) -> None:
-        """Close it as it is: nobody will read it."""
+    def discard(self) -> None:
         self._file.close()
 
-    def _take_states(self, entry: Entry) -> None:
-        system_id, unix_s = entry.system_id, entry.unix_s
+    def _write_states(self, record: LogRecord) -> None:
+        system_id, unix_s = record.system_id, record.unix_s
         latest = self._latest.setdefault(system_id, {})
-        for state, value in entry.states:
+        for state, value in record.states:
             latest[state] = value
             name = topics.vehicle_topic(system_id, state)
             make = lambda: topics.state_topic(system_id, state, value)  # noqa: E731, B023
             self._put(unix_s, name, topics.state_fields(value), make)
             if state == "status_text":
                 fields = topics.log_entry(unix_s, system_id, value)
-                self._put_known(unix_s, system_id, "log", fields, topics.LOG)
-        moved = {state for state, _ in entry.states} & _MOVES
+                self._put_foxglove(unix_s, system_id, "log", fields, topics.LOG)
+        moved = {state for state, _ in record.states} & _POSE_STATES
         place, attitude = latest.get("position"), latest.get("attitude")
         if not moved or place is None:
             return
         if "position" in moved:
             heading, velocity = latest.get("heading_deg"), latest.get("velocity")
             fix = topics.location_fix(unix_s, system_id, place, heading, velocity)
-            self._put_known(unix_s, system_id, "location", fix, topics.LOCATION_FIX)
+            self._put_foxglove(unix_s, system_id, "location", fix, topics.LOCATION_FIX)
             latest["metres"] = self._map.east_north_up_m(place)
         metres = latest["metres"]
         transform = topics.frame_transform(unix_s, system_id, metres, attitude)
-        self._put_known(unix_s, system_id, "transform", transform, topics.FRAME_TRANSFORM)
+        self._put_foxglove(unix_s, system_id, "transform", transform, topics.FRAME_TRANSFORM)
         pose = topics.pose_in_frame(unix_s, metres, attitude)
-        self._put_known(unix_s, system_id, "pose", pose, topics.POSE_IN_FRAME)
+        self._put_foxglove(unix_s, system_id, "pose", pose, topics.POSE_IN_FRAME)
 
-    def _put_known(
+    def _put_foxglove(
         self, unix_s: float, system_id: int, what: str, fields: Mapping[str, Any], schema: Mapping[str, Any]
     ) -> None:
         name = topics.vehicle_topic(system_id, what)
@@ -107,11 +104,11 @@ class McapFile:
             self._schemas[data] = schema
         return int(self._writer.register_channel(topic.name, "json", schema))
 
-    def _own_topic(self, entry: Entry) -> Topic:
+    def _record_topic(self, record: LogRecord) -> Topic:
         kinds = {"str": "string"}
         properties = {
             column.field: {"type": kinds.get(column.kind, "number"), "description": column.name}
-            for column in self._log.columns(entry)
+            for column in self._log.columns(record)
         }
-        title = f"log.{entry.table}"
-        return Topic(f"/log/{entry.table}", {"title": title, "type": "object", "properties": properties})
+        title = f"log.{record.table}"
+        return Topic(f"/log/{record.table}", {"title": title, "type": "object", "properties": properties})

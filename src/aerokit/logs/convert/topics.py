@@ -1,7 +1,7 @@
-"""The topics of a vehicle: their names, their JSON schemas and their messages, for a live viewer and for files alike.
+"""Foxglove topics of a vehicle: names, JSON schemas and messages, for the live bridge and for files.
 
-Those whose schema is ``foxglove.…`` are the ones that its panels know
-(https://docs.foxglove.dev/docs/sdk/schemas); the others hold our values, field by field. Everything is JSON.
+Schemas named ``foxglove.…`` are known to Foxglove's panels (https://docs.foxglove.dev/docs/sdk/schemas). The
+others contain the fields of aerokit's values. Everything is JSON.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal import geo
-from aerokit._internal.plain import plain
+from aerokit._internal.formatting import to_jsonable
 from aerokit._internal.values import Snapshot
 from aerokit.mavlink.message import SECRET_FIELDS, Message, field_names
 
@@ -24,14 +24,13 @@ if TYPE_CHECKING:
     from aerokit.vehicle.state.movement import Attitude, Velocity
 
 MAP_FRAME = "map"
-"""The frame of all vehicles: x east, y north, z up, metres; its origin is where the first of them was first heard."""
-
+"""Common frame of all vehicles: x east, y north, z up, in metres; the origin is the first known position."""
 _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
 _KINDS = {"float": "number", "int": "number", "str": "string", "bool": "boolean"}
 _FATAL, _ERROR, _WARNING, _INFO, _DEBUG = 5, 4, 3, 2, 1
+# MAV_SEVERITY → foxglove.LogLevel.
 _LEVELS = (_FATAL, _FATAL, _FATAL, _ERROR, _WARNING, _INFO, _INFO, _DEBUG)
-"""MAV_SEVERITY → foxglove.LogLevel."""
 
 
 def _object(title: str, /, **properties: Any) -> dict[str, Any]:
@@ -87,53 +86,52 @@ LOG = _of_foxglove(
 
 
 class Topic(Snapshot):
-    """One topic: its name, and the JSON schema of its messages, whose ``title`` is the schema's name."""
+    """A topic: its name and the JSON schema of its messages."""
 
     name: str
     schema: Mapping[str, Any]
 
     @property
     def schema_name(self) -> str:
-        """The schema's name, ``"foxglove.LocationFix"``."""
         return str(self.schema["title"])
 
 
 class MapFrame:
-    """Places as metres east, north and up of an origin."""
+    """Converts positions to metres east, north and up of an origin."""
 
     def __init__(self) -> None:
         self._origin: tuple[float, float, float] | None = None
 
-    def east_north_up_m(self, place: Position) -> tuple[float, float, float]:
-        """Where a place is; the first that is asked for is made the origin, at the height of home where it is known."""
-        altitude, relative = place.altitude_amsl_m, place.altitude_relative_m
+    def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
+        """Convert a position. The first one becomes the origin, at the altitude of home if that is known."""
+        altitude, relative = position.altitude_amsl_m, position.altitude_relative_m
         if self._origin is None:
-            self._origin = (place.latitude_deg, place.longitude_deg, (altitude or 0.0) - (relative or 0.0))
+            self._origin = (
+                position.latitude_deg,
+                position.longitude_deg,
+                (altitude or 0.0) - (relative or 0.0),
+            )
         latitude, longitude, height = self._origin
-        north, east = geo.north_east_m(latitude, longitude, place.latitude_deg, place.longitude_deg)
+        north, east = geo.north_east_m(latitude, longitude, position.latitude_deg, position.longitude_deg)
         return east, north, height_above(height, altitude, relative)
 
 
 def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
-    """Metres above the origin: by the altitude above the sea, else by the one above home."""
+    """Return metres above the origin, from the altitude above sea level, or above home if that is unknown."""
     return (relative_m or 0.0) if altitude_amsl_m is None else altitude_amsl_m - origin_m
 
 
-# ------------------------------------------------------------------------------------ names
-
-
-def vehicle_topic(system_id: int, what: str) -> str:
-    """``/vehicle/1/location`` and the like."""
-    return f"/vehicle/{system_id}/{what}"
+def vehicle_topic(system_id: int, name: str) -> str:
+    return f"/vehicle/{system_id}/{name}"
 
 
 def frame_of(system_id: int) -> str:
-    """The name of the frame that moves with a vehicle: x forward, y left, z up."""
+    """Return the name of a vehicle's body frame: x forward, y left, z up."""
     return f"vehicle_{system_id}"
 
 
 def state_topic(system_id: int, name: str, value: object) -> Topic:
-    """The topic of a state, ``/vehicle/1/attitude``; its schema is that of its first value."""
+    """Return the topic of a state, ``/vehicle/1/attitude``, with the schema of its first value."""
     schema = _schema_of(value)
     if schema.get("type") != "object":
         schema = {"type": "object", "properties": {"value": schema}}
@@ -141,7 +139,7 @@ def state_topic(system_id: int, name: str, value: object) -> Topic:
 
 
 def raw_topic(system_id: int, component_id: int, message: type[Message]) -> Topic:
-    """The topic of a MAVLink message as it came, ``/mavlink/1/1/GPS_RAW_INT``; the units are in the schema."""
+    """Return the topic of a raw MAVLink message, ``/mavlink/1/1/GPS_RAW_INT``; the schema has the units."""
     properties: dict[str, Any] = {}
     for field in message.FIELDS:
         if field.name in SECRET_FIELDS:
@@ -155,7 +153,6 @@ def raw_topic(system_id: int, component_id: int, message: type[Message]) -> Topi
 
 
 def raw_topic_name(system_id: int, component_id: int, message: type[Message]) -> str:
-    """``/mavlink/1/1/GPS_RAW_INT``."""
     return f"/mavlink/{system_id}/{component_id}/{message.NAME}"
 
 
@@ -163,58 +160,54 @@ def _are_bytes(field: Any) -> bool:
     return field.type in ("uint8_t", "char") and bool(field.array_length)
 
 
-# --------------------------------------------------------------------------------- messages
-
-
 def nanoseconds(unix_s: float) -> int:
-    """Nanoseconds since 1970, to the microsecond."""
+    """Convert to nanoseconds since 1970, rounded to microseconds."""
     return round(unix_s * 1e6) * 1000
 
 
 def encoded(fields: Mapping[str, Any]) -> bytes:
-    """A message as it goes to the viewer or the file."""
     return _JSON.encode(fields).encode()
 
 
 def state_fields(value: object) -> dict[str, Any]:
-    """The message of a state: its fields, or ``{"value": …}`` when it is a number, a text or a list."""
+    """Return the message of a state: its fields, or ``{"value": …}`` for a number, text or list."""
     if isinstance(value, Snapshot):
         return {name: _plain(getattr(value, name)) for name in value.__match_args__}
-    told = plain(value)
-    return told if isinstance(told, dict) else {"value": told}
+    converted = to_jsonable(value)
+    return converted if isinstance(converted, dict) else {"value": converted}
 
 
 def raw_fields(message: Message) -> dict[str, Any]:
-    """The message of a MAVLink message: the standard's fields in its raw units; keys and passwords are left out."""
-    return {
-        name: _plain(getattr(message, name)) for name in field_names(message) if name not in SECRET_FIELDS
-    }
+    """Return the fields of a MAVLink message, in raw units; keys and passwords are omitted."""
+    return {name: _plain(getattr(message, name)) for name in field_names(message) if name not in SECRET_FIELDS}
 
 
 def _plain(value: object) -> Any:
-    """Like `aerokit._internal.plain.plain`, and three times as fast for the common field types: a log has millions."""
+    """Like `aerokit._internal.formatting.to_jsonable`, but three times as fast for common types: logs have millions of
+    values.
+    """
     kind = type(value)
     if kind is int or kind is str or value is None:
         return value
     if kind is float:
         return value if math.isfinite(value) else None  # type: ignore[arg-type]
-    return plain(value)
+    return to_jsonable(value)
 
 
 def location_fix(
     unix_s: float,
     system_id: int,
-    place: Position,
+    position: Position,
     heading_deg: float | None = None,
     velocity: Velocity | None = None,
 ) -> dict[str, Any]:
-    """``foxglove.LocationFix``, for the map; the altitude is above mean sea level, 0 when it is not known."""
+    """Return a ``foxglove.LocationFix``; the altitude is above mean sea level, 0 if unknown."""
     fix: dict[str, Any] = {
         "timestamp": _time(unix_s),
         "frame_id": frame_of(system_id),
-        "latitude": place.latitude_deg,
-        "longitude": place.longitude_deg,
-        "altitude": place.altitude_amsl_m or 0.0,
+        "latitude": position.latitude_deg,
+        "longitude": position.longitude_deg,
+        "altitude": position.altitude_amsl_m or 0.0,
         "position_covariance": [0.0] * 9,
         "position_covariance_type": 0,
     }
@@ -228,7 +221,6 @@ def location_fix(
 def frame_transform(
     unix_s: float, system_id: int, east_north_up_m: Sequence[float], attitude: Attitude | None
 ) -> dict[str, Any]:
-    """``foxglove.FrameTransform`` from the map to the vehicle's body, for the 3D panel."""
     return {
         "timestamp": _time(unix_s),
         "parent_frame_id": MAP_FRAME,
@@ -238,10 +230,7 @@ def frame_transform(
     }
 
 
-def pose_in_frame(
-    unix_s: float, east_north_up_m: Sequence[float], attitude: Attitude | None
-) -> dict[str, Any]:
-    """``foxglove.PoseInFrame`` in the map, for the 3D panel."""
+def pose_in_frame(unix_s: float, east_north_up_m: Sequence[float], attitude: Attitude | None) -> dict[str, Any]:
     return {
         "timestamp": _time(unix_s),
         "frame_id": MAP_FRAME,
@@ -250,7 +239,7 @@ def pose_in_frame(
 
 
 def log_entry(unix_s: float, system_id: int, text: StatusText) -> dict[str, Any]:
-    """``foxglove.Log`` of what the vehicle said; its level is 0, unknown, where a log does not keep it."""
+    """Return a ``foxglove.Log`` for a status text; the level is 0 (unknown) if the log has no severity."""
     severity: int | None = text.severity
     return {
         "timestamp": _time(unix_s),
@@ -272,21 +261,16 @@ def _vector(x: float, y: float, z: float) -> dict[str, float]:
 
 
 def _rotation(attitude: Attitude | None) -> dict[str, float]:
-    """From (forward, right, down) in (north, east, down) to (forward, left, up) in (east, north, up)."""
+    """Convert from (forward, right, down) in (north, east, down) to (forward, left, up) in (east, north, up)."""
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
-    if attitude is not None and all(
-        map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
-    ):
+    if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
         w, x, y, z = attitude.quaternion
     half = math.sqrt(0.5)
     return {"x": half * (x + y), "y": half * (x - y), "z": half * (w - z), "w": half * (w + z)}
 
 
-# ---------------------------------------------------------------------------------- schemas
-
-
 def _schema_of(value: object) -> dict[str, Any]:
-    """The JSON schema of what `plain` makes of a value; a field that is None tells its type."""
+    """Return the JSON schema of a converted value. For None the field's annotation gives the type."""
     if isinstance(value, Snapshot):
         kinds = _annotations(type(value))
         fields = value.to_dict()
@@ -297,13 +281,13 @@ def _schema_of(value: object) -> dict[str, Any]:
                 for name, field in fields.items()
             },
         }
-    told = plain(value)
-    if isinstance(told, dict):
-        return {"type": "object", "properties": {name: _schema_of(each) for name, each in told.items()}}
-    if isinstance(told, list):
-        members = value if isinstance(value, (list, tuple)) else told
+    converted = to_jsonable(value)
+    if isinstance(converted, dict):
+        return {"type": "object", "properties": {name: _schema_of(item) for name, item in converted.items()}}
+    if isinstance(converted, list):
+        members = value if isinstance(value, (list, tuple)) else converted
         return {"type": "array", "items": _schema_of(members[0]) if members else {}}
-    return {} if told is None else {"type": _KINDS[type(told).__name__]}
+    return {} if converted is None else {"type": _KINDS[type(converted).__name__]}
 
 
 def _annotations(kind: type) -> dict[str, str]:
@@ -314,6 +298,6 @@ def _annotations(kind: type) -> dict[str, str]:
 
 
 def _declared(annotation: str) -> dict[str, Any]:
-    """The schema of ``"float | None"``."""
+    """Return the schema of an annotation like ``"float | None"``."""
     kind = _KINDS.get(annotation.partition(" | ")[0])
     return {} if kind is None else {"type": kind}

@@ -1,4 +1,4 @@
-"""GPX and KML: where the vehicles flew, and the missions they were given."""
+"""GPX and KML: tracks of vehicles, and their missions."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from datetime import datetime, timezone
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from aerokit._internal.values import Snapshot
+from aerokit.logs.flights.flight import Waypoint
 from aerokit.mavlink.enums import MavCmd, MavFrame
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from aerokit.logs.flights.entries import Entry, Log
+    from aerokit.logs.flights.records import LogReader, LogRecord
     from aerokit.position import Position
 
 _ABSOLUTE = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
@@ -21,34 +21,21 @@ _RELATIVE = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_AL
 _TERRAIN = frozenset((MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT))
 
 
-class Waypoint(Snapshot):
-    """A place of a mission; the altitude is above the sea, above home, or above the ground, as ``frame`` says."""
+def _waypoint_name(waypoint: Waypoint) -> str:
+    try:
+        return f"{waypoint.number} {MavCmd(waypoint.command).name}"
+    except ValueError:
+        return f"{waypoint.number} command {waypoint.command}"
 
-    index: int
-    command: int
-    frame: int
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
 
-    @property
-    def name(self) -> str:
-        """``"3 NAV_WAYPOINT"``."""
-        try:
-            return f"{self.index} {MavCmd(self.command).name}"
-        except ValueError:
-            return f"{self.index} command {self.command}"
-
-    def altitude_amsl_m(self, home_amsl_m: float | None) -> float | None:
-        """Above mean sea level; None where that is not known."""
-        if self.frame in _ABSOLUTE:
-            return self.altitude_m
-        return self.altitude_m + home_amsl_m if self.frame in _RELATIVE and home_amsl_m is not None else None
+def _altitude_amsl_m(waypoint: Waypoint, home_amsl_m: float | None) -> float | None:
+    if waypoint.frame in _ABSOLUTE:
+        return waypoint.altitude_m
+    is_known = waypoint.frame in _RELATIVE and home_amsl_m is not None
+    return waypoint.altitude_m + home_amsl_m if is_known and home_amsl_m is not None else None
 
 
 class _Track:
-    """The positions of one vehicle, and its mission as it was told last."""
-
     def __init__(self) -> None:
         self.points: list[tuple[datetime, Position]] = []
         self.waypoints: dict[int, Waypoint] = {}
@@ -60,50 +47,48 @@ class _Track:
             self.home_amsl_m = place.altitude_amsl_m - place.altitude_relative_m
 
 
-class _Tracks:
-    """What both formats gather; the file is written at the end."""
+class _TrackWriter:
+    """Base of writers that collect positions and missions, and write the file at the end."""
 
-    def __init__(self, path: Path, log: Log) -> None:
+    def __init__(self, path: Path, log: LogReader) -> None:
         self._path, self._log = path, log
         self._tracks: dict[int, _Track] = {}
         self._mission: dict[int, Waypoint] = {}
         self.written: int = 0
 
-    def take(self, entry: Entry) -> None:
-        """Keep the positions and the items of missions."""
-        for state, value in entry.states:
+    def write(self, record: LogRecord) -> None:
+        for state, value in record.states:
             if state == "position":
-                self._tracks.setdefault(entry.system_id, _Track()).add(entry.unix_s, value)
+                self._tracks.setdefault(record.system_id, _Track()).add(record.unix_s, value)
                 self.written += 1
-        if entry.table in _ITEMS:
-            self._take_item(entry)
+        if record.table in _ITEMS:
+            self._add_item(record)
 
-    def abandon(self) -> None:
-        """Nothing is open."""
+    def discard(self) -> None:
+        pass  # no file is open yet
 
     def close(self) -> None:
-        """Write the file."""
         if not self.written:
-            self._log.notes.append("no position is in this log: there is no track")
+            self._log.notes.append("the log contains no position; there is no track")
         self._path.write_text(self._text(), encoding="utf-8")
 
-    def _take_item(self, entry: Entry) -> None:
-        item: Any = entry.message
+    def _add_item(self, record: LogRecord) -> None:
+        item: Any = record.message
         if item is None or item.mission_type or item.frame not in _ABSOLUTE | _RELATIVE | _TERRAIN:
             return
-        if item.target_system in self._tracks:  # somebody sends it to a vehicle
+        if item.target_system in self._tracks:  # sent to the vehicle
             system_id = item.target_system
-        elif entry.system_id in self._tracks:  # a vehicle tells it
-            system_id = entry.system_id
+        elif record.system_id in self._tracks:  # sent by the vehicle
+            system_id = record.system_id
         else:
             return
         scale = 1e7 if item.NAME == "MISSION_ITEM_INT" else 1.0
         latitude, longitude = item.x / scale, item.y / scale
-        # 0, 0 is no place, but where it is then; NaN and what is not on earth is none, either
-        is_place = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
-        if is_place and math.isfinite(item.z):
+        # 0, 0 means the current position; NaN and invalid coordinates are skipped too.
+        is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
+        if is_valid and math.isfinite(item.z):
             self._tracks[system_id].waypoints[item.seq] = Waypoint(
-                item.seq, item.command, item.frame, latitude, longitude, item.z
+                item.seq, item.command, latitude, longitude, item.z, item.frame
             )
 
     def _text(self) -> str:
@@ -113,8 +98,10 @@ class _Tracks:
 _ITEMS = frozenset(("MISSION_ITEM_INT", "MISSION_ITEM"))
 
 
-class GpxFile(_Tracks):
-    """``.gpx``: a track with times and elevations above the sea for each vehicle, and waypoints of its mission."""
+class GpxWriter(_TrackWriter):
+    """Writes ``.gpx``: for each vehicle a track with times and elevations above sea level, and the waypoints of
+    its mission.
+    """
 
     def _text(self) -> str:
         gpx = import_module("gpxpy.gpx")
@@ -123,9 +110,7 @@ class GpxFile(_Tracks):
         for system_id, track in self._tracks.items():
             segment = gpx.GPXTrackSegment(
                 [
-                    gpx.GPXTrackPoint(
-                        place.latitude_deg, place.longitude_deg, elevation=place.altitude_amsl_m, time=at
-                    )
+                    gpx.GPXTrackPoint(place.latitude_deg, place.longitude_deg, elevation=place.altitude_amsl_m, time=at)
                     for at, place in track.points
                 ]
             )
@@ -137,22 +122,22 @@ class GpxFile(_Tracks):
                     gpx.GPXWaypoint(
                         waypoint.latitude_deg,
                         waypoint.longitude_deg,
-                        elevation=waypoint.altitude_amsl_m(track.home_amsl_m),
-                        name=waypoint.name,
+                        elevation=_altitude_amsl_m(waypoint, track.home_amsl_m),
+                        name=_waypoint_name(waypoint),
                     )
                 )
         return str(file.to_xml())
 
 
-class KmlFile(_Tracks):
-    """``.kml``: a gx:Track with times for each vehicle, and its mission as points and a line."""
+class KmlWriter(_TrackWriter):
+    """Writes ``.kml``: for each vehicle a gx:Track with times, and the waypoints of its mission."""
 
     def _text(self) -> str:
         kml = import_module("simplekml")
         file = kml.Kml(name=self._log.path.name)
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
-            # Above the sea where that is known; else above home, which is nearest to "above the ground".
+            # Above sea level if known, otherwise above home, which is closest to KML's "relative to ground".
             is_absolute = all(place.altitude_amsl_m is not None for _, place in track.points)
             mode = kml.AltitudeMode.absolute if is_absolute else kml.AltitudeMode.relativetoground
             line = folder.newgxtrack(name="track", altitudemode=mode)
@@ -168,10 +153,10 @@ class KmlFile(_Tracks):
                 ]
             )
             for _, waypoint in sorted(track.waypoints.items()):
-                altitude = waypoint.altitude_amsl_m(track.home_amsl_m)
+                altitude = _altitude_amsl_m(waypoint, track.home_amsl_m)
                 known = altitude is not None
                 folder.newpoint(
-                    name=waypoint.name,
+                    name=_waypoint_name(waypoint),
                     coords=[
                         (
                             waypoint.longitude_deg,

@@ -1,21 +1,124 @@
-"""Flight logs as what was flown: whole flights as columns (`read_flight`), and their entries; docs/report.md."""
+"""Flight logs as flights: `read_flight` reads a log into time series; see docs/report.md."""
 
 from __future__ import annotations
 
-from aerokit.logs.flights.columns import Columns
-from aerokit.logs.flights.failsafes import Failsafe, failsafes
-from aerokit.logs.flights.flight import Flight, ModeChange, ParameterChange, Said, Sign, Waypoint
-from aerokit.logs.flights.reading import read_flight
+import math
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aerokit.errors import FileFormatError
+from aerokit.logs.flights.failsafes import Failsafe, evidence_in_texts, failsafes
+from aerokit.logs.flights.flight import (
+    FailsafeEvidence,
+    FlightLog,
+    LoggedText,
+    ModeChange,
+    ParameterChange,
+    TimeSeries,
+    Waypoint,
+)
+from aerokit.logs.flights.from_bin import read_bin_flight
+from aerokit.logs.flights.from_tlog import read_tlog_flight
+from aerokit.logs.flights.from_ulog import read_ulog_flight
+from aerokit.protocols.exchange import TransferProgress
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.protocols.exchange import OnProgress
 
 __all__ = [
-    "Columns",
     "Failsafe",
-    "Flight",
+    "FailsafeEvidence",
+    "FlightLog",
+    "LoggedText",
     "ModeChange",
     "ParameterChange",
-    "Said",
-    "Sign",
+    "TimeSeries",
     "Waypoint",
     "failsafes",
     "read_flight",
 ]
+
+
+LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]], None]] = {
+    ".tlog": read_tlog_flight,
+    ".bin": read_bin_flight,
+    ".ulg": read_ulog_flight,
+}
+"""Suffix of a log → function that reads it."""
+_SAME_ALTITUDE_M = 5.0
+
+
+def check_log_name(path: Path) -> None:
+    """Raise FileFormatError if the suffix is not that of a flight log."""
+    if path.suffix.lower() not in LOG_READERS:
+        raise FileFormatError(f"{path} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
+
+
+def read_flight(
+    log: str | os.PathLike[str], *, system_id: int | None = None, on_progress: OnProgress | None = None
+) -> FlightLog:
+    """Read a flight from a log; from a damaged log, as much as can be read. Blocks; needs no event loop.
+
+    Args:
+        log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several; None: the first one.
+        on_progress: called from time to time with the bytes that were read.
+
+    Raises:
+        FileFormatError: the file is not such a log, or nothing can be read.
+        OSError: the file cannot be read.
+        ModuleNotFoundError: pyulog, of the extra ``report``, is not installed (``.ulg``).
+    """
+    path = Path(log)
+    check_log_name(path)
+    read = LOG_READERS[path.suffix.lower()]
+    total, started = path.stat().st_size, time.monotonic()
+
+    def show(done: int) -> None:
+        if on_progress is not None:
+            on_progress(TransferProgress(min(done, total), total, time.monotonic() - started))
+
+    flight = FlightLog(path)
+    read(flight, system_id, show)
+    _complete(flight)
+    show(total)
+    return flight
+
+
+def _complete(flight: FlightLog) -> None:
+    """Close open spans, and derive home, heights and failsafe evidence."""
+    if flight.armed and math.isinf(flight.armed[-1][1]):
+        flight.armed[-1] = (flight.armed[-1][0], flight.duration_s)
+        flight.notes.append("the log ends while the vehicle is armed")
+    if flight.home is None and len(flight.track):
+        row = max(flight.track.index_at(flight.armed[0][0]), 0) if flight.armed else 0
+        place = (flight.track[name][row] for name in ("latitude_deg", "longitude_deg", "altitude_amsl_m"))
+        flight.set_home(flight.track.times[row], *place)
+    _fill_relative(flight)
+    flight.failsafe_evidence += evidence_in_texts(flight.texts)
+    flight.failsafe_evidence.sort(key=lambda evidence: evidence.time_s)
+
+
+def _fill_relative(flight: FlightLog) -> None:
+    """Derive heights above home from altitudes above sea level.
+
+    ArduPilot logs the same value for both until it knows home, or the altitude above sea level.
+    """
+    home = flight.home.altitude_amsl_m if flight.home is not None else None
+    if home is None:
+        return
+    for columns in (flight.track, flight.position_target):
+        amsl, relative = columns["altitude_amsl_m"], columns["altitude_relative_m"]
+        for row, height in enumerate(relative):
+            above_sea = amsl[row]
+            if math.isnan(height):
+                relative[row] = above_sea - home
+            elif abs(home) > _SAME_ALTITUDE_M and abs(height - above_sea) < _SAME_ALTITUDE_M:
+                if abs(above_sea - home) < abs(above_sea):
+                    relative[row] = above_sea - home
+                else:
+                    amsl[row] = math.nan

@@ -1,4 +1,4 @@
-"""What numbers in a log of ArduPilot mean: reasons of a mode, errors of a subsystem.
+"""Meanings of numbers in ArduPilot logs: mode reasons, and errors of subsystems.
 
 From ``ModeReason.h`` and ``AP_Logger.h`` of ArduPilot 4.7.
 """
@@ -50,45 +50,45 @@ MODE_REASONS: Mapping[int | None, tuple[str, str | None, bool | None]] = {
     39: ("return complete, landing", None, True),
     40: ("return complete, landing", None, True),
     41: ("mission command", None, True),
-    42: ("telemetry of the radio control", None, False),
+    42: ("RC telemetry", None, False),
     43: ("back to the mode before the fence breach", None, True),
-    44: ("QRTL in the place of RTL", None, True),
+    44: ("QRTL instead of RTL", None, True),
     45: ("end of AUTO RTL", None, True),
     46: ("height for landing reached", None, True),
     47: ("loiter height in a VTOL mode", None, True),
     48: ("end of the radio failsafe", None, True),
-    49: ("QLAND in the place of RTL", None, True),
+    49: ("QLAND instead of RTL", None, True),
     50: ("dead-reckoning failsafe", "estimator", True),
     51: ("failsafe of the TAKEOFF mode", "take-off", True),
-    52: ("order by DDS", None, False),
+    52: ("DDS command", None, False),
     53: ("auxiliary switch", None, False),
     54: ("automatic landing", None, True),
-    55: ("fence was enabled again", None, True),
+    55: ("fence re-enabled", None, True),
 }
-"""Number → in words, kind of failsafe if it is one, whether the autopilot did it by itself."""
+"""Number → description, kind of failsafe (if any), and True if the autopilot changed the mode itself."""
 
 ERRORS: Mapping[int, tuple[str, str]] = {
     1: ("general", "main loop"),
-    2: ("radio", "receiver of the radio control"),
+    2: ("radio", "RC receiver"),
     3: ("compass", "compass"),
     5: ("radio", "radio failsafe"),
     6: ("battery", "battery failsafe"),
     8: ("ground station", "ground station failsafe"),
     9: ("fence", "fence"),
-    10: ("mode", "change of the mode"),
+    10: ("mode", "mode change"),
     11: ("gps", "GPS"),
     12: ("crash", "crash check"),
     13: ("mode", "flip"),
     15: ("general", "parachute"),
-    16: ("estimator", "check of the estimator"),
+    16: ("estimator", "estimator check"),
     17: ("estimator", "estimator failsafe"),
     18: ("general", "barometer"),
     19: ("general", "processor"),
-    20: ("avoidance", "avoidance of aircraft"),
+    20: ("avoidance", "ADS-B avoidance"),
     21: ("terrain", "terrain data"),
     22: ("general", "navigation"),
     23: ("terrain", "terrain failsafe"),
-    24: ("estimator", "another estimator took over"),
+    24: ("estimator", "switch to another estimator"),
     25: ("thrust", "thrust loss"),
     26: ("general", "sensors"),
     27: ("leak", "leak"),
@@ -97,45 +97,43 @@ ERRORS: Mapping[int, tuple[str, str]] = {
     30: ("general", "internal error"),
     31: ("estimator", "dead reckoning"),
 }
-"""Subsystem → kind of failsafe, in words."""
+"""Subsystem → kind of failsafe, description."""
 
 _CODES: Mapping[tuple[int, int], str] = {
-    (2, 2): "its frames come late",
+    (2, 2): "late frames",
     (11, 2): "glitch",
     (12, 1): "crash into the ground",
     (12, 2): "lost control",
-    (16, 2): "variances are too great",
+    (16, 2): "variances too high",
     (18, 2): "glitch",
 }
 
+# Bits of AC_FENCE_TYPE, in the error code of the fence.
 _FENCES = {
-    1: "above the greatest height",
+    1: "above the maximum altitude",
     2: "outside the circle",
     4: "outside a polygon",
-    8: "below the least height",
+    8: "below the minimum altitude",
 }
-"""AC_FENCE_TYPE bits, which the error code of the fence is made of."""
+_CONTROL = re.compile(
+    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # colours and the like (ECMA-48, CSI)
+    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"  # titles of windows (OSC)
+    r"|[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # other control characters, except tab and newline
+)
 
 
-def said_by_error(subsystem: int, code: int, text: str) -> str:
-    """An ERR message in words."""
+def error_text(subsystem: int, code: int, text: str) -> str:
+    """Return the description of an ERR message."""
     if subsystem == 10:
         return f"mode {code} was refused"
     if subsystem == 24:
         return f"{text}: number {code}"
     if subsystem == 9:
         return f"{text}: {' and '.join(words for bit, words in _FENCES.items() if code & bit)}"
-    told = _CODES.get((subsystem, code))
-    return f"{text}: {told}" if told else text
+    detail = _CODES.get((subsystem, code))
+    return f"{text}: {detail}" if detail else text
 
 
-_CONTROL = re.compile(
-    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"  # colours and the like (ECMA-48, CSI)
-    r"|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)"  # titles of windows (OSC)
-    r"|[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # any other control character but tab and new line
-)
-
-
-def readable(text: str) -> str:
-    """``text`` without what only a terminal obeys, and without white space around it: PX4 ends texts with a tab."""
+def clean_text(text: str) -> str:
+    """Remove terminal control sequences and surrounding white space; PX4 ends texts with a tab."""
     return _CONTROL.sub("", text).strip()

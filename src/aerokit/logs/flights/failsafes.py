@@ -1,4 +1,4 @@
-"""Which failsafes acted in a flight, and what led to each: by texts, modes, errors, flags, and values before."""
+"""Detection of failsafes in a flight, from texts, modes, errors and flags, with the values before them."""
 
 from __future__ import annotations
 
@@ -7,43 +7,41 @@ import re
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
-from aerokit.logs.flights.columns import Plane
-from aerokit.logs.flights.flight import Sign
+from aerokit.logs.flights.flight import FailsafeEvidence, TangentPlane
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from aerokit.logs.flights.columns import Columns
-    from aerokit.logs.flights.flight import Flight, ModeChange, Said
+    from aerokit.logs.flights.flight import FlightLog, LoggedText, ModeChange, TimeSeries
 
-_TOGETHER_S = 8.0
-"""Signs of one kind that follow each other so soon are of one failsafe."""
-_BESIDE_S = 3.0
-"""A general sign so near to a special one is of the same failsafe."""
-_REACTION_S = 12.0
-_BEFORE_S = 10.0
-_AT_ONCE_S = 3.0
+# Evidence of one kind within this time is one failsafe.
+_SAME_KIND_GAP_S = 8.0
+# General evidence within this time of specific evidence is the same failsafe.
+_GENERAL_GAP_S = 3.0
+_REACTION_TIMEOUT_S = 12.0
+_CONTEXT_S = 10.0
+_IMMEDIATE_S = 3.0
+# Kinds for which autopilots disarm.
 _DISARMING = frozenset(("crash", "thrust", "motor", "termination"))
-"""What autopilots disarm for."""
 
 
 class Failsafe(Snapshot):
-    """One failsafe, or one thing that was wrong and nothing was done about."""
+    """A failsafe, or a problem without a known reaction."""
 
     time_s: float
     kind: str
     """A key of `KINDS`."""
     acted: bool
-    """Whether the autopilot did something: changed the mode, disarmed, or says so."""
-    signs: tuple[Sign, ...]
+    """True if the autopilot changed the mode, disarmed, or reported an action."""
+    evidence: tuple[FailsafeEvidence, ...]
     reaction: str
-    """What the autopilot did, in words."""
-    led_to: tuple[str, ...]
-    """What was measured before it, and the limits that are set, in words."""
+    """Description of the autopilot's reaction."""
+    context: tuple[str, ...]
+    """Descriptions of values before the failsafe, and of configured limits."""
 
     @property
     def title(self) -> str:
-        """The kind in words."""
+        """Title of the kind."""
         return KINDS[self.kind]
 
 
@@ -52,7 +50,7 @@ KINDS = {
     "fence": "Fence",
     "radio": "Radio control lost",
     "ground station": "Ground station lost",
-    "estimator": "Estimator of position or attitude",
+    "estimator": "Position or attitude estimator",
     "gps": "Satellite receiver",
     "compass": "Compass",
     "vibration": "Vibration",
@@ -61,21 +59,21 @@ KINDS = {
     "motor": "Motor failure",
     "terrain": "Terrain data",
     "avoidance": "Avoidance",
-    "offboard": "Set-points of the program lost",
+    "offboard": "Offboard set-points lost",
     "mission": "Mission",
-    "mode": "Change of the mode refused",
+    "mode": "Mode change refused",
     "take-off": "Take-off",
     "transition": "Transition",
     "termination": "Termination",
     "leak": "Leak",
     "depth": "Depth",
     "wind": "Wind",
-    "time": "Time in the air",
+    "time": "Flight time limit",
     "general": "Failsafe",
 }
-"""Kinds of failsafes, and what a report calls them."""
+"""Kind of failsafe → title in reports."""
 
-_NO_SIGN = re.compile(
+_NO_EVIDENCE = re.compile(
     r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|arming|re-?gained|recovered|restored|compensation off"
     r"|connection .*established|fence enabled|fence disabled",
     re.I,
@@ -105,10 +103,9 @@ _TEXTS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
         (r"fail-?safe", "general"),
     )
 )  # fmt: skip
-_ACTION = re.compile(
-    r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I
-)
+_ACTION = re.compile(r"failsafe activated|changed to|switch|fail-?safe.*[-:] *(rtl|land|hold|brake|disarm)", re.I)
 
+# Parameters that define when a failsafe triggers, and its action.
 _LIMITS: dict[str, tuple[str, ...]] = {
     "battery": (
         *("BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_MAH", "BATT_CRT_MAH", "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"),
@@ -127,89 +124,85 @@ _LIMITS: dict[str, tuple[str, ...]] = {
     "crash": ("FS_CRASH_CHECK", "FD_FAIL_R", "FD_FAIL_P"),
     "offboard": ("COM_OF_LOSS_T", "COM_OBL_RC_ACT"),
 }  # fmt: skip
-"""The parameters that say when a failsafe acts, and what it does."""
 
 
-def signs_of_texts(texts: Iterable[Said]) -> list[Sign]:
-    """What texts say of failsafes."""
+def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
+    """Return the failsafe evidence in texts."""
     found = []
-    for said in texts:
-        if _NO_SIGN.search(said.text) is None:
-            kind = next((kind for pattern, kind in _TEXTS if pattern.search(said.text)), None)
+    for text in texts:
+        if _NO_EVIDENCE.search(text.text) is None:
+            kind = next((kind for pattern, kind in _TEXTS if pattern.search(text.text)), None)
             if kind is not None:
-                found.append(Sign(said.time_s, kind, f"said: {said.text}", bool(_ACTION.search(said.text))))
+                is_action = bool(_ACTION.search(text.text))
+                found.append(FailsafeEvidence(text.time_s, kind, f"text: {text.text}", is_action))
     return found
 
 
-def failsafes(flight: Flight) -> list[Failsafe]:
-    """The failsafes of a flight, oldest first: what was wrong while the vehicle was armed."""
-    groups: list[list[Sign]] = []
-    for sign in flight.signs:
-        if not any(begin - 1 <= sign.time_s <= end + 2 for begin, end in flight.armed):
+def failsafes(flight: FlightLog) -> list[Failsafe]:
+    """Return the failsafes and problems while the vehicle was armed, the oldest first."""
+    groups: list[list[FailsafeEvidence]] = []
+    for evidence in flight.failsafe_evidence:
+        if not any(begin - 1 <= evidence.time_s <= end + 2 for begin, end in flight.armed):
             continue
-        group = next((each for each in reversed(groups) if _belongs(sign, each)), None)
+        group = next((group for group in reversed(groups) if _belongs(evidence, group)), None)
         if group is None:
-            groups.append([sign])
+            groups.append([evidence])
         else:
-            group.append(sign)
-    return [_explained(flight, group) for group in groups]
+            group.append(evidence)
+    return [_explain(flight, group) for group in groups]
 
 
-def _belongs(sign: Sign, group: Sequence[Sign]) -> bool:
-    kind, gap = _kind(group), sign.time_s - group[-1].time_s
-    if "general" in (kind, sign.kind):
-        return gap <= _BESIDE_S
-    return kind == sign.kind and gap <= _TOGETHER_S
+def _belongs(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
+    kind, gap = _kind(group), evidence.time_s - group[-1].time_s
+    if "general" in (kind, evidence.kind):
+        return gap <= _GENERAL_GAP_S
+    return kind == evidence.kind and gap <= _SAME_KIND_GAP_S
 
 
-def _kind(group: Sequence[Sign]) -> str:
-    return next((sign.kind for sign in group if sign.kind != "general"), "general")
+def _kind(group: Sequence[FailsafeEvidence]) -> str:
+    return next((evidence.kind for evidence in group if evidence.kind != "general"), "general")
 
 
-def _explained(flight: Flight, group: Sequence[Sign]) -> Failsafe:
+def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence]) -> Failsafe:
     kind, time_s = _kind(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
-    acted = is_sure or any(sign.is_action for sign in group)
-    facts = [*_where(flight, time_s), *_MEASURED.get(kind, _of_everything)(flight, time_s)]
+    acted = is_sure or any(evidence.is_action for evidence in group)
+    facts = [*_location(flight, time_s), *_CONTEXTS.get(kind, _general_context)(flight, time_s)]
     facts += _limits(flight, kind, time_s)
     facts += _texts_before(flight, time_s)
-    return Failsafe(
-        time_s, kind, acted, tuple(group), reaction or "no change of the mode followed", tuple(facts)
-    )
+    return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
 
 
-def _reaction(flight: Flight, time_s: float, group: Sequence[Sign]) -> tuple[str, bool]:
-    """The first change of the mode that nobody ordered, or disarming; whether that was the autopilot's doing.
+def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
+    """Return the first mode change that was not commanded, or disarming, and True if the autopilot caused it.
 
-    Where a log does not tell who it was, what comes at once is taken for its doing; later it may have been a pilot.
+    If the log does not contain the cause, an immediate change is attributed to the autopilot; a later one may
+    be the pilot's.
     """
     last = group[-1].time_s
     for change in flight.modes:
-        if time_s - 2.5 <= change.time_s <= last + _REACTION_S and change.by_autopilot is not False:
+        if time_s - 2.5 <= change.time_s <= last + _REACTION_TIMEOUT_S and change.by_autopilot is not False:
             before = flight.mode_at(change.time_s - 1e-6)
             if before:
-                is_sure = change.by_autopilot is True or change.time_s - last <= _AT_ONCE_S
-                who = "" if is_sure else "; the log does not tell by whom"
-                return _told(change, before, time_s) + who, is_sure
+                is_sure = change.by_autopilot is True or change.time_s - last <= _IMMEDIATE_S
+                cause = "" if is_sure else "; cause not logged"
+                return _mode_change_text(change, before, time_s) + cause, is_sure
     ended = next((end for _, end in flight.armed if time_s - 0.5 <= end <= last + 3), None)
     if ended is not None and ended < flight.duration_s:
         is_sure = _kind(group) in _DISARMING
-        who = "" if is_sure else "; the log does not tell by whom"
-        return f"disarmed {max(ended - time_s, 0):.1f} s later{who}", is_sure
+        cause = "" if is_sure else "; cause not logged"
+        return f"disarmed {max(ended - time_s, 0):.1f} s later{cause}", is_sure
     return "", False
 
 
-def _told(change: ModeChange, before: str, time_s: float) -> str:
+def _mode_change_text(change: ModeChange, before: str, time_s: float) -> str:
     after = change.time_s - time_s
-    when = "at once" if after < 0.5 else f"{after:.1f} s later"
+    when = "immediately" if after < 0.5 else f"{after:.1f} s later"
     reason = f" ({change.reason})" if change.reason else ""
     return f"mode {before} → {change.name} {when}{reason}"
 
 
-# ------------------------------------------------------------------------------------ what led to it
-
-
-def _where(flight: Flight, time_s: float) -> list[str]:
+def _location(flight: FlightLog, time_s: float) -> list[str]:
     track, facts = flight.track, []
     height = track.at("altitude_relative_m", time_s)
     if height == height:
@@ -221,76 +214,74 @@ def _where(flight: Flight, time_s: float) -> list[str]:
     return [", ".join([*facts, *([f"in {mode}"] if mode else [])])] if facts or mode else []
 
 
-def distance_from_home_m(flight: Flight, time_s: float) -> float | None:
-    """Along the ground at that time; None when it is not known."""
-    place = flight.track.at("latitude_deg", time_s), flight.track.at("longitude_deg", time_s)
-    if flight.home is None or math.isnan(place[0]):
+def distance_from_home_m(flight: FlightLog, time_s: float) -> float | None:
+    """Return the horizontal distance from home at this time; None if unknown."""
+    position = flight.track.at("latitude_deg", time_s), flight.track.at("longitude_deg", time_s)
+    if flight.home is None or math.isnan(position[0]):
         return None
-    return math.hypot(*Plane(flight.home.latitude_deg, flight.home.longitude_deg).metres(*place))
+    return math.hypot(*TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg).metres(*position))
 
 
-def _of_battery(flight: Flight, time_s: float) -> list[str]:
+def _battery_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for number, battery in sorted(flight.batteries.items()):
         now, before = battery.at("voltage_v", time_s), battery.at("voltage_v", time_s - 60, not_older_s=30)
         if now != now:
             continue
-        told = f"battery {number + 1}: {now:.2f} V"
+        text = f"battery {number + 1}: {now:.2f} V"
         if before == before:
-            told += f", {before:.2f} V a minute before"
+            text += f", {before:.2f} V one minute before"
         for name, form in (
             ("current_a", "{:.1f} A"),
             ("remaining_percent", "{:.0f} % left"),
             ("used_mah", "{:.0f} mAh used"),
         ):
             value = battery.at(name, time_s)
-            told += f", {form.format(value)}" if value == value else ""
-        facts.append(told)
+            text += f", {form.format(value)}" if value == value else ""
+        facts.append(text)
     return facts
 
 
-def _of_fence(flight: Flight, time_s: float) -> list[str]:
+def _fence_context(flight: FlightLog, time_s: float) -> list[str]:
     track = flight.velocity
     climb = -track.at("down_m_s", time_s)
     speed = math.hypot(track.at("north_m_s", time_s), track.at("east_m_s", time_s))
     return [f"moving at {speed:.1f} m/s, climbing at {climb:.1f} m/s"] if speed == speed else []
 
 
-def _of_estimator(flight: Flight, time_s: float) -> list[str]:
-    highest = {name: _most(flight.estimator, name, time_s) for name in flight.estimator}
-    told = [f"{name.replace('_', ' ')} {value:.2f}" for name, value in highest.items() if value is not None]
+def _estimator_context(flight: FlightLog, time_s: float) -> list[str]:
+    maxima = {name: _max_before(flight.estimator, name, time_s) for name in flight.estimator}
+    known = [f"{name.replace('_', ' ')} {value:.2f}" for name, value in maxima.items() if value is not None]
     facts = (
-        [f"worst ratios in the {_BEFORE_S:.0f} s before (1 is not believed): {', '.join(told)}"]
-        if told
-        else []
+        [f"highest ratios in the {_CONTEXT_S:.0f} s before (above 1: rejected): {', '.join(known)}"] if known else []
     )
-    return facts + _of_gps(flight, time_s) + _of_vibration(flight, time_s)
+    return facts + _gps_context(flight, time_s) + _vibration_context(flight, time_s)
 
 
-def _of_gps(flight: Flight, time_s: float) -> list[str]:
+def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for number, gps in sorted(flight.gps.items()):
         satellites, fix = gps.at("satellites", time_s), gps.at("fix_type", time_s)
-        before = gps.at("satellites", time_s - _BEFORE_S)
+        before = gps.at("satellites", time_s - _CONTEXT_S)
         if satellites == satellites or fix == fix:
-            told = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix:.0f}"
+            text = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix:.0f}"
             hdop = gps.at("hdop", time_s)
-            told += f", HDOP {hdop:.1f}" if hdop == hdop else ""
-            told += f"; {before:.0f} satellites {_BEFORE_S:.0f} s before" if before == before else ""
-            facts.append(told)
+            text += f", HDOP {hdop:.1f}" if hdop == hdop else ""
+            text += f"; {before:.0f} satellites {_CONTEXT_S:.0f} s before" if before == before else ""
+            facts.append(text)
     return facts
 
 
-def _of_vibration(flight: Flight, time_s: float) -> list[str]:
-    levels = [_most(flight.vibration, f"{axis}_m_s2", time_s) for axis in "xyz"]
+def _vibration_context(flight: FlightLog, time_s: float) -> list[str]:
+    levels = [_max_before(flight.vibration, f"{axis}_m_s2", time_s) for axis in "xyz"]
     known = [level for level in levels if level is not None]
-    return [f"vibration up to {max(known):.0f} m/s² in the {_BEFORE_S:.0f} s before"] if known else []
+    return [f"vibration up to {max(known):.0f} m/s² in the {_CONTEXT_S:.0f} s before"] if known else []
 
 
-def _of_link(flight: Flight, time_s: float) -> list[str]:
-    lost, facts = _most(flight.link, "lost_percent", time_s), []
+def _link_context(flight: FlightLog, time_s: float) -> list[str]:
+    lost, facts = _max_before(flight.link, "lost_percent", time_s), []
     if lost is not None:
-        facts.append(f"up to {lost:.0f} % of the messages lost in the {_BEFORE_S:.0f} s before")
+        facts.append(f"up to {lost:.0f} % of the messages lost in the {_CONTEXT_S:.0f} s before")
     for name in ("rssi", "remote_rssi"):
         value = flight.radio.at(name, time_s)
         if value == value:
@@ -298,67 +289,67 @@ def _of_link(flight: Flight, time_s: float) -> list[str]:
     return facts
 
 
-def _of_station(flight: Flight, time_s: float) -> list[str]:
-    heard = [each for each in flight.station if each <= time_s]
-    if not heard:
-        return _of_link(flight, time_s)
-    told = f"the last heartbeat of a ground station in the log came {time_s - heard[-1]:.1f} s before"
-    return [told, *_of_link(flight, time_s)]
+def _ground_station_context(flight: FlightLog, time_s: float) -> list[str]:
+    heartbeats = [heartbeat for heartbeat in flight.gcs_heartbeats if heartbeat <= time_s]
+    if not heartbeats:
+        return _link_context(flight, time_s)
+    text = f"last logged ground station heartbeat {time_s - heartbeats[-1]:.1f} s before"
+    return [text, *_link_context(flight, time_s)]
 
 
-def _of_attitude(flight: Flight, time_s: float) -> list[str]:
+def _attitude_context(flight: FlightLog, time_s: float) -> list[str]:
     facts = []
     for name in ("roll_deg", "pitch_deg"):
-        flown = flight.attitude.between(name, time_s - 3, time_s)
-        if len(flown):
-            most = max(flown, key=abs)
-            wanted = flight.attitude_target.at(name, time_s, not_older_s=2)
-            told = f"{name[:-4]} up to {most:.0f}° in the 3 s before"
-            facts.append(told + (f", {wanted:.0f}° was wanted" if wanted == wanted else ""))
-    return facts + _of_vibration(flight, time_s)
+        angles = flight.attitude.between(name, time_s - 3, time_s)
+        if len(angles):
+            maximum = max(angles, key=abs)
+            setpoint = flight.attitude_target.at(name, time_s, not_older_s=2)
+            text = f"{name[:-4]} up to {maximum:.0f}° in the 3 s before"
+            facts.append(text + (f", set-point {setpoint:.0f}°" if setpoint == setpoint else ""))
+    return facts + _vibration_context(flight, time_s)
 
 
-def _of_offboard(flight: Flight, time_s: float) -> list[str]:
+def _offboard_context(flight: FlightLog, time_s: float) -> list[str]:
     ages = [
         time_s - columns.times[row]
         for columns in (flight.position_target, flight.velocity_target)
         if (row := columns.index_at(time_s)) >= 0
     ]
-    return [f"the last set-point that the log has came {min(ages):.1f} s before"] if ages else []
+    return [f"last logged set-point {min(ages):.1f} s before"] if ages else []
 
 
-def _of_everything(flight: Flight, time_s: float) -> list[str]:
-    return [*_of_battery(flight, time_s), *_of_gps(flight, time_s), *_of_link(flight, time_s)]
+def _general_context(flight: FlightLog, time_s: float) -> list[str]:
+    return [*_battery_context(flight, time_s), *_gps_context(flight, time_s), *_link_context(flight, time_s)]
 
 
-_MEASURED: dict[str, Callable[[Flight, float], list[str]]] = {
-    "battery": _of_battery,
-    "fence": _of_fence,
-    "radio": _of_link,
-    "ground station": _of_station,
-    "estimator": _of_estimator,
-    "gps": _of_gps,
-    "compass": _of_estimator,
-    "vibration": _of_vibration,
-    "crash": _of_attitude,
-    "thrust": _of_attitude,
-    "motor": _of_attitude,
-    "offboard": _of_offboard,
+_CONTEXTS: dict[str, Callable[[FlightLog, float], list[str]]] = {
+    "battery": _battery_context,
+    "fence": _fence_context,
+    "radio": _link_context,
+    "ground station": _ground_station_context,
+    "estimator": _estimator_context,
+    "gps": _gps_context,
+    "compass": _estimator_context,
+    "vibration": _vibration_context,
+    "crash": _attitude_context,
+    "thrust": _attitude_context,
+    "motor": _attitude_context,
+    "offboard": _offboard_context,
     "mode": lambda flight, time_s: [],
 }
 
 
-def _most(columns: Columns, name: str, time_s: float) -> float | None:
-    values = columns.between(name, time_s - _BEFORE_S, time_s)
+def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
+    values = columns.between(name, time_s - _CONTEXT_S, time_s)
     return max(values) if len(values) else None
 
 
-def _limits(flight: Flight, kind: str, time_s: float) -> list[str]:
+def _limits(flight: FlightLog, kind: str, time_s: float) -> list[str]:
     values = ((name, flight.parameter_at(name, time_s)) for name in _LIMITS.get(kind, ()))
-    told = [f"{name} = {value:g}" for name, value in values if value == value]
-    return [f"set: {', '.join(told)}"] if told else []
+    known = [f"{name} = {value:g}" for name, value in values if value == value]
+    return [f"parameters: {', '.join(known)}"] if known else []
 
 
-def _texts_before(flight: Flight, time_s: float) -> list[str]:
-    said = [each for each in flight.texts if time_s - 15 <= each.time_s < time_s - 0.05]
-    return [f"{time_s - each.time_s:.1f} s before it said: {each.text}" for each in said[-4:]]
+def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
+    texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
+    return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]

@@ -1,45 +1,142 @@
-"""``Flight``: what a log tells of a flight, in one shape, whoever wrote the log."""
+"""``FlightLog``: the content of a flight log, independent of its format."""
 
 from __future__ import annotations
 
 import math
 from array import array
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from aerokit._internal import geo
 from aerokit._internal.values import Snapshot
-from aerokit.logs.flights.columns import Columns
 from aerokit.position import Position
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
-
 
 _HOME_AFTER_ARMING_S = 2.0
 
 
+class TimeSeries:
+    """Columns of numbers with times, the oldest first. NaN is unknown.
+
+    ``series["roll_deg"]`` is a column; names contain the units. ``len(series)`` is the number of rows.
+    """
+
+    def __init__(self, *names: str) -> None:
+        self.names: tuple[str, ...] = names
+        """Names of the columns."""
+        self.times: array[float] = array("d")
+        """Seconds since the start of the log."""
+        self._values = {name: array("d") for name in names}
+        self._rows = tuple(self._values.values())
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, name: str) -> array[float]:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __repr__(self) -> str:
+        return f"<TimeSeries {', '.join(self.names)}: {len(self)} rows>"
+
+    def add(self, time_s: float, *values: float) -> None:
+        """Add a row with one value for each column. A row older than the last one gets the time of the last one."""
+        times = self.times
+        if times and time_s < times[-1]:
+            time_s = times[-1]
+        times.append(time_s)
+        for column, value in zip(self._rows, values):  # noqa: B905 - equal lengths; strict= is slow, and this runs millions of times
+            column.append(value)
+
+    def extend(self, times: Sequence[float], **columns: Sequence[float]) -> None:
+        """Add many rows; columns that are not given are NaN."""
+        self.times.extend(times)
+        missing = array("d", [_NAN]) * len(times)
+        for name, column in self._values.items():
+            column.extend(columns.get(name, missing))
+
+    def has(self, *names: str) -> bool:
+        """Return True if any of these columns (all by default) has a known value."""
+        return any(value == value for name in names or self.names for value in self._values[name])
+
+    def index_at(self, time_s: float) -> int:
+        """Return the index of the last row at or before this time; -1 if there is none."""
+        return bisect_right(self.times, time_s) - 1
+
+    def at(self, name: str, time_s: float, *, not_older_s: float = 10.0) -> float:
+        """Return the last known value at this time; NaN if it is older than ``not_older_s``."""
+        column, index = self._values[name], self.index_at(time_s)
+        while index >= 0 and self.times[index] >= time_s - not_older_s:
+            if column[index] == column[index]:
+                return column[index]
+            index -= 1
+        return _NAN
+
+    def known(self, name: str) -> array[float]:
+        """Return the known values of a column."""
+        return array("d", (value for value in self._values[name] if value == value))
+
+    def between(self, name: str, start_s: float, end_s: float) -> array[float]:
+        """Return the known values of a column in a time span, both ends included."""
+        part = self._values[name][bisect_left(self.times, start_s) : self.index_at(end_s) + 1]
+        return array("d", (value for value in part if value == value))
+
+
+class TangentPlane:
+    """A plane that touches the ellipsoid at a position; accurate to a metre within some kilometres."""
+
+    def __init__(self, latitude_deg: float, longitude_deg: float) -> None:
+        self.latitude_deg: float = latitude_deg
+        self.longitude_deg: float = longitude_deg
+        middle = max(-89.9, min(89.9, latitude_deg))
+        north = geo.distance_m(middle - 0.005, longitude_deg, middle + 0.005, longitude_deg)
+        east = geo.distance_m(middle, longitude_deg - 0.005, middle, longitude_deg + 0.005)
+        self.north_m_per_deg: float = north * 100
+        self.east_m_per_deg: float = east * 100
+
+    def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """Return metres north and east of the origin; NaN for NaN."""
+        east = longitude_deg - self.longitude_deg
+        if not -180.0 <= east < 180.0 and math.isfinite(east):
+            east = geo.wrap_longitude(east)
+        return (latitude_deg - self.latitude_deg) * self.north_m_per_deg, east * self.east_m_per_deg
+
+    def degrees(self, north_m: float, east_m: float) -> tuple[float, float]:
+        """Return latitude and longitude at an offset from the origin."""
+        return (
+            self.latitude_deg + north_m / self.north_m_per_deg,
+            self.longitude_deg + east_m / self.east_m_per_deg,
+        )
+
+
 class ModeChange(Snapshot):
-    """The mode from then on."""
+    """A change to a mode."""
 
     time_s: float
     name: str
     reason: str = ""
-    """Why, as far as the log tells it: ``"battery failsafe"``."""
+    """The reason, if the log contains it: ``"battery failsafe"``."""
     by_autopilot: bool | None = None
-    """Whether the autopilot changed it by itself; None: the log does not tell."""
+    """True if the autopilot changed the mode itself; None if the log does not contain this."""
 
 
-class Said(Snapshot):
+class LoggedText(Snapshot):
     """A status text."""
 
     time_s: float
     severity: int | None
-    """MAV_SEVERITY: 0 is an emergency, 7 is for debugging; None: not known, as in a ``.bin``."""
+    """MAV_SEVERITY, from 0 (emergency) to 7 (debug); None if unknown, as in a ``.bin``."""
     text: str
 
 
 class ParameterChange(Snapshot):
-    """A parameter that was changed during the log."""
+    """A change of a parameter during the log."""
 
     time_s: float
     name: str
@@ -48,158 +145,154 @@ class ParameterChange(Snapshot):
 
 
 class Waypoint(Snapshot):
-    """An item of the mission."""
+    """A mission item."""
 
     number: int
     command: int
     """MAV_CMD."""
     latitude_deg: float
-    """NaN for items without a place, as the others are."""
+    """NaN for items without a position."""
     longitude_deg: float
     altitude_m: float
     frame: int
-    """MAV_FRAME, which says what the altitude is above."""
+    """MAV_FRAME; defines the reference of the altitude."""
 
 
-class Sign(Snapshot):
-    """Something that says that a failsafe acted, or that something was wrong."""
+class FailsafeEvidence(Snapshot):
+    """A log entry that indicates a failsafe or a problem."""
 
     time_s: float
     kind: str
     """A key of `aerokit.logs.flights.failsafes.KINDS`: ``"battery"``, ``"fence"`` …"""
     text: str
-    """What the log says."""
+    """Description, from the log."""
     is_action: bool = False
-    """Whether it says that the autopilot acted, and not just that something was wrong."""
+    """True if the entry shows that the autopilot acted."""
 
 
 @dataclass(slots=True)
-class Flight:
-    """A flight as columns and lists. Times are seconds since ``begins_at``. What the log does not tell is empty."""
+class FlightLog:
+    """One flight: time series and lists. Times are seconds since ``begins_at``. What the log does not contain is
+    empty.
+    """
 
     path: Path
-    """The log."""
+    """Path of the log."""
     begins_at: float = 0.0
-    """UTC of the first entry, seconds since 1970; below a year where no clock told it."""
+    """UTC of the first entry, in seconds since 1970; less than a year if no clock was set."""
     ends_at: float = 0.0
     """UTC of the last entry."""
     vehicle: str = ""
-    """Firmware with its version, as far as known: ``"ArduCopter V4.5.7"``."""
+    """Firmware and its version, if known: ``"ArduCopter V4.5.7"``."""
     autopilot: str = ""
     """``"ArduPilot"``, ``"PX4"``."""
     system_id: int = 1
     home: Position | None = None
-    """Of the first flight in the log, as the vehicle told it; else where it was first armed."""
-    track: Columns = field(
-        default_factory=lambda: Columns(
-            "latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m"
-        )
+    """Home of the first flight in the log; if not logged, the position where it was first armed."""
+    track: TimeSeries = field(
+        default_factory=lambda: TimeSeries("latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m")
     )
-    velocity: Columns = field(default_factory=lambda: Columns("north_m_s", "east_m_s", "down_m_s"))
-    attitude: Columns = field(default_factory=lambda: Columns("roll_deg", "pitch_deg", "yaw_deg"))
-    air: Columns = field(default_factory=lambda: Columns("air_speed_m_s", "throttle_percent"))
-    position_target: Columns = field(
-        default_factory=lambda: Columns(
-            "latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m"
-        )
+    velocity: TimeSeries = field(default_factory=lambda: TimeSeries("north_m_s", "east_m_s", "down_m_s"))
+    attitude: TimeSeries = field(default_factory=lambda: TimeSeries("roll_deg", "pitch_deg", "yaw_deg"))
+    air: TimeSeries = field(default_factory=lambda: TimeSeries("air_speed_m_s", "throttle_percent"))
+    position_target: TimeSeries = field(
+        default_factory=lambda: TimeSeries("latitude_deg", "longitude_deg", "altitude_amsl_m", "altitude_relative_m")
     )
-    """Where it was to be."""
-    velocity_target: Columns = field(default_factory=lambda: Columns("north_m_s", "east_m_s", "down_m_s"))
-    attitude_target: Columns = field(default_factory=lambda: Columns("roll_deg", "pitch_deg", "yaw_deg"))
-    batteries: dict[int, Columns] = field(default_factory=dict)
-    """By number: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
-    gps: dict[int, Columns] = field(default_factory=dict)
-    """By number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
-    vibration: Columns = field(default_factory=lambda: Columns("x_m_s2", "y_m_s2", "z_m_s2", "clips"))
-    """Levels, and how often an accelerometer reached its limit; of PX4, which has one level, as ``x_m_s2``."""
-    estimator: Columns = field(
-        default_factory=lambda: Columns(
+    """Position set-points."""
+    velocity_target: TimeSeries = field(default_factory=lambda: TimeSeries("north_m_s", "east_m_s", "down_m_s"))
+    attitude_target: TimeSeries = field(default_factory=lambda: TimeSeries("roll_deg", "pitch_deg", "yaw_deg"))
+    batteries: dict[int, TimeSeries] = field(default_factory=dict)
+    """By battery number: ``voltage_v``, ``current_a``, ``used_mah``, ``remaining_percent``."""
+    gps: dict[int, TimeSeries] = field(default_factory=dict)
+    """By receiver number: ``fix_type`` (GPS_FIX_TYPE), ``satellites``, ``hdop``, ``accuracy_m``."""
+    vibration: TimeSeries = field(default_factory=lambda: TimeSeries("x_m_s2", "y_m_s2", "z_m_s2", "clips"))
+    """Vibration levels, and the count of accelerometer clipping. PX4 logs one level, stored as ``x_m_s2``."""
+    estimator: TimeSeries = field(
+        default_factory=lambda: TimeSeries(
             "velocity", "horizontal_position", "vertical_position", "compass", "height_or_airspeed"
         )
     )
-    """How far measurements are from what the estimator expects: above 1 they are not believed."""
-    link: Columns = field(default_factory=lambda: Columns("lost_percent", "received_hz"))
-    """Each second: of what the other side sent, how much never came."""
-    radio: Columns = field(default_factory=lambda: Columns("rssi", "remote_rssi", "noise", "remote_noise"))
+    """Innovation test ratios: above 1, the estimator rejects the measurement."""
+    link: TimeSeries = field(default_factory=lambda: TimeSeries("lost_percent", "received_hz"))
+    """For each second: the percentage of lost messages, and the rate of received ones."""
+    radio: TimeSeries = field(default_factory=lambda: TimeSeries("rssi", "remote_rssi", "noise", "remote_noise"))
     """In the radio's own units."""
-    station: array[float] = field(default_factory=lambda: array("d"))
-    """When a ground station sent a heartbeat, as far as a ``.tlog`` has what was sent."""
+    gcs_heartbeats: array[float] = field(default_factory=lambda: array("d"))
+    """Times of ground station heartbeats; only in a ``.tlog`` that includes sent messages."""
     modes: list[ModeChange] = field(default_factory=list)
     armed: list[tuple[float, float]] = field(default_factory=list)
-    """Begin and end of each span in which it was armed."""
-    texts: list[Said] = field(default_factory=list)
-    signs: list[Sign] = field(default_factory=list)
-    """What `aerokit.logs.flights.failsafes.failsafes` judges."""
+    """Start and end of each span in which the vehicle was armed."""
+    texts: list[LoggedText] = field(default_factory=list)
+    failsafe_evidence: list[FailsafeEvidence] = field(default_factory=list)
+    """Input of `aerokit.logs.flights.failsafes.failsafes`."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """As they were first told."""
+    """First logged value of each parameter."""
     parameter_changes: list[ParameterChange] = field(default_factory=list)
     mission: list[Waypoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    """What was wrong with the log, or is missing for a reason that is known."""
+    """Problems with the log, and known reasons for missing data."""
     _latest: dict[str, float] = field(default_factory=dict, repr=False)
 
     @property
     def duration_s(self) -> float:
-        """From the first entry to the last."""
+        """Seconds from the first entry to the last."""
         return max(self.ends_at - self.begins_at, 0.0)
 
-    def battery(self, number: int) -> Columns:
-        """The columns of a battery, made when first asked for."""
+    def battery(self, number: int) -> TimeSeries:
+        """Return the time series of a battery; created on first use."""
         if number not in self.batteries:
-            self.batteries[number] = Columns("voltage_v", "current_a", "used_mah", "remaining_percent")
+            self.batteries[number] = TimeSeries("voltage_v", "current_a", "used_mah", "remaining_percent")
         return self.batteries[number]
 
-    def receiver(self, number: int) -> Columns:
-        """The columns of a satellite receiver, made when first asked for."""
+    def receiver(self, number: int) -> TimeSeries:
+        """Return the time series of a GNSS receiver; created on first use."""
         if number not in self.gps:
-            self.gps[number] = Columns("fix_type", "satellites", "hdop", "accuracy_m")
+            self.gps[number] = TimeSeries("fix_type", "satellites", "hdop", "accuracy_m")
         return self.gps[number]
 
     def mode_at(self, time_s: float) -> str:
-        """The mode at that time, empty when it is not known."""
+        """Return the mode at this time; empty if unknown."""
         return next((change.name for change in reversed(self.modes) if change.time_s <= time_s), "")
 
     def mode_spans(self) -> list[tuple[ModeChange, float]]:
-        """Each mode, and when it ended."""
+        """Return each mode change with its end."""
         ends = [change.time_s for change in self.modes[1:]] + [self.duration_s]
-        return list(zip(self.modes, ends))  # noqa: B905 - no mode, no end
+        return list(zip(self.modes, ends))  # noqa: B905 - without modes, there is one end too many
 
     def parameter_at(self, name: str, time_s: float) -> float:
-        """The value of a parameter at that time, NaN when it is not known."""
+        """Return the value of a parameter at this time; NaN if unknown."""
         value = self.parameters.get(name, math.nan)
         for change in self.parameter_changes:
             if change.name == name and change.time_s <= time_s:
                 value = change.after
         return value
 
-    # ------------------------------------------------------------------------- used while a log is read
-
-    def note_mode(self, time_s: float, name: str, reason: str = "", by_autopilot: bool | None = None) -> bool:
-        """Take the mode that was told; whether it is another one than before."""
+    def add_mode(self, time_s: float, name: str, reason: str = "", by_autopilot: bool | None = None) -> bool:
+        """Record a mode. Return False if it is the current one."""
         if self.modes and self.modes[-1].name == name:
             return False
         self.modes.append(ModeChange(time_s, name, reason, by_autopilot))
         return True
 
-    def note_armed(self, time_s: float, armed: bool) -> None:
-        """Take what was told; a span that is not over ends at infinity until then."""
+    def set_armed(self, time_s: float, armed: bool) -> None:
+        """Record the arming state. The end of an open span is infinity."""
         is_open = bool(self.armed) and math.isinf(self.armed[-1][1])
         if armed and not is_open:
             self.armed.append((time_s, math.inf))
         elif not armed and is_open:
             self.armed[-1] = (self.armed[-1][0], time_s)
 
-    def note_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Take what was told. The first flight's counts: while it is disarmed, ArduPilot's home goes along."""
-        is_place = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
-        if not is_place:  # NaN is none, either
+    def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
+        """Record home. Only that of the first flight is kept: ArduPilot moves home along while disarmed."""
+        is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
+        if not is_valid:  # also for NaN
             return
         home = Position(latitude_deg, longitude_deg, amsl_m if math.isfinite(amsl_m) else None)
         if self.home is None or not self.armed or time_s <= self.armed[0][0] + _HOME_AFTER_ARMING_S:
             self.home = home
 
-    def note_parameter(self, time_s: float, name: str, value: float) -> None:
-        """Take a value that was told: the first one, or a change."""
+    def set_parameter(self, time_s: float, name: str, value: float) -> None:
+        """Record the first value of a parameter, or a change."""
         before = self._latest.get(name)
         self._latest[name] = value
         if name not in self.parameters:
@@ -208,3 +301,6 @@ class Flight:
         before = self.parameters[name] if before is None else before
         if value != before and not (math.isnan(value) and math.isnan(before)):
             self.parameter_changes.append(ParameterChange(time_s, name, before, value))
+
+
+_NAN = math.nan

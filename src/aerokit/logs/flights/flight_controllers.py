@@ -1,4 +1,4 @@
-"""The logs that flight controllers write themselves: ``.bin`` of ArduPilot, ``.ulg`` of PX4."""
+"""Readers of flight controllers' own logs: ``.bin`` of ArduPilot, ``.ulg`` of PX4."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import readable
-from aerokit.logs.flights.entries import Column, Entry, Log, unit_suffix
+from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.from_ulog import utc_at_boot
+from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, unit_suffix
 from aerokit.position import Position
 from aerokit.vehicle.state.condition import StatusText
 from aerokit.vehicle.state.equipment import Battery
@@ -24,71 +25,65 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAGIC = b"\xa3\x95"
+_TAIL = 4096  # at power-off the last rows are incomplete
+_NO_UTC = "no GNSS time in the log: times count from power-on, as if that were 1970"
+_A_YEAR_S = 365 * 86_400.0
+_MAX_UNIX_S = 4_102_444_800.0  # the year 2100, as for a .tlog
 
 
 def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) -> Any:
-    """A ``DFReader_binary``, to be closed by :func:`close_bin`.
+    """Return a ``DFReader_binary``; close it with :func:`close_bin`.
 
     Raises:
-        FileFormatError: it is no log of ArduPilot, or its formats are damaged.
+        FileFormatError: the file is not an ArduPilot log, or its formats are damaged.
     """
     with path.open("rb") as file:
         if file.read(2) != _MAGIC:
-            raise FileFormatError(f"{path} is no log of ArduPilot: it does not begin like one")
+            raise FileFormatError(f"{path} is not an ArduPilot log: wrong first bytes")
     kind = import_module("pymavlink.DFReader").DFReader_binary
-    reader = kind.__new__(kind)  # so that its file can be closed when it raises on damage
+    reader = kind.__new__(kind)  # without __init__, so that its file can be closed if that raises
     try:
-        with redirect_stdout(sys.stderr):  # it prints what is damaged, where our answers may go to
+        with redirect_stdout(sys.stderr):  # pymavlink prints damage to stdout, which may carry our output
             reader.__init__(str(path), progress_callback=on_percent)
-    except Exception as error:  # whatever it raises
+    except Exception as error:  # pymavlink raises arbitrary errors
         close_bin(reader)
         raise FileFormatError(f"{path} cannot be read: {error}") from None
     return reader
 
 
 def close_bin(reader: Any) -> None:
-    """Close its file."""
     for name in ("data_map", "filehandle"):
-        with suppress(AttributeError, BufferError):  # opened never, or still looked at by a traceback
+        with suppress(AttributeError, BufferError):  # never opened, or still referenced by a traceback
             getattr(reader, name).close()
 
 
 States = tuple[tuple[str, Any], ...]
 
-_TAIL = 4096  # the last row is cut off where the power was
 
-_NO_UTC = "no satellite receiver told the time: times count from the start, as if that were 1970"
+class _RowReader(LogReader):
+    """Base of readers whose records have named fields."""
 
-_A_YEAR_S = 365 * 86_400.0
-
-_LATEST_S = 4_102_444_800.0
-"""The year 2100, as for a ``.tlog``."""
-
-
-class _OwnLog(Log):
-    """Rows with names: their columns are those of the first row of a table."""
-
-    def columns(self, entry: Entry) -> list[Column]:
-        """The fields, with their units where the log tells them."""
+    def columns(self, entry: LogRecord) -> list[TableColumn]:
+        """Return the fields of the first record of a table, with units if the log has them."""
         return [
-            Column(unit_suffix(name, self._unit(entry.table, name)), name, _kind(value))
+            TableColumn(unit_suffix(name, self._unit(entry.table, name)), name, _kind(value))
             for name, value in entry.fields.items()
         ]
 
     def _unit(self, table: str, field: str) -> str:
         return ""
 
-    _left_out = 0
+    _skipped = 0
 
-    def _is_time(self, unix_s: float) -> bool:
-        """Whether a row may be that old or new; the time of a damaged one may be any number."""
-        is_time = 0 <= unix_s < _LATEST_S
-        self._left_out += not is_time
-        return is_time
+    def _is_plausible_time(self, unix_s: float) -> bool:
+        """Return False, and count the row, if a damaged row has an impossible time."""
+        is_plausible = 0 <= unix_s < _MAX_UNIX_S
+        self._skipped += not is_plausible
+        return is_plausible
 
-    def _note_left_out(self) -> None:
-        if self._left_out:
-            self.notes.append(f"{self._left_out} damaged rows with a time that cannot be were left out")
+    def _note_skipped(self) -> None:
+        if self._skipped:
+            self.notes.append(f"{self._skipped} damaged rows with an impossible time were skipped")
 
     def _note_time(self, unix_s: float) -> None:
         if unix_s < _A_YEAR_S and _NO_UTC not in self.notes:
@@ -101,8 +96,8 @@ def _kind(value: object) -> str:
     return "str"  # texts, bytes, arrays
 
 
-def _place(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
-    """None where a filter has diverged, or has not begun: such numbers are no place."""
+def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
+    """Return None for positions of an estimator that has diverged, or not started."""
     try:
         check_place(latitude, longitude)
         place = Position(latitude, longitude, float(amsl_m), relative_m)
@@ -111,24 +106,24 @@ def _place(latitude: float, longitude: float, amsl_m: float, relative_m: float |
     return None if latitude == longitude == 0 else place
 
 
-def _said(name: str, value: object) -> States:
+def _state(name: str, value: object) -> States:
     return () if value is None else ((name, value),)
 
 
-class BinFile(_OwnLog):
-    """A ``.bin`` of ArduPilot, read by pymavlink; system 1, for such a log does not tell it."""
+class BinReader(_RowReader):
+    """Reads a ``.bin`` of ArduPilot with pymavlink. The log has no system id; 1 is used."""
 
     _reader: Any = None
 
-    def entries(self, on_bytes: Callable[[int], object]) -> Iterator[Entry]:
-        """All messages of the log but the formats; multipliers are applied."""
+    def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
+        """Yield all records except formats, with multipliers applied."""
         reader = self._reader = opened_bin(self.path)
         try:
             yield from self._rows(reader, on_bytes)
         finally:
             close_bin(reader)
 
-    def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[Entry]:
+    def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         count = 0
         while (message := self._next(reader)) is not None:
             count += 1
@@ -136,22 +131,22 @@ class BinFile(_OwnLog):
                 on_bytes(reader.offset)
             table, fields = message.get_type(), message.to_dict()
             fields.pop("mavpackettype", None)
-            if table not in ("FMT", "FMTU") and self._is_time(message._timestamp):
+            if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
-                yield Entry(message._timestamp, 1, 1, table, fields, _of_ardupilot(table, fields, reader))
+                yield LogRecord(message._timestamp, 1, 1, table, fields, _ardupilot_states(table, fields, reader))
         if not count:
-            raise FileFormatError(f"{self.path} is no log of ArduPilot: it has no message")
+            raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
         if reader.data_len - reader.offset > _TAIL:
-            self.notes.append(f"nothing can be read behind byte {reader.offset} of {reader.data_len}")
-        self._note_left_out()
+            self.notes.append(f"unreadable after byte {reader.offset} of {reader.data_len}")
+        self._note_skipped()
         on_bytes(reader.data_len)
 
     def _next(self, reader: Any) -> Any:
         try:
-            with redirect_stdout(sys.stderr):  # it prints what is damaged, where our answers may go to
+            with redirect_stdout(sys.stderr):  # see opened_bin
                 return reader.recv_msg()
-        except Exception as error:  # whatever it raises on a damaged row
-            self.notes.append(f"damaged at byte {reader.offset}, and not read on: {error}")
+        except Exception as error:  # arbitrary errors for a damaged row
+            self.notes.append(f"damaged at byte {reader.offset}; the rest was skipped: {error}")
             return None
 
     def _unit(self, table: str, field: str) -> str:
@@ -160,11 +155,10 @@ class BinFile(_OwnLog):
         return str(found.get_unit(field) or "") if found is not None and found.units is not None else ""
 
 
-def _of_ardupilot(table: str, fields: Mapping[str, Any], reader: Any) -> States:
-    """What a message of the log says of the states of a vehicle."""
-    tell = _ARDUPILOT.get(table)
+def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
+    decode = _ARDUPILOT.get(table)
     try:
-        return () if tell is None else tell(fields, reader)
+        return () if decode is None else decode(fields, reader)
     except KeyError:  # an old log without that field
         return ()
 
@@ -178,29 +172,29 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
 
 
 def _known(value: float) -> float | None:
-    """None instead of NaN, which a battery without a sensor for it has."""
+    """Return None for NaN, which batteries without a sensor have."""
     return value if math.isfinite(value) else None
 
 
 def _ardupilot_battery(fields: Mapping[str, Any]) -> States:
     number = fields.get("Instance", fields.get("Inst", 0))
-    if number != 0:  # the state begins with the first battery, and a row tells of one alone
+    if number != 0:  # the state lists all batteries, but a row has only one
         return ()
     return (("batteries", (Battery(number, _known(fields["Volt"]), _known(fields["Curr"])),)),)
 
 
 _ARDUPILOT: dict[str, Callable[[Mapping[str, Any], Any], States]] = {
-    "POS": lambda f, _: _said("position", _place(f["Lat"], f["Lng"], f["Alt"], f["RelHomeAlt"])),
+    "POS": lambda f, _: _state("position", _position(f["Lat"], f["Lng"], f["Alt"], f["RelHomeAlt"])),
     "ATT": _ardupilot_attitude,
-    "MSG": lambda f, _: _said("status_text", _TextOfBin(text=readable(f["Message"]))),
+    "MSG": lambda f, _: _state("status_text", _BinText(text=clean_text(f["Message"]))),
     "BAT": lambda f, _: _ardupilot_battery(f),
-    "ARM": lambda f, _: _said("armed", bool(f["ArmState"])),
-    "MODE": lambda f, reader: _said("mode", _Mode(reader.flightmode, f["ModeNum"])),
+    "ARM": lambda f, _: _state("armed", bool(f["ArmState"])),
+    "MODE": lambda f, reader: _state("mode", _Mode(reader.flightmode, f["ModeNum"])),
 }
 
 
-class _TextOfBin(Snapshot):
-    """A `StatusText` without its severity, which a ``.bin`` does not keep."""
+class _BinText(Snapshot):
+    """A `StatusText` without severity, which a ``.bin`` does not contain."""
 
     severity: int | None = None
     text: str = ""
@@ -208,8 +202,6 @@ class _TextOfBin(Snapshot):
 
 
 class _Mode:
-    """A mode as such a log tells it."""
-
     def __init__(self, name: str, number: int) -> None:
         self.name, self.custom_mode = str(name), int(number)
 
@@ -217,22 +209,22 @@ class _Mode:
         return {"name": self.name, "custom_mode": self.custom_mode}
 
 
-class UlogFile(_OwnLog):
-    """A ``.ulg`` of PX4, read by pyulog as a whole."""
+class UlogReader(_RowReader):
+    """Reads a ``.ulg`` of PX4 with pyulog, into memory."""
 
-    def entries(self, on_bytes: Callable[[int], object]) -> Iterator[Entry]:
-        """All rows of all topics in the order of their times."""
+    def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
+        """Yield all rows of all topics, ordered by time."""
         try:
-            with self.path.open("rb") as file, redirect_stdout(sys.stderr):  # as above
+            with self.path.open("rb") as file, redirect_stdout(sys.stderr):  # see opened_bin
                 log = import_module("pyulog").ULog(file)
-        except Exception as error:  # whatever it raises on a file that is none
-            raise FileFormatError(f"{self.path} is no log of PX4: {error}") from error
+        except Exception as error:  # pyulog raises arbitrary errors for other files
+            raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
         if log.file_corruption:
-            self.notes.append("the log is damaged: what could be read was converted")
+            self.notes.append("the log is damaged: the readable part was converted")
         if not log.data_list:
-            raise FileFormatError(f"{self.path} holds no data")
+            raise FileFormatError(f"{self.path} contains no data")
         self._log = log
-        begins_s = _utc_of_start(log)
+        begins_s = utc_at_boot(log)
         self._note_time(begins_s)
         system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         decoder = _Px4States()
@@ -241,21 +233,10 @@ class UlogFile(_OwnLog):
         for count, (at, table, fields) in enumerate(rows):
             if not count & 0x3FF:
                 on_bytes(size * count // max(total, 1))
-            if self._is_time(begins_s + at / 1e6):
-                yield Entry(begins_s + at / 1e6, system_id, 1, table, fields, decoder.states(table, fields))
-        self._note_left_out()
+            if self._is_plausible_time(begins_s + at / 1e6):
+                yield LogRecord(begins_s + at / 1e6, system_id, 1, table, fields, decoder.states(table, fields))
+        self._note_skipped()
         on_bytes(size)
-
-
-def _utc_of_start(log: Any) -> float:
-    """UTC when PX4's clock was 0; 0 when no receiver told the time."""
-    for data in log.data_list:
-        if data.name in ("vehicle_gps_position", "sensor_gps") and "time_utc_usec" in data.data:
-            pairs = zip(data.data["time_utc_usec"].tolist(), data.data["timestamp"].tolist(), strict=True)
-            found = next(((utc - at) / 1e6 for utc, at in pairs if utc), None)
-            if found is not None:
-                return float(found)
-    return 0.0
 
 
 def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
@@ -268,7 +249,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     for text in log.logged_messages:
-        # The level is the kernel's, as a character: "6" is information. MAVLink's severities have the same numbers.
+        # The kernel's level as a character: "6" is info. MAV_SEVERITY has the same numbers.
         severity = max(0, min(7, int(text.log_level) - 48))
         yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
 
@@ -280,7 +261,7 @@ class _Px4States:
     def states(self, table: str, row: Mapping[str, Any]) -> States:
         try:
             return self._states(table, row)
-        except KeyError:  # a version of PX4 that calls it otherwise
+        except KeyError:  # the field has another name in this version of PX4
             return ()
 
     def _states(self, table: str, row: Mapping[str, Any]) -> States:
@@ -289,7 +270,7 @@ class _Px4States:
         elif table == "vehicle_global_position" and row.get("lat_lon_valid", 1):
             home = self._home_amsl_m
             relative = None if home is None else row["alt"] - home
-            return _said("position", _place(row["lat"], row["lon"], row["alt"], relative))
+            return _state("position", _position(row["lat"], row["lon"], row["alt"], relative))
         elif table == "vehicle_attitude":
             quaternion = (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"])
             return (("attitude", Attitude.from_quaternion(*quaternion, (None, None, None))),)
@@ -300,9 +281,9 @@ class _Px4States:
         elif table == "battery_status":
             remaining = row["remaining"]
             percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
-            current_a = _known(row["current_a"]) if row["current_a"] >= 0 else None  # -1: not known
-            voltage_v = _known(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: not known
+            current_a = _known(row["current_a"]) if row["current_a"] >= 0 else None  # -1: unknown
+            voltage_v = _known(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: unknown
             return (("batteries", (Battery(0, voltage_v, current_a, percent),)),)
         elif table == "logged_messages":
-            return (("status_text", StatusText(row["severity"], readable(row["message"]))),)
+            return (("status_text", StatusText(row["severity"], clean_text(row["message"]))),)
         return ()

@@ -1,4 +1,4 @@
-"""A ``.bin`` of ArduPilot → `Flight`: pymavlink finds the rows; only the columns that are wanted are read."""
+"""Reads a `FlightLog` from a ``.bin`` of ArduPilot: pymavlink indexes the rows, needed columns are unpacked."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.ardupilot import ardupilot_for
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, readable, said_by_error
-from aerokit.logs.flights.columns import Plane
-from aerokit.logs.flights.flight import Said, Sign, Waypoint
+from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text
+from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, Waypoint
 from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
 from aerokit.mavlink.enums import MavType
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from aerokit.logs.flights.flight import Flight
+    from aerokit.logs.flights.flight import FlightLog
 
 NAN = math.nan
 _CHUNK = 1 << 14
+# Unknown charge: AP_BattMonitor_Logging.cpp writes -1 as a byte.
 _NO_PERCENT = 255
-"""A battery that does not know how much is left (AP_BattMonitor_Logging.cpp writes its -1 as a byte)."""
 _FIRMWARES = {
     "ArduCopter": MavType.QUADROTOR,
     "ArduPlane": MavType.FIXED_WING,
@@ -33,58 +32,56 @@ _FIRMWARES = {
     "AntennaTracker": MavType.ANTENNA_TRACKER,
     "Blimp": MavType.AIRSHIP,
 }
-_ARMED, _DISARMED = 10, 11  # events, of logs that have no ARM
+_ARMED, _DISARMED = 10, 11  # events in old logs without ARM
 _HOME = 1
-_NOWHERE_DEG = 0.01
-"""So near to 0° N 0° E: an estimator that does not know its place yet."""
-_SHARE_OF_SEARCH = 0.3  # of all the work
+# Closer to 0° N 0° E, the estimator has no position yet.
+_NULL_ISLAND_DEG = 0.01
+_INDEXING_SHARE = 0.3  # of the total time
 
 
-def read_bin_flight(flight: Flight, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
+def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
     """Fill a flight from its file.
 
     Raises:
-        FileFormatError: it is no log of ArduPilot, or one from before 2015.
+        FileFormatError: the file is not an ArduPilot log, or one from before 2015.
     """
     size = flight.path.stat().st_size
-    reader = opened_bin(flight.path, lambda percent: on_bytes(round(size * _SHARE_OF_SEARCH * percent / 100)))
+    reader = opened_bin(flight.path, lambda percent: on_bytes(round(size * _INDEXING_SHARE * percent / 100)))
     try:
         _Reader(flight, _Tables(reader)).read(
-            lambda share: on_bytes(round(size * (_SHARE_OF_SEARCH + (1 - _SHARE_OF_SEARCH) * share)))
+            lambda share: on_bytes(round(size * (_INDEXING_SHARE + (1 - _INDEXING_SHARE) * share)))
         )
     finally:
         close_bin(reader)
 
 
 class _Tables:
-    """The tables of a log, by name."""
-
     def __init__(self, reader: Any) -> None:
         self._reader = reader
         self.began_us = self._first_time()
 
     @property
     def unix_at_0(self) -> float:
-        """UTC when the clock of the log was 0; 0 where no receiver told the time."""
+        """UTC at power-on; 0 without GNSS time."""
         return float(getattr(self._reader.clock, "timebase", 0.0) or 0.0)
 
     def has(self, table: str, *columns: str) -> bool:
-        """Whether there is such a table with these columns, and rows in it."""
+        """Return True if there is a table with these columns that has rows."""
         number = self._reader.name_to_id.get(table)
         if number is None or not len(self._reader.offsets[number]):
             return False
         return {"TimeUS", *columns} <= set(self._reader.formats[number].columns)
 
     def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
-        """Seconds since the log began, then the values of the columns; nothing if the table or one of them is missing.
+        """Yield seconds since the start of the log, and the values of the columns; nothing if a column is missing.
 
-        Texts are ``str``, numbers in the unit of the table.
+        Texts are ``str``, numbers have the unit of the table.
         """
         for chunk in self._chunks(table, columns):
             yield from zip(*chunk, strict=True)
 
     def columns(self, table: str, *columns: str) -> list[list[Any]]:
-        """The same by columns."""
+        """Return the same by columns."""
         found: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
         for chunk in self._chunks(table, columns):
             for whole, part in zip(found, chunk, strict=True):
@@ -95,14 +92,14 @@ class _Tables:
         if not self.has(table, *columns):
             return
         reader = self._reader
-        made = reader.formats[reader.name_to_id[table]]
+        row_format = reader.formats[reader.name_to_id[table]]
         wanted = ("TimeUS", *columns)
-        places = [made.columns.index(name) for name in wanted]
-        unpack = struct.Struct(_pattern(made, places)).unpack_from
-        order = [sorted(places).index(place) for place in places]
-        scales = [made.msg_mults[place] for place in places]
-        data, offsets = reader.data_map, reader.offsets[made.type]
-        last, began = len(data) - made.len, self.began_us
+        indices = [row_format.columns.index(name) for name in wanted]
+        unpack = struct.Struct(_pattern(row_format, indices)).unpack_from
+        order = [sorted(indices).index(index) for index in indices]
+        scales = [row_format.msg_mults[index] for index in indices]
+        data, offsets = reader.data_map, reader.offsets[row_format.type]
+        last, began = len(data) - row_format.len, self.began_us
         for begin in range(0, len(offsets), _CHUNK):
             rows = [unpack(data, at + 3) for at in offsets[begin : begin + _CHUNK] if at <= last]
             if not rows:
@@ -113,38 +110,36 @@ class _Tables:
             yield chunk
 
     def _first_time(self) -> int:
-        """Of the rows at the beginning of each table the earliest: tables begin at different times."""
+        """Return the time of the first row in the file. Tables start at different times."""
         self.began_us = 0
         reader, found = self._reader, []
         for number in reader.name_to_id.values():
             offsets = reader.offsets[number]
             if not len(offsets) or "TimeUS" not in reader.formats[number].columns:
                 continue
-            made = reader.formats[number]
-            place = made.columns.index("TimeUS")
-            if made.format[place] == "Q" and offsets[0] + made.len <= len(reader.data_map):
-                pattern = _pattern(made, [place])
+            row_format = reader.formats[number]
+            index = row_format.columns.index("TimeUS")
+            if row_format.format[index] == "Q" and offsets[0] + row_format.len <= len(reader.data_map):
+                pattern = _pattern(row_format, [index])
                 found.append((offsets[0], struct.unpack_from(pattern, reader.data_map, offsets[0] + 3)[0]))
         if not found:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        return int(min(found)[1])  # of the first row of the file: a damaged one may claim any time
+        return int(min(found)[1])  # not the smallest time: a damaged row can have any
 
 
-def _pattern(made: Any, places: Sequence[int]) -> str:
-    """The rows' layout for struct, the columns that nobody wants as padding."""
-    codes, at = [], 1  # behind "<"
-    text = made.msg_struct
+def _pattern(row_format: Any, indices: Sequence[int]) -> str:
+    """Return the struct layout of rows, with unneeded columns as padding."""
+    codes, at = [], 1  # after "<"
+    text = row_format.msg_struct
     while at < len(text):
         end = at
         while text[end].isdigit():
             end += 1
         codes.append(text[at : end + 1])
         at = end + 1
-    padded = [
-        code if place in places else f"{struct.calcsize('<' + code)}x" for place, code in enumerate(codes)
-    ]
+    padded = [code if index in indices else f"{struct.calcsize('<' + code)}x" for index, code in enumerate(codes)]
     return "<" + "".join(padded)
 
 
@@ -160,12 +155,12 @@ def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
 
 
 def _wrapped(angles: Sequence[float]) -> list[float]:
-    """From -180 to 180 degrees."""
+    """Wrap angles to -180 to 180 degrees."""
     return [(angle + 180) % 360 - 180 for angle in angles]
 
 
 class _Reader:
-    def __init__(self, flight: Flight, tables: _Tables) -> None:
+    def __init__(self, flight: FlightLog, tables: _Tables) -> None:
         self._flight, self._tables = flight, tables
 
     def read(self, on_share: Callable[[float], object]) -> None:
@@ -181,21 +176,19 @@ class _Reader:
             step()
             on_share((number + 1) / len(steps))
         columns = (flight.track, flight.attitude, flight.vibration, *flight.batteries.values())
-        ends = [each.times[-1] for each in columns if len(each)]
+        ends = [series.times[-1] for series in columns if len(series)]
         ends += [flight.texts[-1].time_s] if flight.texts else []
         flight.ends_at = flight.begins_at + max(ends, default=0.0)
         if not tables.unix_at_0:
-            flight.notes.append(
-                "no satellite receiver told the time: times count from the start of the controller"
-            )
+            flight.notes.append("no GNSS time in the log: times count from power-on")
 
     def _texts(self) -> None:
         flight = self._flight
         rows = self._tables.rows("MSG", "Message")
-        flight.texts = [Said(time, None, readable(text)) for time, text in rows]
+        flight.texts = [LoggedText(time, None, clean_text(text)) for time, text in rows]
         names = (text.text for text in flight.texts if text.text.split(" ")[0] in _FIRMWARES)
-        told = next(names, "")
-        flight.vehicle = " ".join(told.split(" ")[:2]) or "ArduPilot"
+        banner = next(names, "")
+        flight.vehicle = " ".join(banner.split(" ")[:2]) or "ArduPilot"
 
     def _modes(self) -> None:
         kind = _FIRMWARES.get(self._flight.vehicle.split(" ")[0], MavType.GENERIC)
@@ -204,23 +197,23 @@ class _Reader:
         for row in self._tables.rows("MODE", "ModeNum", *(("Rsn",) if has_reason else ())):
             reason, failsafe, by_itself = MODE_REASONS.get(row[2] if has_reason else None, ("", None, None))
             name = table.name_of(row[1])
-            if self._flight.note_mode(row[0], name, reason, by_itself) and failsafe:
-                self._flight.signs.append(
-                    Sign(row[0], failsafe, f"mode {name}, for this reason: {reason} (MODE)", True)
+            if self._flight.add_mode(row[0], name, reason, by_itself) and failsafe:
+                self._flight.failsafe_evidence.append(
+                    FailsafeEvidence(row[0], failsafe, f"mode {name}, reason: {reason} (MODE)", True)
                 )
 
     def _armed(self) -> None:
         if self._tables.has("ARM", "ArmState"):
             for time, armed in self._tables.rows("ARM", "ArmState"):
-                self._flight.note_armed(time, bool(armed))
+                self._flight.set_armed(time, bool(armed))
             return
         for time, event in self._tables.rows("EV", "Id"):
             if event in (_ARMED, _DISARMED):
-                self._flight.note_armed(time, event == _ARMED)
+                self._flight.set_armed(time, event == _ARMED)
 
     def _parameters(self) -> None:
         for time, name, value in self._tables.rows("PARM", "Name", "Value"):
-            self._flight.note_parameter(time, name, value)
+            self._flight.set_parameter(time, name, value)
 
     def _mission(self) -> None:
         items: dict[int, Waypoint] = {}
@@ -235,25 +228,21 @@ class _Reader:
         for row in self._tables.rows("ORGN", "Type", "Lat", "Lng", "Alt"):
             time, kind, latitude, longitude, altitude = row
             if kind == _HOME:
-                self._flight.note_home(time, latitude, longitude, altitude)
+                self._flight.set_home(time, latitude, longitude, altitude)
 
     def _track(self) -> None:
         track = self._flight.track
-        for time, latitude, longitude, amsl, relative in self._tables.rows(
-            "POS", "Lat", "Lng", "Alt", "RelHomeAlt"
-        ):
-            if abs(latitude) > _NOWHERE_DEG or abs(longitude) > _NOWHERE_DEG:
+        for time, latitude, longitude, amsl, relative in self._tables.rows("POS", "Lat", "Lng", "Alt", "RelHomeAlt"):
+            if abs(latitude) > _NULL_ISLAND_DEG or abs(longitude) > _NULL_ISLAND_DEG:
                 track.add(time, latitude, longitude, amsl, relative)
         if len(track):
             return
-        for time, status, latitude, longitude, amsl in self._tables.rows(
-            "GPS", "Status", "Lat", "Lng", "Alt"
-        ):
+        for time, status, latitude, longitude, amsl in self._tables.rows("GPS", "Status", "Lat", "Lng", "Alt"):
             if status >= 3:
                 track.add(time, latitude, longitude, amsl, NAN)
 
     def _velocity(self) -> None:
-        name = next((each for each in ("XKF1", "NKF1") if self._tables.has(each, "VN", "VE", "VD")), "XKF1")
+        name = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
         several = self._tables.has(name, "C")
         for row in self._tables.rows(name, "VN", "VE", "VD", *(("C",) if several else ())):
             if not several or row[4] == 0:
@@ -270,14 +259,14 @@ class _Reader:
         north = list(self._tables.rows("PSCN", "TPN", "TVN"))
         east = list(self._tables.rows("PSCE", "TPE", "TVE"))
         if origin is not None:
-            plane = Plane(*origin)
-            for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north, east):  # noqa: B905 - cut off at the end
+            plane = TangentPlane(*origin)
+            for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north, east):  # noqa: B905 - one may be cut off at the end
                 self._flight.position_target.add(time, *plane.degrees(north_m, east_m), NAN, NAN)
                 self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
-        self._put_heights(self._tables.rows("CTUN", "DAlt"))
+        self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
-    def _put_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
-        """Put the heights that were wanted beside the places that were wanted, which come at the same rate."""
+    def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
+        """Add height set-points to the position set-points, which have the same rate."""
         target = self._flight.position_target
         has_places = len(target) > 0
         relative = target["altitude_relative_m"]
@@ -303,12 +292,8 @@ class _Reader:
             self._flight.battery(row[1]).add(row[0], *row[2:5], row[5] if is_known else NAN)
 
     def _gps(self) -> None:
-        accuracy = defaultdict(
-            lambda: NAN, {(at, i): m for at, i, m in self._tables.rows("GPA", "I", "HAcc")}
-        )
-        for time, number, status, satellites, hdop in self._tables.rows(
-            "GPS", "I", "Status", "NSats", "HDop"
-        ):
+        accuracy = defaultdict(lambda: NAN, {(at, i): m for at, i, m in self._tables.rows("GPA", "I", "HAcc")})
+        for time, number, status, satellites, hdop in self._tables.rows("GPS", "I", "Status", "NSats", "HDop"):
             self._flight.receiver(number).add(time, status, satellites, hdop, accuracy[time, number])
 
     def _vibration(self) -> None:
@@ -333,5 +318,5 @@ class _Reader:
         for time, system, code in self._tables.rows("ERR", "Subsys", "ECode"):
             kind, text = ERRORS.get(system, ("general", f"subsystem {system}"))
             if code:
-                said = said_by_error(system, code, text)
-                self._flight.signs.append(Sign(time, kind, f"{said} (ERR {system}/{code})"))
+                description = f"{error_text(system, code, text)} (ERR {system}/{code})"
+                self._flight.failsafe_evidence.append(FailsafeEvidence(time, kind, description))

@@ -1,4 +1,4 @@
-"""A ``.tlog`` → `Flight`: only the frames that a flight is made of are checked and decoded."""
+"""Reads a `FlightLog` from a ``.tlog``. Only messages that a flight needs are checked and decoded."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots import Autopilot, autopilot_for, is_armed
-from aerokit.connection.components import is_autopilot
+from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import readable
-from aerokit.logs.flights.columns import Columns
-from aerokit.logs.flights.flight import Said, Sign, Waypoint
+from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries, Waypoint
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavState, MavType
@@ -24,19 +23,19 @@ from aerokit.vehicle.state.status_text import StatusTextAssembler
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.logs.flights.flight import Flight
+    from aerokit.logs.flights.flight import FlightLog
     from aerokit.mavlink.message import Message
 
 NAN = math.nan
 _U16, _E7, _METRES_PER_DEGREE = 0xFFFF, 1e7, 111_319.5
-_NOWHERE_E7 = 100_000
-"""So near to 0° N 0° E: an estimator that does not know its place yet."""
-_HEARTBEAT, _MOST_MISSING = b"\0\0\0", 200
-_AGO_S = 5.0
-"""A mode that follows an order so soon was ordered."""
+# Closer to 0° N 0° E, the estimator has no position yet.
+_NULL_ISLAND_E7 = 100_000
+_HEARTBEAT, _MAX_SEQUENCE_GAP = b"\0\0\0", 200
+# A mode change within this time of a command was commanded.
+_COMMAND_MAX_AGE_S = 5.0
+# Bits of a type mask: these fields are ignored.
 _NO_POSITION, _NO_VELOCITY = 0x7, 0x38
-"""Bits of a type mask: these are to be ignored."""
-_ORDERS_OF_MODE = frozenset(
+_MODE_COMMANDS = frozenset(
     (
         MavCmd.DO_SET_MODE,
         MavCmd.NAV_RETURN_TO_LAUNCH,
@@ -50,32 +49,32 @@ _ORDERS_OF_MODE = frozenset(
 _ALARM = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
-def read_tlog_flight(flight: Flight, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight from its file; ``system_id`` says whose flight, None: of the first autopilot in it.
+def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
+    """Fill a flight from its file, for this system id, or for the first autopilot.
 
     Raises:
-        FileFormatError: there is no autopilot in it.
+        FileFormatError: the log has no such autopilot.
     """
     heartbeat, frame = _first_autopilot(flight, system_id)
     flight.system_id = frame.system_id
     _Reader(flight, frame.component_id, heartbeat).read(on_bytes)
 
 
-def _first_autopilot(flight: Flight, system_id: int | None) -> tuple[m.Heartbeat, Frame]:
+def _first_autopilot(flight: FlightLog, system_id: int | None) -> tuple[m.Heartbeat, Frame]:
     records = 0
     for _, raw in read_tlog(flight.path):
         records += 1
-        if (raw[7:10] == b"\0\0\0" if raw[0] == MAGIC_V2 else raw[5] == 0) and _is_right(raw):
+        if (raw[7:10] == b"\0\0\0" if raw[0] == MAGIC_V2 else raw[5] == 0) and _is_valid(raw):
             frame = Frame.parse(raw)
             message = m.Heartbeat.decode_body(frame.body, frame)
             if is_autopilot(message) and system_id in (None, frame.system_id):
                 return message, frame
     what = "no MAVLink messages" if not records else "no heartbeat of an autopilot"
-    whose = "" if system_id is None else f" with system id {system_id}"
-    raise FileFormatError(f"{flight.path} holds {what}{whose}: there is no flight in it")
+    which = "" if system_id is None else f" with system id {system_id}"
+    raise FileFormatError(f"{flight.path} contains {what}{which}, so there is no flight")
 
 
-def _is_right(raw: bytes) -> bool:
+def _is_valid(raw: bytes) -> bool:
     try:
         frame = Frame.parse(raw)
         return x25(frame.body + STANDARD.extras[frame.message_id]) == frame.checksum
@@ -84,7 +83,7 @@ def _is_right(raw: bytes) -> bool:
 
 
 class _Reader:
-    def __init__(self, flight: Flight, component_id: int, heartbeat: m.Heartbeat) -> None:
+    def __init__(self, flight: FlightLog, component_id: int, heartbeat: m.Heartbeat) -> None:
         self._flight = flight
         self._source = bytes((flight.system_id, component_id))
         self._autopilot: Autopilot = autopilot_for(heartbeat)
@@ -92,34 +91,34 @@ class _Reader:
         self._texts = StatusTextAssembler()
         self._others: set[int] = set()
         self._capabilities: int | None = None
-        self._ordered_at, self._hears_orders = -math.inf, False
+        self._commanded_at, self._has_commands = -math.inf, False
         self._status = 0
         self._has_battery_status = False
-        self._place = self._local = (NAN, NAN, NAN)
-        self._relative = NAN
-        self._told_of_breach = False
-        self._where_to = Columns(*flight.position_target.names)
+        self._position = self._local = (NAN, NAN, NAN)
+        self._relative_m = NAN
+        self._is_breached = False
+        self._destinations = TimeSeries(*flight.position_target.names)
         self._link = _LinkCounter(flight)
         self._items: dict[int, Waypoint] = {}
-        of_anybody: dict[type[Message], Callable[[float, Any], None]] = {
-            m.CommandLong: self._order,
-            m.CommandInt: self._order,
+        from_any: dict[type[Message], Callable[[float, Any], None]] = {
+            m.CommandLong: self._on_command,
+            m.CommandInt: self._on_command,
             m.SetMode: self._set_mode,
             m.MissionItemInt: self._mission_item,
             m.MissionItem: self._mission_item,
             m.MissionCount: self._mission_count,
         }
-        self._of_anybody = {_key(kind): handler for kind, handler in of_anybody.items()}
-        self._of_vehicle = {
-            **self._of_anybody,
+        self._from_any = {_key(kind): handler for kind, handler in from_any.items()}
+        self._from_vehicle = {
+            **self._from_any,
             **{_key(kind): handler for kind, handler in self._handlers().items()},
         }
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
-        # This runs for every message of a log, of which there are millions: most leave it undecoded.
+        # Hot loop: a log has millions of messages, and most are not decoded.
         flight, source, link = self._flight, self._source, self._link
-        of_vehicle, of_anybody = self._of_vehicle, self._of_anybody
-        damaged = count = came = 0
+        from_vehicle, from_any = self._from_vehicle, self._from_any
+        damaged = count = received = 0
         expected, next_second = -1, 0.0
         begins_at = ends_at = 0.0
         with flight.path.open("rb") as file:
@@ -136,16 +135,16 @@ class _Reader:
                 else:
                     kind, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
                 if sender == source:
-                    came += 1
+                    received += 1
                     if sequence != expected or unix_s >= next_second:
-                        next_second = begins_at + link.count(unix_s - begins_at, sequence, expected, came)
-                        came = 0
+                        next_second = begins_at + link.count(unix_s - begins_at, sequence, expected, received)
+                        received = 0
                     expected = (sequence + 1) & 0xFF
-                    if kind not in of_vehicle:
+                    if kind not in from_vehicle:
                         continue
-                    handle = of_vehicle[kind]
-                elif kind in of_anybody:
-                    handle = of_anybody[kind]
+                    handle = from_vehicle[kind]
+                elif kind in from_any:
+                    handle = from_any[kind]
                 else:
                     if kind == _HEARTBEAT:
                         self._other(unix_s - begins_at, sender[0], raw)
@@ -157,42 +156,41 @@ class _Reader:
                     handle(unix_s - begins_at, message)
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
-        link.end(came)
+        link.end(received)
         self._end(damaged)
 
     def _end(self, damaged: int) -> None:
         flight = self._flight
-        self._take_texts(flight.duration_s, self._texts.expire(math.inf))
-        self._take_destinations()
+        self._add_texts(flight.duration_s, self._texts.expire(math.inf))
+        self._use_destinations()
         flight.mission = [self._items[number] for number in sorted(self._items)]
         if damaged:
-            flight.notes.append(f"{damaged} messages are damaged and were left out")
+            flight.notes.append(f"{damaged} messages are damaged and were skipped")
         if self._others:
-            who = ", ".join(map(str, sorted(self._others)))
+            others = ", ".join(map(str, sorted(self._others)))
             flight.notes.append(
-                f"this is system {flight.system_id}; the log has other vehicles, too: system {who}"
+                f"this is system {flight.system_id}; the log contains other vehicles too: system {others}"
             )
-        if not self._hears_orders:
-            flight.notes.append("the log has no orders to the vehicle: who changed the mode is not known")
+        if not self._has_commands:
+            flight.notes.append(
+                "the log contains no commands to the vehicle, so the causes of mode changes are unknown"
+            )
 
-    def _take_destinations(self) -> None:
-        """Where it was to go in the end (POSITION_TARGET_GLOBAL_INT), if nothing tells where it was to be meanwhile."""
-        target, where_to = self._flight.position_target, self._where_to
+    def _use_destinations(self) -> None:
+        """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points, if there are no continuous ones."""
+        target, destinations = self._flight.position_target, self._destinations
         if target.has("latitude_deg"):
             return
         has_heights = target.has()
-        rows = [
-            (time, *values)
-            for time, *values in zip(target.times, *map(target.__getitem__, target), strict=True)
-        ]
+        rows = [(time, *values) for time, *values in zip(target.times, *map(target.__getitem__, target), strict=True)]
         for time, latitude, longitude, amsl, relative in zip(
-            where_to.times, *map(where_to.__getitem__, where_to), strict=True
+            destinations.times, *map(destinations.__getitem__, destinations), strict=True
         ):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
-        self._flight.position_target = made = Columns(*target.names)
+        self._flight.position_target = merged = TimeSeries(*target.names)
         for row in sorted(rows, key=lambda row: row[0]):
-            made.add(*row)
+            merged.add(*row)
 
     def _handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
         flight = self._flight
@@ -204,7 +202,7 @@ class _Reader:
                 t, math.degrees(x.roll), math.degrees(x.pitch), math.degrees(x.yaw)
             ),
             m.VfrHud: lambda t, x: flight.air.add(t, x.airspeed, x.throttle),
-            m.Statustext: lambda t, x: self._take_texts(t, self._texts.receive(x, t)),
+            m.Statustext: lambda t, x: self._add_texts(t, self._texts.receive(x, t)),
             m.SysStatus: self._sys_status,
             m.BatteryStatus: self._battery_status,
             m.GpsRawInt: lambda t, x: self._gps(t, x, 0),
@@ -231,7 +229,7 @@ class _Reader:
             m.NavControllerOutput: self._navigation,
             m.AttitudeTarget: self._attitude_target,
             m.PositionTargetGlobalInt: self._global_target,
-            m.PositionTargetLocalNed: self._local_target_told,
+            m.PositionTargetLocalNed: self._local_target,
             m.RadioStatus: self._radio,
             m.Radio: self._radio,
             m.ParamValue: self._parameter,
@@ -240,55 +238,54 @@ class _Reader:
             m.FenceStatus: self._fence,
         }
 
-    # ---------------------------------------------------------------------------- state and orders
-
     def _heartbeat(self, time_s: float, message: m.Heartbeat) -> None:
         flight = self._flight
-        ordered = time_s - self._ordered_at < _AGO_S
-        flight.note_mode(
+        was_commanded = time_s - self._commanded_at < _COMMAND_MAX_AGE_S
+        flight.add_mode(
             time_s,
             self._autopilot.mode_of(message).name,
-            "ordered" if ordered else "",
-            False if ordered else None,
+            "ordered" if was_commanded else "",
+            False if was_commanded else None,
         )
         armed = is_armed(message.base_mode)
-        flight.note_armed(time_s, armed)
+        flight.set_armed(time_s, armed)
         status = message.system_status
         if armed and status in _ALARM and status != self._status:
             name = _ALARM[MavState(status)]
-            flight.signs.append(Sign(time_s, "general", f"the vehicle calls its state {name} (HEARTBEAT)"))
+            text = f"system status {name} (HEARTBEAT)"
+            flight.failsafe_evidence.append(FailsafeEvidence(time_s, "general", text))
         self._status = status
 
     def _other(self, time_s: float, system_id: int, raw: bytes) -> None:
-        kind = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # a damaged one may be shorter
+        kind = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # may be empty in a damaged frame
         if kind == bytes((MavType.GCS,)):
-            self._flight.station.append(time_s)
+            self._flight.gcs_heartbeats.append(time_s)
             return
-        if system_id != self._flight.system_id and system_id not in self._others and _is_right(raw):
+        if system_id != self._flight.system_id and system_id not in self._others and _is_valid(raw):
             frame = Frame.parse(raw)
             if is_autopilot(m.Heartbeat.decode_body(frame.body, frame)):
                 self._others.add(system_id)
 
-    def _order(self, time_s: float, message: m.CommandLong | m.CommandInt) -> None:
+    def _on_command(self, time_s: float, message: m.CommandLong | m.CommandInt) -> None:
         if message.target_system in (0, self._flight.system_id):
-            self._hears_orders = True
-            if message.command in _ORDERS_OF_MODE:
-                self._mode_was_ordered(time_s)
+            self._has_commands = True
+            if message.command in _MODE_COMMANDS:
+                self._record_mode_command(time_s)
 
     def _set_mode(self, time_s: float, message: m.SetMode) -> None:
         if message.target_system in (0, self._flight.system_id):
-            self._mode_was_ordered(time_s)
+            self._record_mode_command(time_s)
 
-    def _mode_was_ordered(self, time_s: float) -> None:
-        self._ordered_at, self._hears_orders = time_s, True
+    def _record_mode_command(self, time_s: float) -> None:
+        self._commanded_at, self._has_commands = time_s, True
 
-    def _take_texts(self, time_s: float, texts: list[Any]) -> None:
-        self._flight.texts += [Said(time_s, text.severity, readable(text.text)) for text in texts]
+    def _add_texts(self, time_s: float, texts: list[Any]) -> None:
+        self._flight.texts += [LoggedText(time_s, text.severity, clean_text(text.text)) for text in texts]
 
     def _parameter(self, time_s: float, message: m.ParamValue) -> None:
         bytewise = self._autopilot.encodes_parameters_bytewise(self._capabilities)
         if message.param_id and not message.param_id.startswith("_HASH"):
-            self._flight.note_parameter(time_s, message.param_id, float(value_of(message, bytewise)))
+            self._flight.set_parameter(time_s, message.param_id, float(value_of(message, bytewise)))
 
     def _version(self, time_s: float, message: m.AutopilotVersion) -> None:
         self._capabilities = message.capabilities
@@ -298,9 +295,7 @@ class _Reader:
             self._flight.vehicle = f"{self._autopilot.firmware} {parts}"
 
     def _home(self, time_s: float, message: m.HomePosition) -> None:
-        self._flight.note_home(
-            time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3
-        )
+        self._flight.set_home(time_s, message.latitude / _E7, message.longitude / _E7, message.altitude / 1e3)
 
     def _mission_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
         if not self._is_our_mission(message):
@@ -317,31 +312,29 @@ class _Reader:
         )
 
     def _mission_count(self, time_s: float, message: m.MissionCount) -> None:
-        """What follows has so many items: those behind are of a mission before."""
+        """Drop items beyond the new count: they belong to an earlier mission."""
         if self._is_our_mission(message):
             self._items = {number: item for number, item in self._items.items() if number < message.count}
 
     def _is_our_mission(self, message: m.MissionItemInt | m.MissionItem | m.MissionCount) -> bool:
-        """Whether it is told by this vehicle or to it: a log may have those of others, and fences."""
+        """Return True for missions of this vehicle, not of others, and not fences."""
         frame, ours = message.received_frame, self._flight.system_id
         sender = None if frame is None else frame.system_id
         return message.mission_type == 0 and ours in (sender, message.target_system)
 
     def _fence(self, time_s: float, message: m.FenceStatus) -> None:
-        if message.breach_status and not self._told_of_breach:
-            self._flight.signs.append(Sign(time_s, "fence", "outside the fence (FENCE_STATUS)"))
-        self._told_of_breach = bool(message.breach_status)
-
-    # ------------------------------------------------------------------------------------ movement
+        if message.breach_status and not self._is_breached:
+            self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, "fence", "outside the fence (FENCE_STATUS)"))
+        self._is_breached = bool(message.breach_status)
 
     def _global_position(self, time_s: float, message: m.GlobalPositionInt) -> None:
-        if abs(message.lat) < _NOWHERE_E7 and abs(message.lon) < _NOWHERE_E7:
+        if abs(message.lat) < _NULL_ISLAND_E7 and abs(message.lon) < _NULL_ISLAND_E7:
             return
         if abs(message.lat) > 90 * _E7 or abs(message.lon) > 180 * _E7:
             return
-        self._place = message.lat / _E7, message.lon / _E7, message.alt / 1e3
-        self._relative = message.relative_alt / 1e3
-        self._flight.track.add(time_s, *self._place, self._relative)
+        self._position = message.lat / _E7, message.lon / _E7, message.alt / 1e3
+        self._relative_m = message.relative_alt / 1e3
+        self._flight.track.add(time_s, *self._position, self._relative_m)
         self._flight.velocity.add(time_s, message.vx / 100, message.vy / 100, message.vz / 100)
 
     def _local_position(self, time_s: float, message: m.LocalPositionNed) -> None:
@@ -349,10 +342,10 @@ class _Reader:
 
     def _navigation(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
-            bearing = message.nav_bearing  # of fixed wings where they are to go; copters are told no yaw here
+            bearing = message.nav_bearing  # the bearing for fixed wings; for copters it has no meaning
             self._flight.attitude_target.add(time_s, message.nav_roll, message.nav_pitch, NAN)
-            if -180 <= bearing <= 360 and self._relative == self._relative:
-                self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative + message.alt_error)
+            if -180 <= bearing <= 360 and self._relative_m == self._relative_m:
+                self._flight.position_target.add(time_s, NAN, NAN, NAN, self._relative_m + message.alt_error)
 
     def _attitude_target(self, time_s: float, message: m.AttitudeTarget) -> None:
         if not message.type_mask & 0x80 and all(math.isfinite(part) for part in message.q):
@@ -363,7 +356,7 @@ class _Reader:
     def _global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:
         if message.type_mask & _NO_POSITION != _NO_POSITION and (message.lat_int or message.lon_int):
             is_amsl = message.coordinate_frame in (0, 5)
-            self._where_to.add(
+            self._destinations.add(
                 time_s,
                 message.lat_int / _E7,
                 message.lon_int / _E7,
@@ -372,37 +365,31 @@ class _Reader:
             )
         self._velocity_target(time_s, message)
 
-    def _local_target_told(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
+    def _local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
         target, here = (message.x, message.y, message.z), self._local
         if message.type_mask & _NO_POSITION != _NO_POSITION:
             north, east, down = (there - mine for there, mine in zip(target, here, strict=True))
-            latitude, longitude, amsl = self._place
+            latitude, longitude, amsl = self._position
             east_per_degree = _METRES_PER_DEGREE * math.cos(math.radians(latitude))
             self._flight.position_target.add(
                 time_s,
                 latitude + north / _METRES_PER_DEGREE,
                 longitude + east / east_per_degree,
                 amsl - down,
-                self._relative - down,
+                self._relative_m - down,
             )
         self._velocity_target(time_s, message)
 
-    def _velocity_target(
-        self, time_s: float, message: m.PositionTargetLocalNed | m.PositionTargetGlobalInt
-    ) -> None:
+    def _velocity_target(self, time_s: float, message: m.PositionTargetLocalNed | m.PositionTargetGlobalInt) -> None:
         if message.type_mask & _NO_VELOCITY != _NO_VELOCITY:
             self._flight.velocity_target.add(time_s, message.vx, message.vy, message.vz)
-
-    # ----------------------------------------------------------------------------------- equipment
 
     def _sys_status(self, time_s: float, message: m.SysStatus) -> None:
         if self._has_battery_status or message.voltage_battery in (0, _U16):
             return
         ampere = current(message.current_battery, self._autopilot)
         left = NAN if message.battery_remaining < 0 else message.battery_remaining
-        self._flight.battery(0).add(
-            time_s, message.voltage_battery / 1e3, NAN if ampere is None else ampere, NAN, left
-        )
+        self._flight.battery(0).add(time_s, message.voltage_battery / 1e3, NAN if ampere is None else ampere, NAN, left)
 
     def _battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
         cells = [mv for mv in message.voltages if mv != _U16]
@@ -432,14 +419,14 @@ class _Reader:
 
 
 def _key(kind: type[Message]) -> bytes:
-    """A message id as it is in a frame."""
+    """Return a message id as in a frame."""
     return kind.ID.to_bytes(3, "little")
 
 
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
-    """The message of a record; None when its checksum is wrong."""
+    """Return the message of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2 and not raw[2]:
-        frame = Frame()  # as `Frame.parse`, and quicker
+        frame = Frame()  # same as `Frame.parse`, but faster
         frame.body, frame.checksum = raw[1:-2], raw[-2] | raw[-1] << 8
         frame.system_id, frame.component_id = raw[5], raw[6]
         frame.message_id, frame.received_at = raw[7] | raw[8] << 8 | raw[9] << 16, unix_s
@@ -451,37 +438,36 @@ def _decoded(raw: bytes, unix_s: float) -> Message | None:
 
 
 class _LinkCounter:
-    """How many frames of the vehicle came each second, and how many did not, by their sequence numbers."""
+    """Counts received and lost frames per second, by sequence numbers."""
 
-    def __init__(self, flight: Flight) -> None:
-        self._columns = flight.link
+    def __init__(self, flight: FlightLog) -> None:
+        self._series = flight.link
         self._second = 0
-        self._came = self._lost = 0
+        self._received = self._lost = 0
 
-    def count(self, time_s: float, sequence: int, expected: int, came: int) -> float:
-        """Take frames that came, the last of them out of order or in another second; when the next second begins."""
+    def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
+        """Count frames after a gap, or at the start of a second. Return the start of the next second."""
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
-        if missing > _MOST_MISSING:  # an older one, or a second way: nothing is missing for that
+        if missing > _MAX_SEQUENCE_GAP:  # a delayed frame, or one from a second link: nothing is lost
             missing = 0
         if time_s >= self._second + 1:
-            self._came += came - 1
-            came = 1
-            if int(time_s) - self._second > 1:  # whole seconds of silence count as such
+            self._received += received - 1
+            received = 1
+            if int(time_s) - self._second > 1:  # silence is recorded as 100 % loss
                 missing = 0
-            self._tell(int(time_s))
-        self._came += came
+            self._add_row(int(time_s))
+        self._received += received
         self._lost += missing
         return self._second + 1
 
-    def end(self, came: int) -> None:
-        """Take the last ones."""
-        self._came += came
-        self._tell(self._second + 1)
+    def end(self, received: int) -> None:
+        self._received += received
+        self._add_row(self._second + 1)
 
-    def _tell(self, second: int) -> None:
-        sent = self._came + self._lost
-        self._columns.add(self._second, 100 * self._lost / sent if sent else NAN, self._came)
-        if second - self._second > 1:  # nothing came for a while
-            self._columns.add(self._second + 1, 100.0, 0)
-            self._columns.add(second - 1, 100.0, 0)
-        self._second, self._came, self._lost = second, 0, 0
+    def _add_row(self, second: int) -> None:
+        sent = self._received + self._lost
+        self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
+        if second - self._second > 1:  # nothing received for a while
+            self._series.add(self._second + 1, 100.0, 0)
+            self._series.add(second - 1, 100.0, 0)
+        self._second, self._received, self._lost = second, 0, 0

@@ -1,4 +1,4 @@
-"""A ``.ulg`` of PX4 → `Flight`: pyulog reads the topics that are wanted."""
+"""Reads a `FlightLog` from a ``.ulg`` of PX4; pyulog loads the needed topics."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.px4 import Px4
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import readable
-from aerokit.logs.flights.columns import Plane
-from aerokit.logs.flights.flight import Said, Sign
+from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from aerokit.logs.flights.columns import Columns
-    from aerokit.logs.flights.flight import Flight
+    from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
 NAN = math.nan
 _TOPICS = (
@@ -29,6 +27,7 @@ _TOPICS = (
     *("home_position", "airspeed_validated", "radio_status"),
 )
 _ARMED = 2
+# ``nav_state`` of vehicle_status → mode name (VehicleStatus.msg).
 _NAV_STATES = {
     0: "MANUAL",
     1: "ALTCTL",
@@ -50,58 +49,55 @@ _NAV_STATES = {
     22: "VTOL_TAKEOFF",
     **{22 + number: f"EXTERNAL{number}" for number in range(1, 9)},
 }
-"""``nav_state`` of vehicle_status → the mode's name as everywhere here (VehicleStatus.msg)."""
+# Flag of failsafe_flags → kind, description (FailsafeFlags.msg).
 _FLAGS = {
-    "manual_control_signal_lost": ("radio", "the signal of the radio control is lost"),
-    "gcs_connection_lost": ("ground station", "the connection to the ground station is lost"),
-    "offboard_control_signal_lost": ("offboard", "no set-points come"),
+    "manual_control_signal_lost": ("radio", "RC signal lost"),
+    "gcs_connection_lost": ("ground station", "ground station connection lost"),
+    "offboard_control_signal_lost": ("offboard", "no offboard set-points"),
     "geofence_breached": ("fence", "outside the fence"),
-    "battery_unhealthy": ("battery", "the battery is not healthy"),
-    "battery_low_remaining_time": ("battery", "the battery will not last much longer"),
-    "global_position_invalid": ("estimator", "the global position is not valid"),
-    "local_position_invalid": ("estimator", "the local position is not valid"),
-    "attitude_invalid": ("estimator", "the attitude is not valid"),
-    "mission_failure": ("mission", "the mission failed"),
-    "wind_limit_exceeded": ("wind", "the wind is too strong"),
-    "flight_time_limit_exceeded": ("time", "the flight took too long"),
-    "navigator_failure": ("general", "the navigator failed"),
-    "fd_critical_failure": ("crash", "attitude or height beyond their limits"),
-    "fd_motor_failure": ("motor", "a motor failed"),
-    "vtol_fixed_wing_system_failure": ("transition", "failure as a fixed wing"),
+    "battery_unhealthy": ("battery", "battery unhealthy"),
+    "battery_low_remaining_time": ("battery", "low remaining battery time"),
+    "global_position_invalid": ("estimator", "global position invalid"),
+    "local_position_invalid": ("estimator", "local position invalid"),
+    "attitude_invalid": ("estimator", "attitude invalid"),
+    "mission_failure": ("mission", "mission failed"),
+    "wind_limit_exceeded": ("wind", "wind limit exceeded"),
+    "flight_time_limit_exceeded": ("time", "flight time limit exceeded"),
+    "navigator_failure": ("general", "navigator failed"),
+    "fd_critical_failure": ("crash", "attitude or altitude limit exceeded"),
+    "fd_motor_failure": ("motor", "motor failed"),
+    "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
-"""A flag of failsafe_flags → kind, in words (FailsafeFlags.msg)."""
 _WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
-_SEARCHING = 0.9  # of all the work is pyulog's
+_LOADING_SHARE = 0.9  # of the total time
 
 
-def read_ulog_flight(flight: Flight, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
+def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
     """Fill a flight from its file.
 
     Raises:
-        FileFormatError: it is no log of PX4.
+        FileFormatError: the file is not a PX4 log.
         ModuleNotFoundError: pyulog is not installed.
     """
     core = import_module("pyulog")
     try:
-        # It prints what is damaged, where our answers may go to.
+        # pyulog prints damage to stdout, which may carry our output.
         with flight.path.open("rb") as file, redirect_stdout(sys.stderr):
-            log = core.ULog(_Watched(file, flight.path.stat().st_size, on_bytes), list(_TOPICS))
-    except Exception as error:  # whatever it raises on a file that is none
-        raise FileFormatError(f"{flight.path} is no log of PX4: {error}") from error
+            log = core.ULog(_ProgressFile(file, flight.path.stat().st_size, on_bytes), list(_TOPICS))
+    except Exception as error:  # pyulog raises arbitrary errors for other files
+        raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
     if not log.data_list and not log.logged_messages:
-        raise FileFormatError(f"{flight.path} holds no data of a flight")
+        raise FileFormatError(f"{flight.path} contains no data of a flight")
     if log.file_corruption:
-        flight.notes.append("the log is damaged: what could be read is shown")
+        flight.notes.append("the log is damaged: only the readable part is shown")
     if log.dropouts:
-        lost_s = sum(each.duration for each in log.dropouts) / 1e3
-        flight.notes.append(
-            f"{len(log.dropouts)} gaps where the logger was too slow, {lost_s:.1f} s together"
-        )
+        lost_s = sum(dropout.duration for dropout in log.dropouts) / 1e3
+        flight.notes.append(f"{len(log.dropouts)} logging dropouts, {lost_s:.1f} s in total")
     _Reader(flight, log).read()
 
 
-class _Watched:
-    """A file that tells how far it was read."""
+class _ProgressFile:
+    """A file that reports how far it was read."""
 
     def __init__(self, file: Any, size: int, on_bytes: Callable[[int], object]) -> None:
         self._read, self._seek, self._tell, self._on_bytes = file.read, file.seek, file.tell, on_bytes
@@ -112,7 +108,7 @@ class _Watched:
     def read(self, count: int = -1) -> bytes:
         self._calls += 1
         if not self._calls & 0xFFFF:
-            self._on_bytes(round(_SEARCHING * self._tell()))
+            self._on_bytes(round(_LOADING_SHARE * self._tell()))
         data: bytes = self._read(count)
         return data
 
@@ -124,7 +120,7 @@ class _Watched:
 
 
 class _Topic:
-    """The columns of one instance of a topic, with times in seconds since the log began."""
+    """One instance of a topic, with times in seconds since the start of the log."""
 
     def __init__(self, data: dict[str, Any], began_us: int) -> None:
         self._data = data
@@ -134,18 +130,18 @@ class _Topic:
         return field in self._data
 
     def array(self, *fields: str) -> Any:
-        """The column of the first of these fields that there is, as numpy has it; NaN without any."""
+        """Return the first existing column as a numpy array; NaN if there is none."""
         for field in fields:
             if field in self._data:
                 return self._data[field].astype("float64")
         return self._data["timestamp"] * NAN
 
     def rows(self, *fields: str) -> Iterator[tuple[Any, ...]]:
-        """Times and values, fields that are missing as NaN."""
+        """Yield times and values; missing fields are NaN."""
         yield from zip(self.times, *(self.array(field).tolist() for field in fields), strict=True)
 
     def changes(self, field: str) -> Iterator[tuple[float, float]]:
-        """The first value and each other one."""
+        """Yield the first value, and each change."""
         before = None
         for time_s, value in self.rows(field):
             if value != before:
@@ -154,7 +150,7 @@ class _Topic:
 
 
 class _Reader:
-    def __init__(self, flight: Flight, log: Any) -> None:
+    def __init__(self, flight: FlightLog, log: Any) -> None:
         self._flight, self._log = flight, log
         self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
         firsts = [int(data.data["timestamp"][0]) for data in self._data]
@@ -164,23 +160,21 @@ class _Reader:
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
-        utc = _utc_at_0(log)
+        utc = utc_at_boot(log)
         flight.begins_at = utc + self._began_us / 1e6
         flight.ends_at = utc + log.last_timestamp / 1e6
         if not utc:
-            flight.notes.append(
-                "no satellite receiver told the time: times count from the start of the controller"
-            )
+            flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for severity, at, text in (
-            (int(each.log_level) - 48, each.timestamp, each.message) for each in log.logged_messages
+            (int(text.log_level) - 48, text.timestamp, text.message) for text in log.logged_messages
         ):
-            # The level is the kernel's, as a character; MAVLink's severities have the same numbers.
-            flight.texts.append(Said(self._time(at), max(0, min(7, severity)), readable(str(text))))
-        parameters = [(log.start_timestamp, *each) for each in log.initial_parameters.items()]
+            # The kernel's level as a character; MAV_SEVERITY has the same numbers.
+            flight.texts.append(LoggedText(self._time(at), max(0, min(7, severity)), clean_text(str(text))))
+        parameters = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
         for at, name, value in (*parameters, *log.changed_parameters):
             if isinstance(value, (int, float)):
-                flight.note_parameter(self._time(at), str(name), float(value))
+                flight.set_parameter(self._time(at), str(name), float(value))
         self._status()
         self._movement()
         self._targets()
@@ -190,28 +184,26 @@ class _Reader:
         return max((int(at_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """The instances of the first of these topics that there is, with their numbers."""
+        """Return the instances, with their numbers, of the first existing topic."""
         for name in names:
-            found = [each for each in self._data if each.name == name]
+            found = [topic for topic in self._data if topic.name == name]
             if found:
-                return [(each.multi_id, _Topic(each.data, self._began_us)) for each in found]
+                return [(topic.multi_id, _Topic(topic.data, self._began_us)) for topic in found]
         return []
 
     def _topic(self, *names: str) -> _Topic | None:
         return next((topic for _, topic in self._topics(*names)), None)
-
-    # -------------------------------------------------------------------------------------- status
 
     def _status(self) -> None:
         flight, status = self._flight, self._topic("vehicle_status")
         if status is not None:
             self._modes(status)
             for time_s, state in status.changes("arming_state"):
-                flight.note_armed(time_s, state == _ARMED)
+                flight.set_armed(time_s, state == _ARMED)
             for time_s, failsafe in status.changes("failsafe"):
                 if failsafe == 1:
-                    flight.signs.append(
-                        Sign(time_s, "general", "the failsafe acts (vehicle_status.failsafe)", True)
+                    flight.failsafe_evidence.append(
+                        FailsafeEvidence(time_s, "general", "failsafe active (vehicle_status.failsafe)", True)
                     )
         self._failsafe_flags()
 
@@ -220,11 +212,11 @@ class _Reader:
         for time_s, state, wanted, failsafe in status.rows(*fields):
             name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
             by_itself = bool(state != wanted) if wanted == wanted else None
-            reason = "failsafe" if failsafe == 1 else "by itself" if by_itself else ""
-            self._flight.note_mode(time_s, name, reason, by_itself)
+            reason = "failsafe" if failsafe == 1 else "autopilot" if by_itself else ""
+            self._flight.add_mode(time_s, name, reason, by_itself)
 
     def _failsafe_flags(self) -> None:
-        """Only while armed: on the ground many of them are set, and mean nothing."""
+        # Only while armed: on the ground many flags are set without meaning.
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
@@ -234,25 +226,23 @@ class _Reader:
 
         for name, (kind, text) in _FLAGS.items():
             if name in flags:
-                flight.signs += [
-                    Sign(time_s, kind, f"{text} ({name})")
+                flight.failsafe_evidence += [
+                    FailsafeEvidence(time_s, kind, f"{text} ({name})")
                     for time_s, value in flags.changes(name)
                     if value == 1 and is_armed(time_s)
                 ]
         for time_s, warning in flags.changes("battery_warning"):
             if warning in _WARNINGS and is_armed(time_s):
-                flight.signs.append(
-                    Sign(time_s, "battery", f"the battery is {_WARNINGS[int(warning)]} (battery_warning)")
+                flight.failsafe_evidence.append(
+                    FailsafeEvidence(time_s, "battery", f"battery {_WARNINGS[int(warning)]} (battery_warning)")
                 )
-
-    # ------------------------------------------------------------------------------------ movement
 
     def _movement(self) -> None:
         flight = self._flight
         home = self._topic("home_position")
         if home is not None:
             for row in home.rows("lat", "lon", "alt"):
-                flight.note_home(*row)
+                flight.set_home(*row)
         place = self._topic("vehicle_global_position")
         if place is not None:
             latitude, longitude, amsl = place.array("lat"), place.array("lon"), place.array("alt")
@@ -288,7 +278,7 @@ class _Reader:
                     scale, metres = (1e7, 1e3) if old else (1, 1)
                     self._flight.track.add(time_s, latitude / scale, longitude / scale, amsl / metres, NAN)
 
-    def _angles(self, columns: Columns, topic: _Topic | None, field: str) -> None:
+    def _angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:
         if topic is None or f"{field}[0]" not in topic:
             return
         numpy = import_module("numpy")
@@ -316,7 +306,7 @@ class _Reader:
         if origin is None:
             return
         latitude, longitude, amsl = origin
-        plane = Plane(latitude, longitude)
+        plane = TangentPlane(latitude, longitude)
         _extend(
             flight.position_target,
             wanted.times,
@@ -326,15 +316,11 @@ class _Reader:
         )
 
     def _origin(self, local: _Topic | None) -> tuple[float, float, float] | None:
-        """Where the local frame has its origin: the last that was told; it moves on the ground, before the flight."""
+        """Return the last origin of the local frame; PX4 moves it on the ground, before the flight."""
         if local is None:
             return None
-        rows = [
-            row[1:4] for row in local.rows("ref_lat", "ref_lon", "ref_alt") if row[1] == row[1] and row[1]
-        ]
+        rows = [row[1:4] for row in local.rows("ref_lat", "ref_lon", "ref_alt") if row[1] == row[1] and row[1]]
         return rows[-1] if rows else None
-
-    # ----------------------------------------------------------------------------------- equipment
 
     def _equipment(self) -> None:
         flight = self._flight
@@ -342,9 +328,9 @@ class _Reader:
             remaining = battery.array("remaining") * 100
             remaining[remaining < 0] = NAN
             current = battery.array("current_a")
-            current[current < 0] = NAN  # -1: not known
+            current[current < 0] = NAN  # -1: unknown
             voltage, used = battery.array("voltage_v"), battery.array("discharged_mah")
-            voltage[voltage <= 0] = NAN  # 0: not known
+            voltage[voltage <= 0] = NAN  # 0: unknown
             used[used < 0] = NAN
             _extend(
                 flight.battery(number),
@@ -381,7 +367,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
-        """Of several links the one that received most."""
+        # Of several links, use the one that received the most messages.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
             best = max(links, key=lambda topic: float(topic.array("rx_message_count")[-1]))
@@ -402,21 +388,19 @@ class _Reader:
 _GPS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_msl_m")
 
 
-def _extend(columns: Columns, times: Sequence[float], **values: Any) -> None:
-    columns.extend(
-        times, **{name: array("d", value.astype("float64").tobytes()) for name, value in values.items()}
-    )
+def _extend(columns: TimeSeries, times: Sequence[float], **values: Any) -> None:
+    columns.extend(times, **{name: array("d", value.astype("float64").tobytes()) for name, value in values.items()})
 
 
 def _version(log: Any) -> str:
-    told = log.msg_info_dict.get("ver_sw_release")
-    if not isinstance(told, int) or not told:
+    release = log.msg_info_dict.get("ver_sw_release")
+    if not isinstance(release, int) or not release:
         return Px4.name
-    return f"{Px4.name} {told >> 24 & 0xFF}.{told >> 16 & 0xFF}.{told >> 8 & 0xFF}"
+    return f"{Px4.name} {release >> 24 & 0xFF}.{release >> 16 & 0xFF}.{release >> 8 & 0xFF}"
 
 
-def _utc_at_0(log: Any) -> float:
-    """UTC when PX4's clock was 0; 0 when no receiver told the time."""
+def utc_at_boot(log: Any) -> float:
+    """Return UTC at PX4's boot, when its clock was 0; 0 without GNSS time."""
     for data in log.data_list:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():

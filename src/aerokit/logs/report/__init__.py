@@ -1,7 +1,109 @@
-"""A flight, or two compared, as one HTML file that needs no network; see docs/report.md."""
+"""Reports on one flight, or a comparison of two, as one self-contained HTML file; see docs/report.md."""
 
 from __future__ import annotations
 
-from aerokit.logs.report.writing import Report, write_report
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aerokit._internal.files import write_atomically
+from aerokit._internal.values import Snapshot
+from aerokit.errors import InvalidArgument
+from aerokit.logs.flights import check_log_name, read_flight
+from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.report.comparing import NAMES, comparison
+from aerokit.logs.report.page import page
+from aerokit.logs.report.sections import SECTIONS
+from aerokit.logs.report.statistics import FlightStatistics, date, statistics_of, summary
+
+if TYPE_CHECKING:
+    from aerokit.logs.flights.failsafes import Failsafe
+    from aerokit.logs.flights.flight import FlightLog
+    from aerokit.protocols.exchange import OnProgress
 
 __all__ = ["Report", "write_report"]
+
+
+class Report(Snapshot):
+    """The written report, and its main content."""
+
+    target: Path
+    bytes: int
+    summaries: tuple[tuple[str, ...], ...]
+    """Sentences of the summary, for each flight."""
+    statistics: tuple[FlightStatistics, ...]
+    """For each flight."""
+    failsafes: tuple[tuple[Failsafe, ...], ...]
+    """For each flight."""
+
+
+def write_report(
+    log: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    compare_with: str | os.PathLike[str] | None = None,
+    system_id: int | None = None,
+    force: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Report:
+    """Write a report on a flight, or a comparison of two, as one HTML file that loads nothing.
+
+    The file appears when it is complete. Blocks; needs no event loop.
+
+    Args:
+        log: a ``.tlog`` of a ground station or of ``record=``, a ``.bin`` of ArduPilot, a ``.ulg`` of PX4.
+        target: the file, ``flight.html``.
+        compare_with: a second log, of any kind.
+        system_id: system id of the vehicle, if a ``.tlog`` contains several; None: the first one.
+        force: replace an existing file.
+        on_progress: called from time to time with the bytes that were read, for each log.
+
+    Raises:
+        InvalidArgument: the file exists, or its name does not end in .html.
+        FileFormatError: a file is not a log, or nothing can be read.
+        OSError: a file cannot be read or written.
+        ModuleNotFoundError: a package of the extra ``report`` is not installed.
+    """
+    to = Path(target)
+    if to.suffix.lower() not in (".html", ".htm"):
+        raise InvalidArgument(f"target = {str(to)!r} is not allowed: the name of a report must end in .html")
+    logs = [log] if compare_with is None else [log, compare_with]
+    for path in logs:
+        check_log_name(Path(path))  # first, because the default target is derived from it
+    if to.exists() and not force:
+        raise InvalidArgument(f"{to} exists; use force (--force) to replace it")
+    flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]
+    statistics = [statistics_of(flight) for flight in flights]
+    summaries = [summary(*pair) for pair in zip(flights, statistics, strict=True)]
+    write_atomically(to, _render(flights, statistics, summaries))
+    return Report(
+        to,
+        to.stat().st_size,
+        tuple(map(tuple, summaries)),
+        tuple(statistics),
+        tuple(tuple(failsafes(flight)) for flight in flights),
+    )
+
+
+def report_html(flight: FlightLog) -> str:
+    """Return the HTML of a report on one flight; raises ModuleNotFoundError without plotly."""
+    statistics = statistics_of(flight)
+    return _render([flight], [statistics], [summary(flight, statistics)])
+
+
+def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summaries: list[list[str]]) -> str:
+    if len(flights) == 1:
+        flight = flights[0]
+        sections = [section for make in SECTIONS if (section := make(flight)) is not None]
+        return page(flight.path.name, [(_heading(flight), summaries[0])], sections)
+    one, other = flights
+    headed = [
+        (f"{name}: {flight.path.name}, {_heading(flight)}", sentences)
+        for name, flight, sentences in zip(NAMES, flights, summaries, strict=True)
+    ]
+    sections = comparison((one, other), (statistics[0], statistics[1]))
+    return page(f"{one.path.name} and {other.path.name}", headed, sections)
+
+
+def _heading(flight: FlightLog) -> str:
+    return f"{flight.vehicle}, system {flight.system_id}, {date(flight.begins_at)}"

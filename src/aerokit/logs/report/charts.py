@@ -1,4 +1,4 @@
-"""The charts of a flight as Plotly reads them: the map without tiles, and lines over time with modes behind them."""
+"""Plotly charts of a flight: a map without tiles, and lines over time with mode bands."""
 
 from __future__ import annotations
 
@@ -6,24 +6,26 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.flights.columns import Plane
 from aerokit.logs.flights.failsafes import failsafes
-from aerokit.logs.report.figures import clock, metres_from_home
+from aerokit.logs.flights.flight import TangentPlane
 from aerokit.logs.report.page import Chart
+from aerokit.logs.report.statistics import clock, metres_from_home
 from aerokit.missions.item import command_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from aerokit.logs.flights.columns import Columns
-    from aerokit.logs.flights.flight import Flight
+    from aerokit.logs.flights.flight import FlightLog, TimeSeries
 
-POINTS = 2000
-"""So many points of a line are drawn at most."""
+MAX_POINTS = 2000
+"""Maximum number of points of a line."""
+COLOURS = ("#1f77b4", "#e4572e", "#2ca02c", "#a05eb5", "#d69e00", "#17a2b8", "#8c564b", "#e377c2")
+_MAX_BANDS = 80
+_MAX_POINTS = 6000
 
 
-def points(columns: Columns, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
-    """Times and values of a column to draw; None is a gap."""
+def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
+    """Return times and values of a column for drawing; None is a gap."""
     values, times = columns[name], columns.times
     rows = rows_to_draw(len(values), (values,))
     return (
@@ -32,11 +34,11 @@ def points(columns: Columns, name: str, digits: int = 3) -> tuple[list[float], l
     )
 
 
-def rows_to_draw(count: int, columns: Sequence[Any], most: int = POINTS) -> list[int]:
-    """Rows that show all peaks of these columns; values that are not known stay as gaps."""
-    if count <= most:
+def rows_to_draw(count: int, columns: Sequence[Any], max_rows: int = MAX_POINTS) -> list[int]:
+    """Select rows that preserve all peaks and gaps of these columns."""
+    if count <= max_rows:
         return list(range(count))
-    pieces = max(most // (2 * len(columns)), 1)
+    pieces = max(max_rows // (2 * len(columns)), 1)
     found = {0, count - 1}
     for piece in range(pieces):
         begin, end = count * piece // pieces, count * (piece + 1) // pieces
@@ -53,137 +55,119 @@ def rows_to_draw(count: int, columns: Sequence[Any], most: int = POINTS) -> list
 
 
 def _is_gap(values: Any, begin: int, end: int) -> bool:
-    """Whether half of a piece is not known: single unknown values between known ones are none."""
+    """Return True if more than half of a segment is unknown; single unknown values are not drawn as gaps."""
     unknown = sum(1 for row in range(begin, end) if values[row] != values[row])
     return unknown * 2 > end - begin
 
 
-COLOURS = ("#1f77b4", "#e4572e", "#2ca02c", "#a05eb5", "#d69e00", "#17a2b8", "#8c564b", "#e377c2")
-
-_WANTED, _FAILED = "#999999", "#d62728"
-
-_MOST_BANDS = 80
-
-_MOST_POINTS = 6000
+_SETPOINT_COLOUR, _FAILSAFE_COLOUR = "#999999", "#d62728"
 
 
-def mode_colours(flight: Flight) -> dict[str, str]:
-    """A colour for each mode, in the order of their first use."""
+def mode_colours(flight: FlightLog) -> dict[str, str]:
     names = dict.fromkeys(change.name for change in flight.modes)
     return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
-def line(name: str, columns: Columns, column: str, digits: int = 3, **look: Any) -> dict[str, Any] | None:
-    """A line over time; None when nothing of it is known."""
+def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
+    """Return a line over time; None if all values are unknown."""
     if not columns.has(column):
         return None
     x, y = points(columns, column, digits)
-    return {"x": x, "y": y, "name": name, "mode": "lines", "connectgaps": False, **look}
+    return {"x": x, "y": y, "name": name, "mode": "lines", "connectgaps": False, **style}
 
 
-def wanted(name: str, columns: Columns, column: str, digits: int = 3) -> dict[str, Any] | None:
-    """A line of what was wanted, beside what was flown."""
-    found = line(name, columns, column, digits, line={"color": _WANTED, "dash": "dot", "width": 1.5})
+def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) -> dict[str, Any] | None:
+    """Return a line of set-points, in the style that distinguishes them from measured values."""
+    found = line(name, columns, column, digits, line={"color": _SETPOINT_COLOUR, "dash": "dot", "width": 1.5})
     if found is not None:
         found["connectgaps"] = True
     return found
 
 
 def over_time(
-    flight: Flight, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
+    flight: FlightLog, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
 ) -> Chart | None:
-    """A chart over time, modes behind it and failsafes across it; None without a line."""
+    """Return a chart over time with mode bands and failsafe lines; None without lines."""
     drawn = [trace for trace in traces if trace is not None]
     if not drawn:
         return None
     height = layout.pop("height", 300)
-    whole = {
-        "xaxis": {"title": {"text": "seconds since the log began"}},
+    full_layout = {
+        "xaxis": {"title": {"text": "seconds since the start of the log"}},
         "yaxis": {"title": {"text": unit}, **layout.pop("yaxis", {})},
         "shapes": [*_bands(flight), *_failsafe_lines(flight), *layout.pop("shapes", [])],
         **layout,
     }
-    return Chart(name, drawn, whole, height, f"{unit} over time: {', '.join(t['name'] for t in drawn)}")
+    return Chart(name, drawn, full_layout, height, f"{unit} over time: {', '.join(t['name'] for t in drawn)}")
 
 
-def _bands(flight: Flight) -> list[dict[str, Any]]:
-    colours, found = mode_colours(flight), []
-    for change, end in flight.mode_spans()[:_MOST_BANDS]:
-        found.append(
-            {
-                "type": "rect",
-                "xref": "x",
-                "yref": "paper",
-                "y0": 0,
-                "y1": 1,
-                "layer": "below",
-                "x0": round(change.time_s, 2),
-                "x1": round(end, 2),
-                "line": {"width": 0},
-                "fillcolor": colours[change.name],
-                "opacity": 0.1,
-            }
-        )
-    return found
+def _vertical(kind: str, x0: float, x1: float, **style: Any) -> dict[str, Any]:
+    span = {"x0": round(x0, 2), "x1": round(x1, 2), "y0": 0, "y1": 1}
+    return {"type": kind, "xref": "x", "yref": "paper", **span, **style}
 
 
-def _failsafe_lines(flight: Flight) -> list[dict[str, Any]]:
+def _bands(flight: FlightLog) -> list[dict[str, Any]]:
+    colours, style = mode_colours(flight), {"layer": "below", "line": {"width": 0}, "opacity": 0.1}
     return [
-        {
-            "type": "line",
-            "xref": "x",
-            "yref": "paper",
-            "y0": 0,
-            "y1": 1,
-            "x0": round(each.time_s, 2),
-            "x1": round(each.time_s, 2),
-            "line": {"color": _FAILED, "width": 1.5, "dash": "solid" if each.acted else "dot"},
-        }
-        for each in failsafes(flight)[:_MOST_BANDS]
+        _vertical("rect", change.time_s, end, fillcolor=colours[change.name], **style)
+        for change, end in flight.mode_spans()[:_MAX_BANDS]
     ]
 
 
-# ------------------------------------------------------------------------------------------- the map
-def track_chart(flight: Flight) -> Chart | None:
-    """The track from above, in metres from home, a colour for each mode; None without a place."""
+def _failsafe_lines(flight: FlightLog) -> list[dict[str, Any]]:
+    return [
+        _vertical(
+            "line",
+            failsafe.time_s,
+            failsafe.time_s,
+            line={"color": _FAILSAFE_COLOUR, "width": 1.5, "dash": "solid" if failsafe.acted else "dot"},
+        )
+        for failsafe in failsafes(flight)[:_MAX_BANDS]
+    ]
+
+
+def track_chart(flight: FlightLog) -> Chart | None:
+    """Return the track from above, in metres from home, with a colour for each mode; None without positions."""
     places = metres_from_home(flight)
     if not places or flight.home is None:
         return None
-    plane = Plane(flight.home.latitude_deg, flight.home.longitude_deg)
+    plane = TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg)
     traces = [
-        *_wanted_path(flight, plane),
+        *_setpoint_path(flight, plane),
         *_mission(flight, plane),
         *_fence(flight),
-        *_flown(flight, places),
+        *_track_lines(flight, places),
         _marker("home", [(0.0, 0.0)], "circle", "#2ca02c", 11),
-        *_failed(flight, places),
+        *_failsafe_markers(flight, places),
     ]
-    layout = {
-        "xaxis": {
-            "title": {"text": "metres east of home"},
-            "constrain": "domain",
-            "autorangeoptions": {"include": with_margin([place[1] for place in places])},
-        },
-        "yaxis": {"title": {"text": "metres north of home"}, "scaleanchor": "x", "scaleratio": 1},
-        "hovermode": "closest",
-    }
+    layout = map_layout([place[1] for place in places], constrain="domain")
     return Chart("map", traces, layout, 520, "the track from above, north is up")
 
 
-def with_margin(values: Sequence[float]) -> list[float]:
-    """The least and the greatest with some room beside them: Plotly leaves none at the ends of a line in x."""
+def map_layout(east: Sequence[float], **xaxis: Any) -> dict[str, Any]:
+    """Return the layout of a map that shows these eastings."""
+    include = {"autorangeoptions": {"include": _with_margin(east)}}
+    return {
+        "xaxis": {"title": {"text": "metres east of home"}, **include, **xaxis},
+        "yaxis": {"title": {"text": "metres north of home"}, "scaleanchor": "x", "scaleratio": 1},
+        "hovermode": "closest",
+    }
+
+
+def _with_margin(values: Sequence[float]) -> list[float]:
+    """Return minimum and maximum with a margin, which Plotly omits at the ends of lines in x."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return []
-    room = max(0.05 * (max(known) - min(known)), 1.0)
-    return [round(min(known) - room, 1), round(max(known) + room, 1)]
+    margin = max(0.05 * (max(known) - min(known)), 1.0)
+    return [round(min(known) - margin, 1), round(max(known) + margin, 1)]
 
 
-def _flown(flight: Flight, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
     track, colours, found = flight.track, mode_colours(flight), []
     north = [place[0] for place in places]
     east = [place[1] for place in places]
-    rows = rows_to_draw(len(places), (north, east), _MOST_POINTS)
+    rows = rows_to_draw(len(places), (north, east), _MAX_POINTS)
     heights = track["altitude_relative_m"]
     changes = [(change.time_s, change.name) for change in flight.modes] or [(0.0, "")]
     changes[0] = (-math.inf, changes[0][1])
@@ -196,8 +180,8 @@ def _flown(flight: Flight, places: Sequence[tuple[float, float]]) -> list[dict[s
             continue
         found.append(
             {
-                "x": [_round(east[row]) for row in part],
-                "y": [_round(north[row]) for row in part],
+                "x": [rounded(east[row]) for row in part],
+                "y": [rounded(north[row]) for row in part],
                 "text": [_here(track.times[row], heights[row]) for row in part],
                 "mode": "lines",
                 "name": name or "track",
@@ -215,11 +199,11 @@ def _here(time_s: float, height_m: float) -> str:
     return clock(time_s) + (f", {height_m:.1f} m up" if height_m == height_m else "")
 
 
-def _round(value: float) -> float | None:
+def rounded(value: float) -> float | None:
     return round(value, 2) if math.isfinite(value) else None
 
 
-def _wanted_path(flight: Flight, plane: Plane) -> list[dict[str, Any]]:
+def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
     target = flight.position_target
     places = [
         plane.metres(*place)
@@ -229,36 +213,36 @@ def _wanted_path(flight: Flight, plane: Plane) -> list[dict[str, Any]]:
     if not places:
         return []
     north, east = [place[0] for place in places], [place[1] for place in places]
-    rows = rows_to_draw(len(places), (north, east), _MOST_POINTS // 2)
+    rows = rows_to_draw(len(places), (north, east), _MAX_POINTS // 2)
     return [
         {
-            "x": [_round(east[row]) for row in rows],
-            "y": [_round(north[row]) for row in rows],
+            "x": [rounded(east[row]) for row in rows],
+            "y": [rounded(north[row]) for row in rows],
             "mode": "lines",
-            "name": "wanted",
-            "line": {"color": _WANTED, "width": 1.5, "dash": "dot"},
+            "name": "set-point",
+            "line": {"color": _SETPOINT_COLOUR, "width": 1.5, "dash": "dot"},
             "hoverinfo": "skip",
         }
     ]
 
 
-def _mission(flight: Flight, plane: Plane) -> list[dict[str, Any]]:
-    items = [each for each in flight.mission if each.latitude_deg == each.latitude_deg and each.number > 0]
+def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
+    items = [item for item in flight.mission if item.latitude_deg == item.latitude_deg and item.number > 0]
     if not items:
         return []
     found = _marker(
         "mission",
-        [plane.metres(each.latitude_deg, each.longitude_deg) for each in items],
+        [plane.metres(item.latitude_deg, item.longitude_deg) for item in items],
         "diamond-open",
         "#555555",
         9,
-        [f"{each.number} {command_name(each.command)}" for each in items],
+        [f"{item.number} {command_name(item.command)}" for item in items],
     )
     return [{**found, "mode": "markers+lines", "line": {"color": "#888888", "width": 1, "dash": "dash"}}]
 
 
-def _fence(flight: Flight) -> list[dict[str, Any]]:
-    """The circle around home that the parameters tell; polygons are not in a log."""
+def _fence(flight: FlightLog) -> list[dict[str, Any]]:
+    """Return the circular fence from the parameters. Logs do not contain polygons."""
     end, value = flight.duration_s, flight.parameter_at
     radius = value("GF_MAX_HOR_DIST", end)
     if value("FENCE_ENABLE", end) >= 1 and int(value("FENCE_TYPE", end)) & 2:
@@ -273,19 +257,19 @@ def _fence(flight: Flight) -> list[dict[str, Any]]:
             "mode": "lines",
             "name": "fence",
             "hoverinfo": "skip",
-            "line": {"color": _FAILED, "width": 1, "dash": "dash"},
+            "line": {"color": _FAILSAFE_COLOUR, "width": 1, "dash": "dash"},
         }
     ]
 
 
-def _failed(flight: Flight, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
     found, names = [], []
-    for each in failsafes(flight):
-        row = flight.track.index_at(each.time_s)
+    for failsafe in failsafes(flight):
+        row = flight.track.index_at(failsafe.time_s)
         if row >= 0 and places[row][0] == places[row][0]:
             found.append(places[row])
-            names.append(f"{each.title}, {clock(each.time_s)}")
-    return [_marker("failsafe", found, "x", _FAILED, 12, names)] if found else []
+            names.append(f"{failsafe.title}, {clock(failsafe.time_s)}")
+    return [_marker("failsafe", found, "x", _FAILSAFE_COLOUR, 12, names)] if found else []
 
 
 def _marker(
@@ -297,8 +281,8 @@ def _marker(
     texts: Sequence[str] = (),
 ) -> dict[str, Any]:
     return {
-        "x": [_round(east) for _, east in places],
-        "y": [_round(north) for north, _ in places],
+        "x": [rounded(east) for _, east in places],
+        "y": [rounded(north) for north, _ in places],
         "mode": "markers",
         "name": name,
         "text": list(texts) or [name] * len(places),

@@ -1,51 +1,50 @@
-"""The sections of a report that compares two flights; their times count from when each was first armed."""
+"""Sections of a report that compares two flights. Times count from the first arming of each flight."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.report.charts import COLOURS, points, rows_to_draw, with_margin
-from aerokit.logs.report.figures import metres_from_home, span
-from aerokit.logs.report.page import Chart, Section, Table, Words
+from aerokit.logs.report.charts import COLOURS, map_layout, points, rounded, rows_to_draw
+from aerokit.logs.report.page import Chart, Paragraphs, Section, Table
 from aerokit.logs.report.sections import failsafe_section
+from aerokit.logs.report.statistics import metres_from_home, span
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from aerokit.logs.flights.columns import Columns
-    from aerokit.logs.flights.flight import Flight
-    from aerokit.logs.report.figures import Figures
+    from aerokit.logs.flights.flight import FlightLog, TimeSeries
     from aerokit.logs.report.page import Part
+    from aerokit.logs.report.statistics import FlightStatistics
 
 NAMES = ("A", "B")
-"""What the two flights are called in charts and tables."""
+"""Names of the two flights in charts and tables."""
 
-_FIGURES = {
+# Field of `FlightStatistics` → label, digits.
+_STATISTICS = {
     "armed_s": ("armed, s", 0),
-    "way_m": ("flown, m", 0),
-    "highest_m": ("highest above home, m", 1),
-    "farthest_m": ("farthest from home, m", 0),
-    "fastest_m_s": ("fastest, m/s", 1),
-    "climbed_m_s": ("fastest climb, m/s", 1),
-    "sank_m_s": ("fastest descent, m/s", 1),
-    "tilted_deg": ("greatest angle, °", 0),
-    "ended_m": ("end from home, m", 1),
-    "voltage_before_v": ("battery before, V", 2),
-    "voltage_after_v": ("battery after, V", 2),
-    "voltage_least_v": ("battery at the least, V", 2),
-    "remaining_before_percent": ("left before, %", 0),
-    "remaining_after_percent": ("left after, %", 0),
-    "current_most_a": ("greatest current, A", 1),
-    "satellites_least": ("fewest satellites", 0),
-    "hdop_most": ("worst HDOP", 2),
-    "vibration_most_m_s2": ("greatest vibration, m/s²", 1),
-    "clips": ("clips", 0),
-    "estimator_most": ("worst ratio of the estimator", 2),
+    "distance_m": ("distance flown, m", 0),
+    "max_height_m": ("max height above home, m", 1),
+    "max_distance_m": ("max distance from home, m", 0),
+    "max_speed_m_s": ("max speed, m/s", 1),
+    "max_climb_m_s": ("max climb rate, m/s", 1),
+    "max_descent_m_s": ("max descent rate, m/s", 1),
+    "max_tilt_deg": ("max tilt, °", 0),
+    "end_distance_m": ("distance from home at the end, m", 1),
+    "start_voltage_v": ("battery at start, V", 2),
+    "end_voltage_v": ("battery at end, V", 2),
+    "min_voltage_v": ("battery minimum, V", 2),
+    "start_remaining_percent": ("battery at start, %", 0),
+    "end_remaining_percent": ("battery at end, %", 0),
+    "max_current_a": ("max current, A", 1),
+    "min_satellites": ("min satellites", 0),
+    "max_hdop": ("max HDOP", 2),
+    "max_vibration_m_s2": ("max vibration, m/s²", 1),
+    "clips": ("accelerometer clippings", 0),
+    "max_estimator_ratio": ("max estimator ratio", 2),
     "lost_percent": ("messages lost, %", 2),
 }
-"""Field of `Figures` → in words, digits."""
-_CHARTS: tuple[tuple[str, str, Callable[[Flight], Columns | None], str], ...] = (
+# Title, unit, function that returns the time series, column.
+_CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], ...] = (
     ("Height", "metres above home", lambda flight: flight.track, "altitude_relative_m"),
     ("Roll", "degrees", lambda flight: flight.attitude, "roll_deg"),
     ("Pitch", "degrees", lambda flight: flight.attitude, "pitch_deg"),
@@ -57,11 +56,9 @@ _CHARTS: tuple[tuple[str, str, Callable[[Flight], Columns | None], str], ...] = 
     ("Satellites", "satellites", lambda flight: _first(flight.gps), "satellites"),
     ("Link", "% lost", lambda flight: flight.link, "lost_percent"),
 )
-"""Heading, unit, where the column is, the column."""
 
 
-def comparison(flights: tuple[Flight, Flight], found: tuple[Figures, Figures]) -> list[Section]:
-    """The sections, for two flights and their figures."""
+def comparison(flights: tuple[FlightLog, FlightLog], found: tuple[FlightStatistics, FlightStatistics]) -> list[Section]:
     failed = [failsafe_section(flight) for flight in flights]
     return [
         _differences(found),
@@ -70,28 +67,28 @@ def comparison(flights: tuple[Flight, Flight], found: tuple[Figures, Figures]) -
         _modes(flights),
         _parameters(flights),
         *(
-            Section(f"{each.title} of {name}", each.parts, each.means, each.missing)
-            for name, each in zip(NAMES, failed, strict=True)
+            Section(f"{section.title} of {name}", section.parts, section.explanation, section.missing)
+            for name, section in zip(NAMES, failed, strict=True)
         ),
     ]
 
 
-def _first(by_number: dict[int, Columns]) -> Columns | None:
+def _first(by_number: dict[int, TimeSeries]) -> TimeSeries | None:
     return by_number[min(by_number)] if by_number else None
 
 
-def _differences(found: tuple[Figures, Figures]) -> Section:
+def _differences(found: tuple[FlightStatistics, FlightStatistics]) -> Section:
     rows = []
-    for field, (name, digits) in _FIGURES.items():
-        values = [getattr(each, field) for each in found]
+    for field, (name, digits) in _STATISTICS.items():
+        values = [getattr(statistics, field) for statistics in found]
         if any(value is not None for value in values):
             one, other = values
             change = "" if one is None or other is None else f"{round(other - one, digits) + 0.0:+.{digits}f}"
             rows.append((name, *("unknown" if v is None else f"{v:.{digits}f}" for v in values), change))
-    return Section("Differences", [Table(("figure", *NAMES, "B − A"), rows)])
+    return Section("Differences", [Table(("statistic", *NAMES, "B − A"), rows)])
 
 
-def _maps(flights: Sequence[Flight]) -> Section:
+def _maps(flights: Sequence[FlightLog]) -> Section:
     traces = []
     all_east: list[float] = []
     for number, flight in enumerate(flights):
@@ -102,28 +99,16 @@ def _maps(flights: Sequence[Flight]) -> Section:
         if rows:
             traces.append(
                 {
-                    "x": [_known(east[row]) for row in rows],
-                    "y": [_known(north[row]) for row in rows],
+                    "x": [rounded(east[row]) for row in rows],
+                    "y": [rounded(north[row]) for row in rows],
                     **_look(number),
                 }
             )
     title, missing = "Tracks", "Neither log has positions."
     if not traces:
         return Section(title, missing=missing)
-    layout = {
-        "xaxis": {
-            "title": {"text": "metres east of home"},
-            "autorangeoptions": {"include": with_margin(all_east)},
-        },
-        "yaxis": {"title": {"text": "metres north of home"}, "scaleanchor": "x", "scaleratio": 1},
-        "hovermode": "closest",
-    }
-    chart = Chart("maps", traces, layout, 520, "both tracks from above, north is up")
-    return Section(title, [chart], "From above, each from its own home, north is up.")
-
-
-def _known(value: float) -> float | None:
-    return round(value, 2) if math.isfinite(value) else None
+    chart = Chart("maps", traces, map_layout(all_east), 520, "both tracks from above, north is up")
+    return Section(title, [chart], "From above, relative to each flight's home; north is up.")
 
 
 def _look(number: int) -> dict[str, Any]:
@@ -131,10 +116,10 @@ def _look(number: int) -> dict[str, Any]:
 
 
 def _overlaid(
-    flights: Sequence[Flight],
+    flights: Sequence[FlightLog],
     title: str,
     unit: str,
-    where: Callable[[Flight], Columns | None],
+    where: Callable[[FlightLog], TimeSeries | None],
     column: str,
 ) -> Section:
     traces, lacking = [], []
@@ -147,28 +132,26 @@ def _overlaid(
         begin = flight.armed[0][0] if flight.armed else 0.0
         traces.append({"x": [round(time - begin, 2) for time in times], "y": values, **_look(number)})
     if not traces:
-        return Section(title, missing="Neither log has this.")
+        return Section(title, missing="Neither log contains this.")
     layout = {"xaxis": {"title": {"text": "seconds since arming"}}, "yaxis": {"title": {"text": unit}}}
     chart = Chart("both-" + title.lower().replace(" ", "-"), traces, layout, 240, f"{unit}, both flights")
-    missing = [Words([f"The log of {lacking[0]} has nothing of this."])] if lacking else []
+    missing = [Paragraphs([f"The log of {lacking[0]} does not contain this."])] if lacking else []
     return Section(title, [chart, *missing])
 
 
-def _modes(flights: Sequence[Flight]) -> Section:
-    told = []
+def _modes(flights: Sequence[FlightLog]) -> Section:
+    texts = []
     for name, flight in zip(NAMES, flights, strict=True):
         modes = (f"{change.name} ({span(end - change.time_s)})" for change, end in flight.mode_spans())
-        told.append(f"{name}: {' → '.join(modes) or 'not told'}")
-    return Section("Modes", [Words(told)])
+        texts.append(f"{name}: {' → '.join(modes) or 'not texts'}")
+    return Section("Modes", [Paragraphs(texts)])
 
 
-def _parameters(flights: Sequence[Flight]) -> Section:
+def _parameters(flights: Sequence[FlightLog]) -> Section:
     one, other = (flight.parameters for flight in flights)
     if not one or not other:
         lacking = [name for name, each in zip(NAMES, (one, other), strict=True) if not each]
-        return Section(
-            "Parameters that differ", missing=f"The log of {' and of '.join(lacking)} has no parameters."
-        )
+        return Section("Parameters that differ", missing=f"The log of {' and of '.join(lacking)} has no parameters.")
     rows = [
         (name, _value(one.get(name)), _value(other.get(name)))
         for name in sorted(one.keys() | other.keys())
@@ -177,13 +160,13 @@ def _parameters(flights: Sequence[Flight]) -> Section:
     parts: list[Part] = [
         Table(("parameter", *NAMES), rows, f"{len(rows)} differ" if len(rows) > 40 else "")
         if rows
-        else Words([f"None: all {len(one)} are the same."])
+        else Paragraphs([f"None: all {len(one)} are the same."])
     ]
-    return Section("Parameters that differ", parts, "At the beginning of each log.")
+    return Section("Parameters that differ", parts, "Values at the start of each log.")
 
 
 def _value(value: float | None) -> str:
-    return "not there" if value is None else f"{value:.9g}"
+    return "missing" if value is None else f"{value:.9g}"
 
 
 def _same(one: float | None, other: float | None) -> bool:

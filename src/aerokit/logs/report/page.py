@@ -1,4 +1,4 @@
-"""Sections → one HTML file: everything is in it, everything from a log is escaped, and it can load nothing."""
+"""Renders sections as one HTML file. It is self-contained, loads nothing, and all text from logs is escaped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Words:
+class Paragraphs:
     """Paragraphs, or a list."""
 
     lines: Sequence[str]
@@ -25,55 +25,55 @@ class Words:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts below a header."""
+    """A table of texts."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     folded: str = ""
-    """Not empty: what it is called while it is folded away."""
+    """Title of the collapsed table; empty: not collapsible."""
     marks: Sequence[str] = ()
-    """For each row "", "warning" or "bad"."""
+    """Class of each row: "", "warning" or "bad"."""
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines that Plotly draws.
+    """A Plotly chart.
 
-    Names that are drawn come from aerokit, never from a log: Plotly reads some of HTML in texts.
+    Names must not come from a log, because Plotly interprets some HTML in texts.
     """
 
     name: str
-    """Where it is in the page, once."""
+    """Unique name in the page."""
     traces: Sequence[dict[str, Any]]
     layout: dict[str, Any] = field(default_factory=dict)
     height: int = 300
     label: str = ""
-    """What it shows, for who cannot see it."""
+    """Text alternative for screen readers."""
 
 
-Part = Words | Table | Chart
+Part = Paragraphs | Table | Chart
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, what it means, and its parts; ``missing`` says what the log does not have."""
+    """A section: title, explanation and parts. ``missing`` is shown if the log lacks the data."""
 
     title: str
     parts: Sequence[Part] = ()
-    means: str = ""
+    explanation: str = ""
     missing: str = ""
 
 
 def page(title: str, summaries: Sequence[tuple[str, Sequence[str]]], sections: Sequence[Section]) -> str:
-    """The text of the file; ``summaries`` has a heading and sentences for each flight.
+    """Return the HTML; ``summaries`` has a heading and sentences for each flight.
 
-    Its policy (CSP) lets run the two scripts that are in it, and nothing else, and lets it load nothing: what a
-    hostile log says would be text even if it were not escaped.
+    The Content-Security-Policy allows only the two included scripts, and no network access. It is a second
+    barrier after escaping, for hostile logs.
 
     Raises:
         ModuleNotFoundError: plotly is not installed.
     """
-    scripts = [import_module("plotly.offline").get_plotlyjs(), _ours("draw.js")]
+    scripts = [import_module("plotly.offline").get_plotlyjs(), _resource("draw.js")]
     hashes = " ".join(f"'sha256-{_hash(script)}'" for script in scripts)
     policy = f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
     charts = [part for section in sections for part in section.parts if isinstance(part, Chart)]
@@ -82,7 +82,7 @@ def page(title: str, summaries: Sequence[tuple[str, Sequence[str]]], sections: S
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<title>{escape(title)}</title>",
-        f"<style>{_ours('page.css')}</style></head><body>",
+        f"<style>{_resource('page.css')}</style></head><body>",
         f"<h1>{escape(title)}</h1>",
         *_summary(summaries),
         _contents(sections),
@@ -94,23 +94,20 @@ def page(title: str, summaries: Sequence[tuple[str, Sequence[str]]], sections: S
     return "\n".join(lines)
 
 
-def _ours(name: str) -> str:
+def _resource(name: str) -> str:
     return resources.files("aerokit.logs.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def _hash(script: str) -> str:
-    """As a browser reads the script: it makes every line end a line feed."""
+    """Hash a script as browsers do, with normalized line ends."""
     data = script.replace("\r\n", "\n").replace("\r", "\n").encode()
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 
 
 def _json(charts: Sequence[Chart]) -> str:
-    """By name; no text in it can end the script that holds it."""
-    told = {
-        chart.name: {"traces": chart.traces, "layout": chart.layout, "height": chart.height}
-        for chart in charts
-    }
-    text = json.dumps(told, separators=(",", ":"), allow_nan=False)
+    """Serialize the charts by name; no text can end the surrounding script element."""
+    content = {chart.name: {"traces": chart.traces, "layout": chart.layout, "height": chart.height} for chart in charts}
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -131,8 +128,8 @@ def _section(number: int, section: Section) -> Iterator[str]:
     yield f'<section id="s{number}"><h2>{escape(section.title)}</h2>'
     if section.missing:
         yield f'<p class="missing">{escape(section.missing)}</p>'
-    elif section.means:
-        yield f'<p class="soft">{escape(section.means)}</p>'
+    elif section.explanation:
+        yield f'<p class="soft">{escape(section.explanation)}</p>'
     for part in section.parts:
         yield from _part(part)
     yield "</section>"
@@ -144,9 +141,9 @@ def _part(part: Part) -> Iterator[str]:
             f'<div class="chart" data-chart="{escape(part.name)}" style="min-height:{part.height}px"'
             f' role="img" aria-label="{escape(part.label)}"><noscript>{escape(part.label)}</noscript></div>'
         )
-    elif isinstance(part, Words):
+    elif isinstance(part, Paragraphs):
         tag = "li" if part.is_list else "p"
-        yield from (f"<{tag}>{escape(each)}</{tag}>" for each in part.lines)
+        yield from (f"<{tag}>{escape(line)}</{tag}>" for line in part.lines)
     else:
         yield from _table(part)
 

@@ -1,4 +1,4 @@
-"""The sections of the report of one flight: a table of functions, each of a flight, which give a section or None."""
+"""Sections of the report on one flight: functions that return a section for a flight, or None."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.failsafes import failsafes
-from aerokit.logs.report.charts import line, over_time, track_chart, wanted
-from aerokit.logs.report.figures import clock, date, span
-from aerokit.logs.report.page import Section, Table, Words
+from aerokit.logs.report.charts import line, over_time, setpoint_line, track_chart
+from aerokit.logs.report.page import Paragraphs, Section, Table
+from aerokit.logs.report.statistics import clock, date, span
 from aerokit.missions.item import command_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from aerokit.logs.flights.columns import Columns
     from aerokit.logs.flights.failsafes import Failsafe
-    from aerokit.logs.flights.flight import Flight
+    from aerokit.logs.flights.flight import FlightLog, TimeSeries
     from aerokit.logs.report.page import Part
 
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
+# GPS_FIX_TYPE, for the values that have the same meaning in MAVLink, ArduPilot's logs and PX4's.
 _FIXES = ("no receiver", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed")
-"""GPS_FIX_TYPE, as far as MAVLink, ArduPilot's logs and PX4's have the same numbers."""
-_MOST_TEXTS, _MOST_CHANGES, _MOST_PARAMETERS = 2000, 2000, 5000
-_OWN = (
+_MAX_TEXTS, _MAX_CHANGES, _MAX_PARAMETERS = 2000, 2000, 5000
+# Parts of the names of parameters that the autopilot writes itself.
+_AUTOPILOT_WRITTEN = (
     "STAT_",
     "_GND_PRESS",
     "_GND_TEMP",
@@ -33,170 +33,160 @@ _OWN = (
     "MIS_TOTAL",
     "LOG_LASTFILE",
 )
-"""Parts of names of parameters that the autopilot writes by itself."""
 
 
-def _shown(section: Section, *charts: Part | None) -> Section:
-    """The section with those parts that there are; what is missing is said where there are none."""
+def _with_parts(section: Section, *charts: Part | None) -> Section:
+    """Return the section with the existing parts, or its text for missing data."""
     parts = [part for part in charts if part is not None]
-    return Section(section.title, parts, section.means, "" if parts else section.missing)
+    return Section(section.title, parts, section.explanation, "" if parts else section.missing)
 
 
-# ------------------------------------------------------------------------------------ what was flown
-
-
-def _map(flight: Flight) -> Section:
+def _map(flight: FlightLog) -> Section:
     title = Section(
         "Track",
-        means="From above, north is up; a colour for each mode, dotted what was wanted. There is no background, for"
-        " that would need the network.",
-        missing="The log has no positions.",
+        explanation="From above, north is up. Colours are modes, dotted lines are set-points. There are no map tiles,"
+        " because they would need network access.",
+        missing="The log contains no positions.",
     )
-    return _shown(title, track_chart(flight))
+    return _with_parts(title, track_chart(flight))
 
 
-def _heights(flight: Flight) -> Section:
+def _heights(flight: FlightLog) -> Section:
     relative = "altitude_relative_m"
     chart = over_time(
         flight,
         "heights",
         "metres above home",
         [
-            wanted("wanted", flight.position_target, relative),
-            line("flown", flight.track, relative),
+            setpoint_line("set-point", flight.position_target, relative),
+            line("actual", flight.track, relative),
         ],
     )
-    means = "The bands behind all charts are the modes, in the colours of the map; red lines are failsafes."
-    return _shown(Section("Height", means=means, missing="The log has no heights."), chart)
+    explanation = "In all charts, background colours are modes, as in the map, and red lines are failsafes."
+    return _with_parts(Section("Height", explanation=explanation, missing="The log contains no heights."), chart)
 
 
-def _modes(flight: Flight) -> Section:
+def _modes(flight: FlightLog) -> Section:
     if not flight.modes:
-        return Section("Modes", missing="The log does not tell the modes.")
+        return Section("Modes", missing="The log contains no modes.")
     rows = [
         (clock(change.time_s), change.name, span(end - change.time_s), change.reason)
         for change, end in flight.mode_spans()
     ]
-    armed = [
-        f"armed {clock(begin)} to {clock(end)} ({span(end - begin)})" for begin, end in flight.armed
-    ] or ["never armed"]
-    return Section("Modes", [Table(("at", "mode", "for", "why"), rows), Words(["; ".join(armed)])])
+    armed = [f"armed {clock(begin)} to {clock(end)} ({span(end - begin)})" for begin, end in flight.armed] or [
+        "never armed"
+    ]
+    return Section("Modes", [Table(("time", "mode", "duration", "reason"), rows), Paragraphs(["; ".join(armed)])])
 
 
-def failsafe_section(flight: Flight) -> Section:
-    """Each failsafe with what led to it."""
+def failsafe_section(flight: FlightLog) -> Section:
+    """Return the section with each failsafe and its context."""
     found = failsafes(flight)
     if not found:
         return Section(
-            "Failsafes", [Words(["None: no text, mode, error or flag of a failsafe while armed."])]
+            "Failsafes",
+            [Paragraphs(["None: no text, mode, error or flag indicates a failsafe while armed."])],
         )
     parts: list[Part] = []
-    for each in found:
-        parts += _failsafe(each)
-    means = "What led to each: what was measured before it, and the parameters that say when it acts."
-    return Section("Failsafes", parts, means)
+    for failsafe in found:
+        parts += _failsafe(failsafe)
+    explanation = "Each with its evidence, the values measured before it, and the parameters that configure it."
+    return Section("Failsafes", parts, explanation)
 
 
-def _failsafe(each: Failsafe) -> list[Part]:
-    what = "failsafe" if each.acted else "warning"
-    head = f"{clock(each.time_s)} {each.title} ({what}): {each.reaction}"
-    rows = [("sign", f"{clock(sign.time_s)} {sign.text}") for sign in each.signs]
-    rows += [("before", fact) for fact in each.led_to]
-    return [Table((what, head), rows, marks=["bad" if each.acted else "warning"] * len(each.signs))]
+def _failsafe(failsafe: Failsafe) -> list[Part]:
+    kind, mark = ("failsafe", "bad") if failsafe.acted else ("warning", "warning")
+    head = f"{clock(failsafe.time_s)} {failsafe.title} ({kind}): {failsafe.reaction}"
+    rows = [("evidence", f"{clock(item.time_s)} {item.text}") for item in failsafe.evidence]
+    rows += [("context", text) for text in failsafe.context]
+    return [Table((kind, head), rows, marks=[mark] * len(failsafe.evidence))]
 
 
-# --------------------------------------------------------------------------------- against set-points
-
-
-def _attitude(flight: Flight) -> Section:
+def _attitude(flight: FlightLog) -> Section:
     title = Section(
-        "Attitude, flown against wanted",
-        means="Where the lines part for longer, the vehicle could not do what the controller wanted.",
-        missing="The log has no attitude.",
+        "Attitude, actual and set-point",
+        explanation="Where the lines diverge for longer, the vehicle could not follow the controller.",
+        missing="The log contains no attitude.",
     )
     columns = {name: f"{name}_deg" for name in ("roll", "pitch", "yaw")}
-    return _shown(
-        title, *_against(flight, "attitude", "degrees", flight.attitude_target, flight.attitude, columns)
+    return _with_parts(
+        title,
+        *_actual_and_setpoint(flight, "attitude", "degrees", flight.attitude_target, flight.attitude, columns),
     )
 
 
-def _velocity(flight: Flight) -> Section:
-    title = Section("Velocity, flown against wanted", missing="The log has no velocity.")
+def _velocity(flight: FlightLog) -> Section:
+    title = Section("Velocity, actual and set-point", missing="The log contains no velocity.")
     columns = {name: f"{name}_m_s" for name in ("north", "east", "down")}
     air = over_time(flight, "air", "air speed, m/s", [_positive(flight)], height=220)
-    return _shown(
-        title, *_against(flight, "velocity", "m/s", flight.velocity_target, flight.velocity, columns), air
+    return _with_parts(
+        title,
+        *_actual_and_setpoint(flight, "velocity", "m/s", flight.velocity_target, flight.velocity, columns),
+        air,
     )
 
 
-def _against(
-    flight: Flight, what: str, unit: str, target: Columns, flown: Columns, columns: Mapping[str, str]
+def _actual_and_setpoint(
+    flight: FlightLog, what: str, unit: str, target: TimeSeries, flown: TimeSeries, columns: Mapping[str, str]
 ) -> list[Part | None]:
-    """A chart for each of ``columns`` (by the name that is shown), and whether it is not known what was wanted."""
+    """Return a chart for each of ``columns`` (label → column), and a note if there are no set-points."""
     charts = [
         over_time(
             flight,
             f"{what}-{name}",
             f"{name}, {unit}",
-            [wanted("wanted", target, column, 2), line("flown", flown, column, 2)],
+            [setpoint_line("set-point", target, column, 2), line("actual", flown, column, 2)],
             height=220,
         )
         for name, column in columns.items()
     ]
     is_unknown = any(charts) and not target.has()
-    return [*charts, Words([f"The log does not say what {what} was wanted."]) if is_unknown else None]
+    return [*charts, Paragraphs([f"The log contains no {what} set-points."]) if is_unknown else None]
 
 
-def _positive(flight: Flight) -> dict[str, Any] | None:
+def _positive(flight: FlightLog) -> dict[str, Any] | None:
     has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
     return line("air speed", flight.air, "air_speed_m_s", 2) if has_speed else None
 
 
-# ------------------------------------------------------------------------------------------ equipment
-
-
-def _batteries(flight: Flight) -> Section:
-    title = Section("Battery", missing="The log has nothing of a battery.")
+def _batteries(flight: FlightLog) -> Section:
+    title = Section("Battery", missing="The log contains no battery data.")
     charts: list[Part | None] = []
     for name, unit, digits in (
         ("voltage_v", "volts", 3),
         ("current_a", "amperes", 2),
-        ("remaining_percent", "per cent left", 1),
+        ("remaining_percent", "% remaining", 1),
     ):
         lines = [
-            line(f"battery {number + 1}", battery, name, digits)
-            for number, battery in sorted(flight.batteries.items())
+            line(f"battery {number + 1}", battery, name, digits) for number, battery in sorted(flight.batteries.items())
         ]
         charts.append(over_time(flight, f"battery-{name}", unit, lines, height=220))
-    return _shown(title, *charts)
+    return _with_parts(title, *charts)
 
 
-def _vibration(flight: Flight) -> Section:
+def _vibration(flight: FlightLog) -> Section:
     title = Section(
         "Vibration",
-        means="Below 30 m/s² is well, above 60 the estimator suffers. Clips count how often an accelerometer reached"
-        " its limit; they should not rise in flight.",
-        missing="The log has no levels of vibration.",
+        explanation="Normal is below 30 m/s²; above 60 m/s² the estimator degrades. Clips count how often an"
+        " accelerometer reached its limit; they should not increase in flight.",
+        missing="The log contains no vibration levels.",
     )
     names = {"x_m_s2": "x", "y_m_s2": "y", "z_m_s2": "z"}
     if flight.autopilot == "PX4" and not flight.vibration.has("y_m_s2"):
         names = {"x_m_s2": "all axes"}
     levels = over_time(
-        flight,
-        "vibration",
-        "m/s²",
-        [line(label, flight.vibration, name, 2) for name, label in names.items()],
+        flight, "vibration", "m/s²", [line(label, flight.vibration, name, 2) for name, label in names.items()]
     )
     clips = over_time(flight, "clips", "clips", [line("clips", flight.vibration, "clips", 0)], height=180)
-    return _shown(title, levels, clips)
+    return _with_parts(title, levels, clips)
 
 
-def _estimator(flight: Flight) -> Section:
+def _estimator(flight: FlightLog) -> Section:
     title = Section(
         "Estimator",
-        means="How far each measurement is from what the estimator expects, as a ratio of what it allows: above 1"
-        " (the line) it is not believed.",
-        missing="The log has nothing of the estimator.",
+        explanation="Innovation test ratios: the difference of each measurement from the estimator's prediction,"
+        " relative to the allowed one. Above 1 (the line) the estimator rejects the measurement.",
+        missing="The log contains no estimator data.",
     )
     limit = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": 1, "y1": 1}
     chart = over_time(
@@ -206,109 +196,112 @@ def _estimator(flight: Flight) -> Section:
         [line(name.replace("_", " "), flight.estimator, name) for name in flight.estimator],
         shapes=[{**limit, "line": {"color": "#d62728", "width": 1}}],
     )
-    return _shown(title, chart)
+    return _with_parts(title, chart)
 
 
-def _axis_of_fixes(flight: Flight) -> dict[str, Any]:
-    """The values that were told, with their names instead of numbers."""
-    told = sorted({value for gps in flight.gps.values() for value in gps.known("fix_type")})
-    names = [_FIXES[int(value)] if 0 <= value < len(_FIXES) else f"{value:g}" for value in told]
-    return {"tickmode": "array", "tickvals": told, "ticktext": names}
+def _axis_of_fixes(flight: FlightLog) -> dict[str, Any]:
+    """Return an axis with the names of the fix types in the log."""
+    values = sorted({value for gps in flight.gps.values() for value in gps.known("fix_type")})
+    names = [_FIXES[int(value)] if 0 <= value < len(_FIXES) else f"{value:g}" for value in values]
+    return {"tickmode": "array", "tickvals": values, "ticktext": names}
 
 
-def _gps(flight: Flight) -> Section:
-    title = Section("Satellites", missing="The log has nothing of a satellite receiver.")
+def _gps(flight: FlightLog) -> Section:
+    title = Section("Satellites", missing="The log contains no GNSS data.")
     charts = []
     for name, unit in (("satellites", "satellites"), ("hdop", "HDOP"), ("fix_type", "fix type")):
         lines = [line(f"receiver {n + 1}", gps, name, 2) for n, gps in sorted(flight.gps.items())]
         axis = _axis_of_fixes(flight) if name == "fix_type" else {}
         charts.append(over_time(flight, f"gps-{name}", unit, lines, height=200, yaxis=axis))
-    return _shown(title, *charts)
+    return _with_parts(title, *charts)
 
 
-def _link(flight: Flight) -> Section:
+def _link(flight: FlightLog) -> Section:
     counted = (
-        "What the autopilot counted of the messages that it did not get: of several links, the one that got most."
+        "Messages that the autopilot did not receive, by its own count; of several links, the busiest one."
         if flight.path.suffix.lower() == ".ulg"
-        else "Lost messages are those whose numbers are missing, each second; 100 % where nothing came."
+        else "Lost messages in each second, by gaps in the sequence numbers; 100 % during silence."
     )
     title = Section(
         "Link",
-        means=counted,
-        missing="The log has nothing of the link: a .bin knows it only by a radio that reports, a .ulg by what"
-        " PX4 counts, too.",
+        explanation=counted,
+        missing="The log contains no link data. A .bin has the reports of a telemetry radio only, a .ulg also PX4's own"
+        " counts.",
     )
     lost = over_time(flight, "lost", "% lost", [line("lost", flight.link, "lost_percent", 1)], height=220)
     rate = over_time(
-        flight, "received", "messages a second", [line("received", flight.link, "received_hz", 0)], height=180
+        flight,
+        "received",
+        "messages per second",
+        [line("received", flight.link, "received_hz", 0)],
+        height=180,
     )
     radio = over_time(
         flight,
         "radio",
-        "the radio's own units",
+        "units of the radio",
         [line(name.replace("_", " "), flight.radio, name, 0) for name in flight.radio],
         height=220,
     )
-    return _shown(title, lost, rate, radio)
+    return _with_parts(title, lost, rate, radio)
 
 
-# ---------------------------------------------------------------------------------------------- lists
-
-
-def _texts(flight: Flight) -> Section:
+def _texts(flight: FlightLog) -> Section:
     if not flight.texts:
-        return Section("Texts", missing="The vehicle said nothing, or the log has no texts.")
+        return Section("Texts", missing="The log contains no texts.")
     rows, marks = [], []
-    for said in flight.texts[:_MOST_TEXTS]:
-        severity = said.severity
+    for text in flight.texts[:_MAX_TEXTS]:
+        severity = text.severity
         name = "—" if severity is None else _SEVERITIES[min(max(severity, 0), 7)]
-        rows.append((clock(said.time_s), name, said.text))
+        rows.append((clock(text.time_s), name, text.text))
         marks.append("" if severity is None or severity > 4 else "warning" if severity == 4 else "bad")
     more = len(flight.texts) - len(rows)
-    parts: list[Part] = [Table(("at", "severity", "text"), rows, f"{len(rows)} texts", marks)]
+    parts: list[Part] = [Table(("time", "severity", "text"), rows, f"{len(rows)} texts", marks)]
     if more:
-        parts.append(Words([f"{more} more texts are left out."]))
+        parts.append(Paragraphs([f"{more} more texts are not shown."]))
     if flight.path.suffix.lower() == ".bin":
-        parts.append(Words(["A .bin does not keep how severe a text was."]))
+        parts.append(Paragraphs(["A .bin does not contain severities."]))
     return Section("Texts", parts)
 
 
-def _parameters(flight: Flight) -> Section:
+def _parameters(flight: FlightLog) -> Section:
     if not flight.parameters:
-        return Section("Parameters", missing="The log has no parameters.")
-    changed = [each for each in flight.parameter_changes if not any(part in each.name for part in _OWN)]
+        return Section("Parameters", missing="The log contains no parameters.")
+    changed = [
+        change for change in flight.parameter_changes if not any(part in change.name for part in _AUTOPILOT_WRITTEN)
+    ]
     rows = [
-        (clock(each.time_s), each.name, f"{each.before:g}", f"{each.after:g}")
-        for each in changed[:_MOST_CHANGES]
+        (clock(change.time_s), change.name, f"{change.before:g}", f"{change.after:g}")
+        for change in changed[:_MAX_CHANGES]
     ]
     parts: list[Part] = [
         Table(
-            ("at", "parameter", "before", "after"), rows, f"{len(changed)} changes" if len(rows) > 20 else ""
+            ("time", "parameter", "before", "after"),
+            rows,
+            f"{len(changed)} changes" if len(rows) > 20 else "",
         )
         if rows
-        else Words(["No parameter was changed during the log."])
+        else Paragraphs(["No parameter changed during the log."])
     ]
     own = len(flight.parameter_changes) - len(changed)
     if own:
-        parts.append(
-            Words([f"{own} changes of counters and the like, by the autopilot itself, are left out."])
-        )
+        parts.append(Paragraphs([f"{own} changes by the autopilot itself, of counters and the like, are not shown."]))
     all_of_them = [(name, f"{value:.9g}") for name, value in sorted(flight.parameters.items())]
     parts.append(
         Table(
-            ("parameter", "at the beginning"),
-            all_of_them[:_MOST_PARAMETERS],
+            ("parameter", "initial value"),
+            all_of_them[:_MAX_PARAMETERS],
             f"all {len(all_of_them)} parameters",
         )
     )
     return Section("Parameters", parts)
 
 
-def _mission(flight: Flight) -> Section | None:
+def _mission(flight: FlightLog) -> Section | None:
     if not flight.mission:
         return None
     if flight.autopilot == "ArduPilot" and all(item.number == 0 for item in flight.mission):
-        return Section("Mission", [Words(["No mission: home only, which ArduPilot keeps as item 0."])])
+        return Section("Mission", [Paragraphs(["No mission: the only item is home, ArduPilot's item 0."])])
     rows = [
         (
             str(item.number),
@@ -322,7 +315,7 @@ def _mission(flight: Flight) -> Section | None:
         "Mission",
         [
             Table(
-                ("item", "command", "place", "altitude"),
+                ("item", "command", "position", "altitude"),
                 rows,
                 f"{len(rows)} item{'' if len(rows) == 1 else 's'}",
             )
@@ -330,20 +323,20 @@ def _mission(flight: Flight) -> Section | None:
     )
 
 
-def _about(flight: Flight) -> Section:
+def _about(flight: FlightLog) -> Section:
     rows = [
         ("file", flight.path.name),
         ("vehicle", f"{flight.vehicle}, system {flight.system_id}"),
-        ("begins", date(flight.begins_at)),
-        ("lasts", span(flight.duration_s)),
+        ("start", date(flight.begins_at)),
+        ("duration", span(flight.duration_s)),
     ]
     if flight.home is not None:
         rows.append(("home", f"{flight.home.latitude_deg:.6f}, {flight.home.longitude_deg:.6f}"))
-    return Section("About this log", [Table(("what", "value"), rows)])
+    return Section("About this log", [Table(("property", "value"), rows)])
 
 
-SECTIONS: tuple[Callable[[Flight], Section | None], ...] = (
+SECTIONS: tuple[Callable[[FlightLog], Section | None], ...] = (
     *(_map, _heights, failsafe_section, _modes, _batteries, _attitude, _velocity, _vibration, _estimator),
     *(_gps, _link, _texts, _parameters, _mission, _about),
 )
-"""In their order; what needs more than a flight has no place here."""
+"""All sections, in order."""

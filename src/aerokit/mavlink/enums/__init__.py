@@ -3,8 +3,8 @@
 # pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
-Each is an ``IntEnum``, or an ``IntFlag`` when the standard calls it a bitmask. Fields of messages are plain ``int``;
-members compare equal to them. https://mavlink.io/en/messages/
+Each is an ``IntEnum``, or an ``IntFlag`` if the standard marks it as a bitmask. Fields of messages are plain ``int``,
+which compare equal to members. https://mavlink.io/en/messages/
 """
 
 from __future__ import annotations

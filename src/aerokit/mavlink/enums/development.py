@@ -3,13 +3,13 @@
 # pyright: reportUnsupportedDunderAll=false
 """Enums of ``development.xml``: https://mavlink.io/en/messages/development.html.
 
-Each is made when it is first asked for: two thousand members at once would double the time an import takes.
-What type checkers and editors read is the stub file beside this one.
+Enums are created on first access, because creating all of their two thousand members would double the import time.
+Type checkers and editors read the stub file beside this one.
 """
 
 from __future__ import annotations
 
-from aerokit.mavlink.enumeration import make_enum
+from aerokit.mavlink.message import make_enum
 
 _TABLE: dict[str, tuple[bool, str, tuple[tuple[str, int], ...]]] = {
     "RadioRcChannelsFlags": (

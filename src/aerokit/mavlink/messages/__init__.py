@@ -3,9 +3,9 @@
 # pyright: reportUnsupportedDunderAll=false
 """Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
-Names of fields, order and raw units are the standard's: https://mavlink.io/en/messages/
+Names, order and raw units of fields are those of the standard: https://mavlink.io/en/messages/
 
-A module is imported when the first of its messages is asked for. `INDEX` is what checking a frame takes, without the
+A module is imported when one of its messages is first used. `INDEX` has what is needed to verify frames without the
 class: message id → (class, module, CRC_EXTRA, base length, length).
 """
 

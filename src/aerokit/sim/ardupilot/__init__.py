@@ -1,11 +1,11 @@
-"""Simulated vehicles that behave as ArduPilot does where a client can see it."""
+"""Simulated ArduPilot vehicles: Copter, Plane, Rover and Sub."""
 
 from __future__ import annotations
 
-from aerokit.sim.ardupilot.copter.vehicle import SimulatedCopter
+from aerokit.sim.ardupilot.copter import SimulatedCopter
 from aerokit.sim.ardupilot.kinds import BootTimeline
-from aerokit.sim.ardupilot.plane.vehicle import SimulatedPlane
-from aerokit.sim.ardupilot.rover.vehicle import SimulatedRover
-from aerokit.sim.ardupilot.sub.vehicle import SimulatedSub
+from aerokit.sim.ardupilot.plane import SimulatedPlane
+from aerokit.sim.ardupilot.rover import SimulatedRover
+from aerokit.sim.ardupilot.sub import SimulatedSub
 
 __all__ = ["BootTimeline", "SimulatedCopter", "SimulatedPlane", "SimulatedRover", "SimulatedSub"]

@@ -1,4 +1,4 @@
-"""Calibrations of a simulated ArduPilot's sensors: how long they take, what they say, what they forbid."""
+"""Sensor calibrations of a simulated ArduPilot: accelerometers, compasses, gyros and barometer."""
 
 from __future__ import annotations
 
@@ -13,50 +13,48 @@ from aerokit.mavlink.enums import (
     MavSeverity,
     PreflightCalibrationAccelerometer,
 )
-from aerokit.mavlink.messages import CommandLong
-from aerokit.sim.ardupilot.host import Host
-from aerokit.sim.commands import Command, CommandHandler, Progress, whole
+from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
 
-_SAMPLE_S, _AGAIN_S = 1.3, 1.0
+_SAMPLE_S, _REPEAT_INTERVAL_S = 1.3, 1.0
 _LAST = AccelcalVehiclePos.BACK
 
 
 class AccelerometerCalibration:
-    """It asks for a position each second with a COMMAND_LONG to everybody, and is told by the same when it is taken.
+    """Six-position calibration. It broadcasts the wanted position as a COMMAND_LONG every second.
 
-    Whoever holds the vehicle does it right, unless ``is_held_wrong``. After the end it tells the result each second
-    until a reboot.
+    The client confirms each position with the same command. After the end the result is broadcast every second until
+    a reboot. With ``is_held_wrong`` the calibration fails.
     """
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.is_held_wrong = False
-        """Then it fails after the second position."""
+        self.is_held_wrong = False  # If True, the calibration fails after the second position.
         self._run = 0
-        self._asked: int | None = None
+        self._requested: int | None = None
 
     @property
     def is_waiting(self) -> bool:
-        return self._asked is not None and AccelcalVehiclePos.LEVEL <= self._asked <= _LAST
+        return self._requested is not None and AccelcalVehiclePos.LEVEL <= self._requested <= _LAST
 
     def reset(self) -> None:
         self._run += 1
-        self._asked = None
+        self._requested = None
 
     def start(self) -> None:
         self._run += 1
         self._vehicle.send_text(MavSeverity.CRITICAL, "Place vehicle level and press any key.")
-        self._ask(self._run, AccelcalVehiclePos.LEVEL)
+        self._request(self._run, AccelcalVehiclePos.LEVEL)
 
-    def take(self, command: Command) -> int:
-        """MAV_CMD_ACCELCAL_VEHICLE_POS from the client: the vehicle lies as it was asked."""
-        if not self.is_waiting or command.param1 != self._asked:
+    def confirm(self, command: ReceivedCommand) -> int:
+        """Execute MAV_CMD_ACCELCAL_VEHICLE_POS: the vehicle is in the requested position."""
+        if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
-        self._asked, run, position = None, self._run, whole(command.param1)
-        self._vehicle.call_later(_SAMPLE_S, lambda: self._sampled(run, position))
+        self._requested, run, position = None, self._run, whole(command.param1)
+        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run, position))
         return MavResult.ACCEPTED
 
-    def _sampled(self, run: int, position: int) -> None:
+    def _on_sample(self, run: int, position: int) -> None:
         if run != self._run:
             return
         if self.is_held_wrong and position > AccelcalVehiclePos.LEVEL:
@@ -64,22 +62,22 @@ class AccelerometerCalibration:
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
         else:
-            self._ask(run, position + 1)
+            self._request(run, position + 1)
 
     def _end(self, text: str, result: int) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
-        self._ask(self._run, result)
+        self._request(self._run, result)
 
-    def _ask(self, run: int, position: int) -> None:
-        self._asked = position
+    def _request(self, run: int, position: int) -> None:
+        self._requested = position
 
-        def ask() -> None:
-            if run == self._run and self._asked == position:
-                request = CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, float(position), 0, 0, 0, 0, 0, 0)
-                self._vehicle.send(request)
-                self._vehicle.call_later(_AGAIN_S, ask)
+        def request() -> None:
+            if run == self._run and self._requested == position:
+                params = (float(position), 0, 0, 0, 0, 0, 0)
+                self._vehicle.send(m.CommandLong(0, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, *params))
+                self._vehicle.call_later(_REPEAT_INTERVAL_S, request)
 
-        ask()
+        request()
 
 
 _COMPASSES, _ALL = 3, 0b111
@@ -88,13 +86,13 @@ _FITNESS = 5.0
 
 
 class CompassCalibration:
-    """DO_START_MAG_CAL, …_ACCEPT… and …_CANCEL…; MAG_CAL_PROGRESS and MAG_CAL_REPORT follow from it.
+    """Compass calibration: DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL, DO_CANCEL_MAG_CAL and their reports.
 
-    ``turns_s``: seconds that whoever turns the vehicle needs; infinity, as in a simulator of the firmware's own, leaves
-    it at 0 % until it is cancelled. While it runs the vehicle cannot be armed.
+    ``turns_s``: seconds until the vehicle has been turned in all directions; with infinity, as in SITL, the progress
+    stays at 0 % until the calibration is cancelled. While it runs the vehicle cannot be armed.
     """
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
         self._mask = 0
@@ -108,7 +106,7 @@ class CompassCalibration:
 
     @property
     def is_running(self) -> bool:
-        """Whether somebody is at it; one that waits to be accepted is done."""
+        """True until 100 %; a calibration that waits to be accepted is not running."""
         return bool(self._mask) and self.percent < 100
 
     @property
@@ -127,8 +125,8 @@ class CompassCalibration:
             MavCmd.FIXED_MAG_CAL_YAW: lambda _: MavResult.ACCEPTED,
         }
 
-    def _start(self, command: Command) -> int:
-        """Param 1 is a mask of compasses, 0 for all; param 3 saves it without being accepted."""
+    def _start(self, command: ReceivedCommand) -> int:
+        """Start; param 1 is a mask of compasses, 0 for all, param 3 saves the result without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -138,88 +136,68 @@ class CompassCalibration:
         self._started_at, self._saves = self._vehicle.now, command.param3 != 0.0
         return MavResult.ACCEPTED
 
-    def _accept(self, command: Command) -> int:
+    def _accept(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255 or not self._mask or self.is_running:
             return MavResult.FAILED
         self.reset()
         return MavResult.ACCEPTED
 
-    def _cancel(self, command: Command) -> int:
+    def _cancel(self, command: ReceivedCommand) -> int:
         if not 0 <= command.param1 <= 255:
             return MavResult.FAILED
         self._mask &= ~(whole(command.param1) or _ALL)
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
-        """Of one compass after the other; None when nothing runs."""
+        """Return the progress of the next compass; None if no calibration runs."""
         if not self.is_running:
             return None
-        self._next = self._following(self._next)
+        self._next = self._next_compass(self._next)
         percent = self.percent
         status = MagCalStatus.RUNNING_STEP_ONE if percent < 50 else MagCalStatus.RUNNING_STEP_TWO
         seen = percent * 80 // 100
-        return m.MagCalProgress(
-            compass_id=self._next,
-            cal_mask=self._mask,
-            cal_status=status,
-            attempt=1,
-            completion_pct=percent,
-            completion_mask=((1 << seen) - 1).to_bytes(10, "little"),
-            direction_x=0.0,
-            direction_y=0.0,
-            direction_z=0.0,
-        )
+        mask = ((1 << seen) - 1).to_bytes(10, "little")
+        return m.MagCalProgress(self._next, self._mask, status, 1, percent, mask, 0.0, 0.0, 0.0)
 
     def report(self) -> m.MagCalReport | None:
-        """Again and again once it is done, until it is accepted or cancelled."""
+        """Return the result of the next compass until it is accepted or cancelled, else None."""
         if not self._mask or self.is_running:
             return None
-        self._reported = self._following(self._reported)
-        return m.MagCalReport(
-            compass_id=self._reported,
-            cal_mask=self._mask,
-            cal_status=MagCalStatus.SUCCESS,
-            autosaved=int(self._saves),
-            fitness=_FITNESS,
-            ofs_x=5.0,
-            ofs_y=13.0,
-            ofs_z=-18.0,
-            diag_x=1.0,
-            diag_y=1.0,
-            diag_z=1.0,
-            offdiag_x=0.0,
-            offdiag_y=0.0,
-            offdiag_z=0.0,
-        )
+        self._reported = self._next_compass(self._reported)
+        offsets, diagonal, off_diagonal = (5.0, 13.0, -18.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+        saved = int(self._saves)
+        status = MagCalStatus.SUCCESS
+        return m.MagCalReport(self._reported, self._mask, status, saved, _FITNESS, *offsets, *diagonal, *off_diagonal)
 
-    def _following(self, compass: int) -> int:
-        return next(
-            each
-            for step in range(1, _COMPASSES + 1)
-            if self._mask & 1 << (each := (compass + step) % _COMPASSES)
-        )
+    def _next_compass(self, compass: int) -> int:
+        candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
+        return next(number for number in candidates if self._mask & 1 << number)
 
 
 _GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
-_ACCELEROMETERS_AGAIN_S = 5.0
+_MIN_ACCELEROMETERS_INTERVAL_S = 5.0
 _FORCED = 76
 _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """PREFLIGHT_CALIBRATION answers when it is done, or when the first position is asked for.
+    """Sensor calibrations. PREFLIGHT_CALIBRATION is acknowledged at its end, or with the first requested position.
 
-    ``compasses`` and ``accelerometers`` are the two that somebody has to turn the vehicle for.
+    ``compasses`` and ``accelerometers`` are the two for which the vehicle is turned by hand.
     """
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.compasses: CompassCalibration = CompassCalibration(vehicle)
         self.accelerometers: AccelerometerCalibration = AccelerometerCalibration(vehicle)
         self._accelerometers_at = -math.inf
 
+    @property
+    def is_compass_running(self) -> bool:
+        return self.compasses.is_running
+
     def reset(self) -> None:
-        """Give up what is running, as a reboot does."""
+        """Cancel all calibrations, as a reboot does."""
         self.compasses.reset()
         self.accelerometers.reset()
 
@@ -227,39 +205,39 @@ class Calibrations:
     def commands(self) -> dict[int, CommandHandler]:
         return {
             MavCmd.PREFLIGHT_CALIBRATION: self._calibrate,
-            MavCmd.ACCELCAL_VEHICLE_POS: self.accelerometers.take,
+            MavCmd.ACCELCAL_VEHICLE_POS: self.accelerometers.confirm,
             **self.compasses.commands,
         }
 
-    def _calibrate(self, command: Command) -> int | Progress:
+    def _calibrate(self, command: ReceivedCommand) -> int | CommandProgress:
         vehicle = self._vehicle
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
             return MavResult.FAILED
         if command.param1 == 1.0:
             vehicle.info("Initialising ArduPilot")
-            return Progress((), _GYROS_S)
+            return CommandProgress((), _GYROS_S)
         if command.param3 == 1.0:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")
             return MavResult.ACCEPTED
         return self._calibrate_accelerometers(command)
 
-    def _calibrate_accelerometers(self, command: Command) -> int | Progress:
+    def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
-            return Progress((), _GYROS_S, finish=self.accelerometers.start)
+            return CommandProgress((), _GYROS_S, finish=self.accelerometers.start)
         if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
-            return Progress(
-                (), _TRIM_S, finish=lambda: vehicle.info("Trim OK: roll=0.00 pitch=0.00 yaw=0.00")
-            )
+            text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
+            return CommandProgress((), _TRIM_S, finish=lambda: vehicle.info(text))
+
         if command.x == _Accelerometers.SIMPLE:
-            if vehicle.now - self._accelerometers_at < _ACCELEROMETERS_AGAIN_S:
+            if vehicle.now - self._accelerometers_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
             self._accelerometers_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
-            return Progress((), _ACCELEROMETERS_S)
+            return CommandProgress((), _ACCELEROMETERS_S)
         is_forced = _FORCED in (command.x, command.param2)
         return MavResult.ACCEPTED if is_forced else MavResult.UNSUPPORTED

@@ -1,4 +1,4 @@
-"""The camera that an ArduPilot owns: a shutter on an output, as CAM1_TYPE 1 fits one, and its captures."""
+"""Camera of a simulated ArduPilot: a shutter on a servo output (CAM1_TYPE 1) and its captures."""
 
 from __future__ import annotations
 
@@ -7,39 +7,35 @@ import math
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraFeedbackFlags, MavCmd, MavResult, SetFocusType
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.host import Host
-from aerokit.sim.commands import Command, whole
+from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.commands import ReceivedCommand, whole
 
 _PERIOD_S, _SHUTTER_S = 0.02, 0.1
 _IDLE, _INTERVAL_SET = 0, 2
-_FOR_EVER = -1
+_UNLIMITED = -1
 
 
-class Camera:
-    """Takes pictures at once, by time or by distance; each is told by CAMERA_FEEDBACK on every link.
+class ArduPilotCamera:
+    """Takes images at once, by time or by distance, and sends CAMERA_FEEDBACK for each on every link.
 
-    It speaks as the autopilot (component 1), and like the firmware it sends no CAMERA_IMAGE_CAPTURED and no
-    heartbeat of its own. It is there while the parameter CAM1_TYPE is not 0.
+    It is part of the autopilot (component 1); like the firmware it sends neither CAMERA_IMAGE_CAPTURED nor
+    heartbeats. It is enabled while CAM1_TYPE is not 0.
     """
 
     image_count: int
     remaining: int
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.image_count = 0
-        """Pictures since power on."""
-        self.interval_s: float = 0.0
-        """Between the pictures of a series."""
-        self.remaining = 0
-        """Pictures of a series that are still to be taken; -1 is without end."""
-        self.trigger_distance_m: float = 0.0
-        """A picture whenever the vehicle has moved so far; 0 is off."""
+        self.image_count = 0  # Images since power-on.
+        self.interval_s: float = 0.0  # Interval of the series.
+        self.remaining = 0  # Remaining images of the series; -1 is unlimited.
+        self.trigger_distance_m: float = 0.0  # Distance in metres between images; 0 is off.
         self._taken_at = -math.inf
         self._taken_where: tuple[float, float] | None = None
         self._ticks = False
         self.feedback: m.CameraFeedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
-        """Of the latest picture; zeros before the first."""
+        """CAMERA_FEEDBACK of the latest image; zeros before the first."""
 
     @property
     def is_fitted(self) -> bool:
@@ -50,7 +46,7 @@ class Camera:
         return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
 
     def take(self) -> bool:
-        """Take a picture now; False without a camera, or while the shutter is still open for the last one."""
+        """Take an image; return False without a camera or while the shutter is open."""
         if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
         motion = self._vehicle.motion
@@ -61,7 +57,7 @@ class Camera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """A picture every ``interval_s`` seconds, the first at once; ``count`` -1 goes on until `stop`."""
+        """Take an image every ``interval_s`` seconds, the first at once; ``count`` -1 continues until `stop`."""
         if not self.is_fitted:
             return False
         self.interval_s, self.remaining = interval_s, count
@@ -73,13 +69,13 @@ class Camera:
         self.remaining = 0
 
     def trigger_by_distance(self, metres: float) -> None:
-        """A picture every so many metres; 0 ends it."""
+        """Take an image at this distance in metres; 0 stops."""
         self.trigger_distance_m = metres
         self._taken_where = None
         self._watch()
 
     def _watch(self) -> None:
-        """Look 50 times a second while there is something to wait for."""
+        """Check at 50 Hz while a trigger is active."""
         if not self._ticks and (self.remaining or self.trigger_distance_m > 0):
             self._ticks = True
             self._vehicle.call_later(_PERIOD_S, self._update)
@@ -95,14 +91,14 @@ class Camera:
 
     def _check_distance(self) -> None:
         motion = self._vehicle.motion
-        here = (motion.north, motion.east)
+        place = (motion.north, motion.east)
         if self._taken_where is None:
-            self._taken_where = here
-        elif math.dist(here, self._taken_where) >= self.trigger_distance_m:
+            self._taken_where = place
+        elif math.dist(place, self._taken_where) >= self.trigger_distance_m:
             self.take()
 
     def run(self, item: MissionItem) -> None:
-        """Carry out a mission command, if it is one for cameras."""
+        """Execute a mission command, if it is for cameras."""
         if item.command == MavCmd.DO_DIGICAM_CONTROL and item.x == 1:
             self.take()
         elif item.command == MavCmd.DO_SET_CAM_TRIGG_DIST:
@@ -117,43 +113,42 @@ class Camera:
     def _start(self, interval_s: float, count: float) -> bool:
         if count == 1.0 or (interval_s == 0.0 and count == 0.0):
             return self.take()
-        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _FOR_EVER)
+        return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, whole(count) or _UNLIMITED)
 
-    def start_capture(self, command: Command) -> int:
-        """MAV_CMD_IMAGE_START_CAPTURE; param1 is the camera, 0 for all."""
+    def start_capture(self, command: ReceivedCommand) -> int:
+        """Handle MAV_CMD_IMAGE_START_CAPTURE; param1 is the camera, 0 for all."""
         if command.param1 < 0.0:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
             return MavResult.FAILED
         return MavResult.ACCEPTED if self._start(command.param2, command.param3) else MavResult.FAILED
 
-    def stop_capture(self, command: Command) -> int:
-        """MAV_CMD_IMAGE_STOP_CAPTURE."""
-        known = command.param1 == 0.0 or (command.param1 == 1.0 and self.is_fitted)
-        if known:
+    def stop_capture(self, command: ReceivedCommand) -> int:
+        is_supported = command.param1 == 0.0 or (command.param1 == 1.0 and self.is_fitted)
+        if is_supported:
             self.stop()
-        return MavResult.ACCEPTED if known else MavResult.UNSUPPORTED
+        return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
-    def control(self, command: Command) -> int:
-        """MAV_CMD_DO_DIGICAM_CONTROL: param5 1 takes a picture; accepted whether or not there is a camera."""
+    def control(self, command: ReceivedCommand) -> int:
+        """Handle MAV_CMD_DO_DIGICAM_CONTROL: param5 is 1 to take an image; accepted even without a camera."""
         if command.x == 1:
             self.take()
         return MavResult.ACCEPTED
 
-    def set_trigger_distance(self, command: Command) -> int:
-        """MAV_CMD_DO_SET_CAM_TRIGG_DIST; param3 1 takes a picture at once, too."""
+    def set_trigger_distance(self, command: ReceivedCommand) -> int:
+        """Handle MAV_CMD_DO_SET_CAM_TRIGG_DIST; param3 is 1 to take an image at once."""
         self.trigger_by_distance(command.param1)
         if command.param3 == 1.0:
             self.take()
         return MavResult.ACCEPTED
 
-    def zoom(self, command: Command) -> int:
-        """MAV_CMD_SET_CAMERA_ZOOM: continuous or in percent; nothing is seen of it."""
-        known = self.is_fitted and command.param1 in (1.0, 2.0)
-        return MavResult.ACCEPTED if known else MavResult.UNSUPPORTED
+    def zoom(self, command: ReceivedCommand) -> int:
+        """Handle MAV_CMD_SET_CAMERA_ZOOM, continuous or in percent; it has no visible effect."""
+        is_supported = self.is_fitted and command.param1 in (1.0, 2.0)
+        return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
-    def focus(self, command: Command) -> int:
-        """MAV_CMD_SET_CAMERA_FOCUS: continuous or in percent; such a lens does not focus by itself."""
+    def focus(self, command: ReceivedCommand) -> int:
+        """Handle MAV_CMD_SET_CAMERA_FOCUS, continuous or in percent; the lens has no autofocus."""
         kind = whole(command.param1)
         if kind in (SetFocusType.STEP, SetFocusType.METERS) or kind not in list(SetFocusType):
             return MavResult.DENIED

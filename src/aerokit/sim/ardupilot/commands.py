@@ -1,186 +1,366 @@
-"""The commands (MAV_CMD) that each simulated ArduPilot knows, with the real one's conditions and results."""
+"""Commands (MAV_CMD) that all simulated ArduPilots implement, with the conditions and results of the firmware.
+
+Results are those of a vehicle as the simulation starts it: without gripper, winch or lifting rotors.
+"""
 
 from __future__ import annotations
 
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult
-from aerokit.mavlink.messages import AutopilotVersion, GpsGlobalOrigin, MissionCurrent, SetGpsGlobalOrigin
-from aerokit.sim.ardupilot.payload_commands import (
-    GimbalCommands,
-    RegionOfInterest,
-    camera_commands,
-    equipment_commands,
-)
+import math
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavMountMode, MavResult, MavSeverity
+from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
+from aerokit.sim.ardupilot.kinds import Kind, rows_of
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import Command, CommandHandler, whole
-from aerokit.sim.local_frame import Ned
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.motion import Ned, euler_from_quaternion
 
+_C, _R = MavCmd, MavResult
 _FORCE_ARM_OR_DISARM, _FORCE_ARM = 21196.0, 2989.0
 _FORCE_REBOOT = 20190226
+_SOURCE_SETS = (1.0, 2.0, 3.0)
+_NOTICE, _WARNING = MavSeverity.NOTICE, MavSeverity.WARNING
+
+_FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
+    (_C.DO_LAND_START, "plane"): ((_WARNING, "Unable to start landing sequence"),),
+    (_C.DO_LAND_START, "copter"): (
+        (_WARNING, "Unable to start landing sequence"),
+        (_WARNING, "Mode change to AUTO RTL failed: No landing sequence found"),
+    ),
+    (_C.DO_VTOL_TRANSITION, "plane"): ((_NOTICE, "VTOL not available"),),
+}
 
 
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler; each kind of vehicle adds its own, and drops what is to be unsupported."""
-    state, setup = _State(vehicle), _Setup(vehicle)
+    """Return the handler of each MAV_CMD. Each kind of vehicle adds and replaces some."""
+    common, requests = _CommonCommands(vehicle), vehicle.requests
+    # Commands of absent devices.
+    handlers: dict[int, CommandHandler] = {
+        _C[command]: common.fixed(_R[result], _FIXED_TEXTS.get((_C[command], vehicle.KIND), ()))
+        for command, result in rows_of(vehicle.KIND, "fixed_results.csv")
+    }
+    if vehicle.KIND != "sub":
+        handlers[_C.DO_FOLLOW] = lambda c: _R.ACCEPTED if 0 < c.param1 <= 255 else _R.DENIED
     return {
-        **equipment_commands(vehicle),
-        MavCmd.COMPONENT_ARM_DISARM: state.arm_or_disarm,
-        MavCmd.DO_SET_MODE: state.set_mode,
-        MavCmd.DO_SET_MISSION_CURRENT: state.set_mission_current,
-        MavCmd.DO_FLIGHTTERMINATION: state.terminate,
-        MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: setup.request_capabilities,
-        MavCmd.REQUEST_MESSAGE: vehicle.requests.request_message,
-        MavCmd.SET_MESSAGE_INTERVAL: vehicle.requests.set_interval,
-        MavCmd.GET_MESSAGE_INTERVAL: vehicle.requests.get_interval,
-        MavCmd.RUN_PREARM_CHECKS: setup.run_prearm_checks,
-        MavCmd.DO_FENCE_ENABLE: lambda command: vehicle.fence.command(command),
-        MavCmd.PREFLIGHT_REBOOT_SHUTDOWN: setup.reboot,
-        MavCmd.DO_SEND_BANNER: setup.send_banner,
+        **handlers,
+        # A reboot replaces the devices, so they are looked up at each command.
+        _C.DO_SET_SERVO: lambda c: vehicle.accessories.set_servo(c),
+        _C.DO_REPEAT_SERVO: lambda c: vehicle.accessories.set_servo(c),
+        _C.DO_SET_RELAY: lambda c: vehicle.accessories.set_relay(c),
+        _C.DO_REPEAT_RELAY: lambda c: vehicle.accessories.repeat_relay(c),
+        _C.DO_AUX_FUNCTION: lambda c: vehicle.accessories.switch(c),
+        _C.DO_FENCE_ENABLE: lambda c: vehicle.fence.command(c),
+        _C.IMAGE_START_CAPTURE: lambda c: vehicle.camera.start_capture(c),
+        _C.IMAGE_STOP_CAPTURE: lambda c: vehicle.camera.stop_capture(c),
+        _C.DO_DIGICAM_CONTROL: lambda c: vehicle.camera.control(c),
+        _C.DO_SET_CAM_TRIGG_DIST: lambda c: vehicle.camera.set_trigger_distance(c),
+        _C.SET_CAMERA_ZOOM: lambda c: vehicle.camera.zoom(c),
+        _C.SET_CAMERA_FOCUS: lambda c: vehicle.camera.focus(c),
+        _C.DO_DIGICAM_CONFIGURE: lambda _: _R.ACCEPTED,
+        _C.SET_CAMERA_SOURCE: lambda _: _R.DENIED,
+        _C.VIDEO_START_CAPTURE: lambda _: _R.FAILED,
+        _C.VIDEO_STOP_CAPTURE: lambda _: _R.FAILED,
+        _C.SET_EKF_SOURCE_SET: lambda c: _R.ACCEPTED if c.param1 in _SOURCE_SETS else _R.DENIED,
+        _C.BATTERY_RESET: common.reset_battery,
+        _C.CONTROL_HIGH_LATENCY: common.control_high_latency,
+        _C.COMPONENT_ARM_DISARM: common.arm_or_disarm,
+        _C.DO_SET_MODE: lambda c: vehicle.set_mode_from(whole(c.param1), whole(c.param2)),
+        _C.DO_SET_MISSION_CURRENT: common.set_mission_current,
+        _C.DO_FLIGHTTERMINATION: common.terminate,
+        _C.MISSION_START: common.start_mission,
+        _C.DO_REPOSITION: common.reposition,
+        _C.REQUEST_AUTOPILOT_CAPABILITIES: common.request_capabilities,
+        _C.REQUEST_MESSAGE: requests.request_message,
+        _C.SET_MESSAGE_INTERVAL: requests.set_interval,
+        _C.GET_MESSAGE_INTERVAL: requests.get_interval,
+        _C.RUN_PREARM_CHECKS: common.run_prearm_checks,
+        _C.PREFLIGHT_REBOOT_SHUTDOWN: common.reboot,
+        _C.DO_SEND_BANNER: common.send_banner,
+        **dict.fromkeys((_C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE), common.look_at),
+        _C.DO_SET_ROI_SYSID: common.look_at_vehicle,
         **vehicle.calibrations.commands,
         **GimbalCommands(vehicle).commands,
         **HomeAndOrigin(vehicle).commands,
-        **RegionOfInterest(vehicle).commands,
-        **camera_commands(vehicle),
     }
 
 
-class _State:
-    """Arming, modes, the place in the mission."""
+def relative_heading(command: ReceivedCommand, yaw: float) -> float | None:
+    """Return the heading of CONDITION_YAW in radians; None if its parameters are invalid."""
+    angle, relative = command.param1, command.param4
+    if not 0.0 <= angle <= 360.0 or relative not in (0.0, 1.0):
+        return None
+    heading = math.radians(angle)
+    return yaw + math.copysign(heading, command.param3 or 1.0) if relative else heading
 
+
+class _CommonCommands:
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
 
-    def arm_or_disarm(self, command: Command) -> int:
+    def fixed(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
+        def handle(_: ReceivedCommand) -> int:
+            for severity, text in texts:
+                self._vehicle.send_text(severity, text)
+            return result
+
+        return handle
+
+    def arm_or_disarm(self, command: ReceivedCommand) -> int:
+        vehicle = self._vehicle
         if command.param1 == 1.0:
-            if self._vehicle.motors.is_armed:
-                return MavResult.ACCEPTED
-            done = self._vehicle.arming.arm(force=command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM))
+            force = command.param2 in (_FORCE_ARM, _FORCE_ARM_OR_DISARM)
+            done = vehicle.motors.is_armed or vehicle.arming.arm(force=force)
         elif command.param1 == 0.0:
-            done = self._vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
+            done = vehicle.arming.disarm(force=command.param2 == _FORCE_ARM_OR_DISARM)
         else:
-            return MavResult.UNSUPPORTED
-        return MavResult.ACCEPTED if done else MavResult.FAILED
+            return _R.UNSUPPORTED
+        return _R.ACCEPTED if done else _R.FAILED
 
-    def set_mode(self, command: Command) -> int:
-        return self._vehicle.set_mode_from(whole(command.param1), whole(command.param2))
-
-    def set_mission_current(self, command: Command) -> int:
+    def set_mission_current(self, command: ReceivedCommand) -> int:
         vehicle, resets = self._vehicle, command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
-            return MavResult.DENIED
+            return _R.DENIED
         if resets:
             vehicle.mission.reset()
         if not vehicle.mission.set_current(whole(command.param1)):
-            return MavResult.FAILED
+            return _R.FAILED
         if resets:
             vehicle.mission.start_or_resume()
-        vehicle.requests.send_soon(MissionCurrent.ID, command.channel)
-        return MavResult.ACCEPTED
+        vehicle.requests.send_soon(m.MissionCurrent.ID, command.channel)
+        return _R.ACCEPTED
 
-    def terminate(self, command: Command) -> int:
+    def start_mission(self, command: ReceivedCommand) -> int:
+        """Start or resume the mission; on the ground this permits its take-off."""
+        vehicle = self._vehicle
+        if command.param1 or command.param2:
+            return _R.DENIED
+        result = vehicle.change_to(vehicle.auto.number)
+        if result == _R.ACCEPTED:
+            vehicle.auto.may_lift_off = vehicle.is_armed
+            if not vehicle.mission.is_running:
+                vehicle.mission.start_or_resume()
+        return result
+
+    def reposition(self, command: ReceivedCommand) -> int:
+        vehicle, guided = self._vehicle, self._vehicle.guided
+        if command.is_long:  # ArduPilot defines no altitude frame for COMMAND_LONG here
+            return _R.UNSUPPORTED
+        if vehicle.mode is not guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+            return _R.DENIED
+        point = vehicle.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return _R.DENIED
+        if not vehicle.set_mode(guided.number) or not vehicle.may_go_to(point):
+            return _R.FAILED
+        guided.go_to(point)
+        return _R.ACCEPTED
+
+    def terminate(self, command: ReceivedCommand) -> int:
         if command.param1 <= 0.5:
-            return MavResult.FAILED
+            return _R.FAILED
         self._vehicle.arming.disarm()
-        return MavResult.ACCEPTED
+        return _R.ACCEPTED
 
-
-class _Setup:
-    """Commands that ask for or change settings."""
-
-    def __init__(self, vehicle: ArduPilotVehicle) -> None:
-        self._vehicle = vehicle
-
-    def request_capabilities(self, command: Command) -> int:
+    def request_capabilities(self, command: ReceivedCommand) -> int:
         if command.param1 != 1.0:
-            return MavResult.FAILED
-        self._vehicle.requests.send_soon(AutopilotVersion.ID, command.channel)
-        return MavResult.ACCEPTED
+            return _R.FAILED
+        self._vehicle.requests.send_soon(m.AutopilotVersion.ID, command.channel)
+        return _R.ACCEPTED
 
-    def run_prearm_checks(self, _: Command) -> int:
+    def run_prearm_checks(self, _: ReceivedCommand) -> int:
         if self._vehicle.motors.is_armed:
-            return MavResult.TEMPORARILY_REJECTED
+            return _R.TEMPORARILY_REJECTED
         self._vehicle.arming.report()
-        return MavResult.ACCEPTED
+        return _R.ACCEPTED
 
-    def reboot(self, command: Command) -> int:
+    def reboot(self, command: ReceivedCommand) -> int:
         if self._vehicle.is_armed and command.y != _FORCE_REBOOT:
-            return MavResult.FAILED
+            return _R.FAILED
         if command.param1 not in (1.0, 3.0):
-            return MavResult.UNSUPPORTED
-        self._vehicle.call_later(0.1, self._vehicle.restart)  # the answer still goes out
-        return MavResult.ACCEPTED
+            return _R.UNSUPPORTED
+        self._vehicle.call_later(0.1, self._vehicle.restart)  # after the acknowledgement
+        return _R.ACCEPTED
 
-    def send_banner(self, _: Command) -> int:
+    def send_banner(self, _: ReceivedCommand) -> int:
         self._vehicle.send_banner()
-        return MavResult.ACCEPTED
+        return _R.ACCEPTED
+
+    def reset_battery(self, command: ReceivedCommand) -> int:
+        """Set the charge of the first battery in percent, if the mask in param 1 contains it."""
+        if whole(command.param1) & 1:
+            self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
+        return _R.ACCEPTED
+
+    def control_high_latency(self, command: ReceivedCommand) -> int:
+        """Refuse to start high latency, which no port supports; stopping it succeeds."""
+        if command.param1:
+            return _R.FAILED
+        self._vehicle.send_text(_NOTICE, "High Latency disabled")
+        return _R.ACCEPTED
+
+    def look_at(self, command: ReceivedCommand) -> int:
+        """Set the region of interest, with or without a gimbal; zeros or DO_SET_ROI_NONE end it."""
+        point = None
+        if command.command != _C.DO_SET_ROI_NONE:
+            point = self._vehicle.point(*command.place(), command.z, command.altitude_frame)
+            if point is None:
+                return _R.DENIED
+            if command.place() == (0, 0) and command.z == 0:
+                point = None
+        self._vehicle.look_at(point)
+        return _R.ACCEPTED
+
+    def look_at_vehicle(self, command: ReceivedCommand) -> int:
+        self._vehicle.gimbal.follow(whole(command.param1))
+        return _R.ACCEPTED
 
 
 _FRAMES = frozenset(
     {
-        MavFrame.GLOBAL,
-        MavFrame.GLOBAL_INT,
-        MavFrame.GLOBAL_RELATIVE_ALT,
-        MavFrame.GLOBAL_RELATIVE_ALT_INT,
-        MavFrame.GLOBAL_TERRAIN_ALT,
-        MavFrame.GLOBAL_TERRAIN_ALT_INT,
+        MavFrame.GLOBAL, MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT,
+        MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT,
     }
-)
+)  # fmt: skip
 
 
 class HomeAndOrigin:
     """DO_SET_HOME, GET_HOME_POSITION and SET_GPS_GLOBAL_ORIGIN.
 
-    The origin can be set once, before GPS does it: then the vehicle knows places without GPS. Copter and Sub take no
+    The origin can be set once, before GPS sets it; positions are available without GPS then. Copter and Sub accept no
     home before they have an origin; Plane and Rover do.
     """
 
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
-        vehicle.on(SetGpsGlobalOrigin, self._on_origin)
+        self.commands: dict[int, CommandHandler] = {
+            _C.DO_SET_HOME: self._set_home,
+            _C.GET_HOME_POSITION: self._get_home,
+        }
+        vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
 
-    @property
-    def commands(self) -> dict[int, CommandHandler]:
-        return {MavCmd.DO_SET_HOME: self._set_home, MavCmd.GET_HOME_POSITION: self._get_home}
-
-    def _set_home(self, command: Command) -> int:
-        nav, motion = self._vehicle.navigation, self._vehicle.motion
+    def _set_home(self, command: ReceivedCommand) -> int:
+        vehicle, nav = self._vehicle, self._vehicle.navigation
         if command.param1 == 1.0 or command.place() == (0, 0):
-            if not nav.has_position:
-                return MavResult.FAILED
-            return self._make_home(motion.place)
+            return self._make_home(vehicle.motion.place) if nav.has_position else _R.FAILED
         if command.param1 != 0.0:
-            return MavResult.FAILED
+            return _R.FAILED
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         if frame not in _FRAMES:
-            self._vehicle.info(f"Unknown mavlink coordinate frame {frame}")
-            return MavResult.DENIED
-        point = self._vehicle.point(*command.place(), command.z, frame)
-        if point is None or (nav.origin is None and self._vehicle.HOME_NEEDS_ORIGIN):
-            return MavResult.FAILED
+            vehicle.info(f"Unknown mavlink coordinate frame {frame}")
+            return _R.DENIED
+        point = vehicle.point(*command.place(), command.z, frame)
+        if point is None or (nav.origin is None and vehicle.HOME_NEEDS_ORIGIN):
+            return _R.FAILED
         return self._make_home(point)
 
     def _make_home(self, point: Ned) -> int:
         vehicle = self._vehicle
         vehicle.navigation.set_home(point, lock=True)
-        if vehicle.TELLS_HOME:
+        if vehicle.REPORTS_HOME:
             place = vehicle.frame.to_global(*point)
             latitude, longitude = place.latitude_e7 / 1e7, place.longitude_e7 / 1e7
             vehicle.info(f"Set HOME to {latitude:.6f} {longitude:.6f} at {place.altitude_m:.2f}m")
-        return MavResult.ACCEPTED
+        return _R.ACCEPTED
 
-    def _get_home(self, command: Command) -> int:
+    def _get_home(self, command: ReceivedCommand) -> int:
         if self._vehicle.navigation.home is None:
-            return MavResult.FAILED
+            return _R.FAILED
         self._vehicle.send_home(command.channel)
-        return MavResult.ACCEPTED
+        return _R.ACCEPTED
 
-    def _on_origin(self, message: SetGpsGlobalOrigin, channel: Channel) -> None:
-        """Told to who asked; nonsense, and a second origin, are ignored without a word."""
+    def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
+        """Set the origin and send it to the requester. Invalid values and a second origin are ignored."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
         if point is None or place == (0, 0) or not vehicle.navigation.set_origin(point):
             return
-        origin = vehicle.build(GpsGlobalOrigin.ID)
+        origin = vehicle.build(m.GpsGlobalOrigin.ID)
         if origin is not None:
             vehicle.send(origin, channel)
+
+
+_PLAIN_MOUNT_MODES = frozenset(
+    {MavMountMode.RETRACT, MavMountMode.NEUTRAL, MavMountMode.RC_TARGETING, MavMountMode.HOME_LOCATION}
+)
+
+
+class GimbalCommands:
+    """DO_MOUNT_CONFIGURE, DO_MOUNT_CONTROL and the commands and messages of the gimbal manager."""
+
+    def __init__(self, vehicle: ArduPilotVehicle) -> None:
+        self._vehicle = vehicle
+        self.commands: dict[int, CommandHandler] = {
+            _C.DO_MOUNT_CONFIGURE: self._configure_mount,
+            _C.DO_MOUNT_CONTROL: self._control_mount,
+            _C.DO_GIMBAL_MANAGER_PITCHYAW: self._manage,
+            _C.DO_GIMBAL_MANAGER_CONFIGURE: self._configure_manager,
+        }
+        vehicle.on(m.GimbalManagerSetAttitude, self._on_attitude)
+        vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
+
+    def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
+        """Return the gimbal if it is fitted and addressed, as device 1 or 0 (all)."""
+        gimbal = self._vehicle.gimbal
+        return gimbal if gimbal.is_fitted and whole(device_id) in (0, 1) else None
+
+    def _configure_mount(self, command: ReceivedCommand) -> int:
+        gimbal = self._gimbal()
+        if gimbal is None:
+            return _R.FAILED
+        gimbal.set_mode(whole(command.param1))
+        return _R.ACCEPTED
+
+    def _control_mount(self, command: ReceivedCommand) -> int:
+        gimbal, mode = self._gimbal(), whole(command.z)
+        if gimbal is None:
+            return _R.FAILED
+        if mode in _PLAIN_MOUNT_MODES:
+            gimbal.set_mode(mode)
+            return _R.ACCEPTED
+        if mode == MavMountMode.MAVLINK_TARGETING:
+            pitch, roll, yaw = command.param1, command.param2, command.param3
+            if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
+                gimbal.warn()
+                return _R.FAILED
+            gimbal.point(roll, pitch, yaw, from_north=False)
+            return _R.ACCEPTED
+        if mode == MavMountMode.GPS_POINT and (command.x or command.y or not command.param1):
+            place = (whole(command.x), whole(command.y), float(whole(command.param4)))
+            gimbal.look_at(self._vehicle.point(*place, MavFrame.GLOBAL_RELATIVE_ALT))
+            return _R.ACCEPTED
+        return _R.FAILED
+
+    def _manage(self, command: ReceivedCommand) -> int:
+        gimbal = self._gimbal(command.z)
+        if gimbal is None:
+            return _R.FAILED
+        angles = (0.0, command.param1, command.param2)
+        return gimbal.manage(whole(command.x), angles, (0.0, command.param3, command.param4))
+
+    def _configure_manager(self, command: ReceivedCommand) -> int:
+        gimbal = self._gimbal(command.z)
+        ids = (whole(command.param1), whole(command.param2))
+        done = gimbal is not None and gimbal.set_control(command.sender, *ids)
+        return _R.ACCEPTED if done else _R.FAILED
+
+    def _on_attitude(self, order: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        gimbal = self._gimbal(order.gimbal_device_id)
+        rates = (order.angular_velocity_x, order.angular_velocity_y, order.angular_velocity_z)
+        has_angles = not any(map(math.isnan, order.q))
+        if gimbal is None or (has_angles and not any(map(math.isnan, rates))):
+            return
+        angles = euler_from_quaternion(*order.q) if has_angles else (math.nan,) * 3
+        gimbal.manage(order.flags, _degrees(*angles), _degrees(*rates))
+
+    def _on_pitch_and_yaw(self, order: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        gimbal = self._gimbal(order.gimbal_device_id)
+        values = (order.pitch, order.yaw, order.pitch_rate, order.yaw_rate)
+        if gimbal is not None and any(map(math.isnan, values)):
+            angles, rates = (0.0, order.pitch, order.yaw), (0.0, order.pitch_rate, order.yaw_rate)
+            gimbal.manage(order.flags, _degrees(*angles), _degrees(*rates))
+
+
+def _degrees(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
+    return (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))

@@ -1,38 +1,39 @@
-"""What a simulated ArduPilot does by itself: the part that all kinds of vehicles share."""
+"""Arming checks and failsafes that all simulated ArduPilots share."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from enum import IntFlag
+from typing import ClassVar, Generic
 
-from aerokit.mavlink.enums import MavSeverity
-from aerokit.sim.ardupilot.host import Host
+from aerokit.mavlink.enums import GpsFixType, MavSeverity
+from aerokit.sim.ardupilot.host import ArduPilotHost, ConditionTimer, HostT
 
 _OK, _LOW, _CRITICAL = 0, 1, 2
 _NAMES = {_LOW: "LOW", _CRITICAL: "CRT"}
 _WORDS = {_LOW: "low", _CRITICAL: "critical"}
+_PERIOD_S = 0.1
 
 
 class BatteryFailsafe:
-    """Looks at voltage and charge while the vehicle is armed, says what it sees and has the kind act on it.
+    """Checks voltage and remaining charge while the vehicle is armed.
 
-    ``priorities`` are the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, the gravest first: one that is less grave
-    than what has been done already is not done.
+    ``priorities`` lists the actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first. An action that is less
+    severe than an earlier one is not executed.
     """
 
-    def __init__(self, vehicle: Host, priorities: Sequence[int], act: Callable[[int], None]) -> None:
+    def __init__(self, vehicle: ArduPilotHost, priorities: Sequence[int], act: Callable[[int], None]) -> None:
         self._vehicle = vehicle
         self._priorities = tuple(priorities)
         self._act = act
-        self._below_since = {_LOW: math.nan, _CRITICAL: math.nan}
-        self.level: int = _OK
-        """0 as it should be, 1 low, 2 critical; it never goes back."""
+        self._voltage_low = {_LOW: ConditionTimer(), _CRITICAL: ConditionTimer()}
+        self.level: int = _OK  # 0 OK, 1 low, 2 critical; it never decreases.
         self.priority: int = len(self._priorities)
-        """Place of the gravest action so far among the priorities; their number before the first."""
+        """Index of the most severe action so far in ``priorities``."""
 
     def update(self) -> None:
-        """Look now. The voltage must stay low for BATT_LOW_TIMER, charge counts at once."""
+        """Check now. The voltage must stay low for BATT_LOW_TIMER, a low charge counts at once."""
         if not self._vehicle.motors.is_armed:
             return
         level = max(self._below(_LOW), self._below(_CRITICAL))
@@ -49,78 +50,68 @@ class BatteryFailsafe:
             self._act(action)
 
     def reason_not_to_arm(self) -> str | None:
-        """What the arming checks say of the battery; None when they say nothing."""
+        """Return the text of the failing arming check, if any."""
         battery, parameters = self._vehicle.battery, self._vehicle.parameters
         if battery.voltage_v < parameters["BATT_ARM_VOLT"]:
             return "Battery 1 below minimum arming voltage"
-        if self._left_mah() < parameters["BATT_ARM_MAH"]:
+        if self._remaining_mah() < parameters["BATT_ARM_MAH"]:
             return "Battery 1 below minimum arming capacity"
         for level, word in _WORDS.items():
-            for is_below, what in zip(self._is_below(level), ("voltage", "capacity"), strict=True):
+            for is_below, quantity in zip(self._is_below(level), ("voltage", "capacity"), strict=True):
                 if is_below:
-                    return f"Battery 1 {word} {what} failsafe"
-        for name, what in (("MAH", "capacity"), ("VOLT", "voltage")):
+                    return f"Battery 1 {word} {quantity} failsafe"
+        for name, quantity in (("MAH", "capacity"), ("VOLT", "voltage")):
             if 0.0 < parameters[f"BATT_LOW_{name}"] <= parameters[f"BATT_CRT_{name}"]:
-                return f"Battery 1 {what} failsafe critical >= low"
+                return f"Battery 1 {quantity} failsafe critical >= low"
         return None
 
     def _below(self, level: int) -> int:
-        """The level if it has been reached for long enough, else 0."""
-        vehicle, since = self._vehicle, self._below_since
+        """Return the level if its limit has been passed for long enough, else 0."""
         volts, charge = self._is_below(level)
-        if not volts:
-            since[level] = math.nan
-        elif math.isnan(since[level]):
-            since[level] = vehicle.now
-        timer = vehicle.parameters["BATT_LOW_TIMER"]
-        return level if charge or (timer > 0 and vehicle.now - since[level] > timer) else _OK
+        low_for = self._voltage_low[level].seconds(volts, self._vehicle.now)
+        timer = self._vehicle.parameters["BATT_LOW_TIMER"]
+        return level if charge or 0 < timer < low_for else _OK
 
     def _is_below(self, level: int) -> tuple[bool, bool]:
-        """Whether voltage and charge are below their limits now."""
+        """Return whether voltage and charge are below the limits of the level now."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
         volts, charge = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
-        return volts > 0 and self._vehicle.battery.voltage_v < volts, charge > 0 and self._left_mah() < charge
+        is_charge_low = charge > 0 and self._remaining_mah() < charge
+        return volts > 0 and self._vehicle.battery.voltage_v < volts, is_charge_low
 
-    def _left_mah(self) -> float:
+    def _remaining_mah(self) -> float:
         return self._vehicle.parameters["BATT_CAPACITY"] - self._vehicle.battery.consumed_mah
 
 
-_PERIOD_S = 0.1
+class ArduPilotFailsafes(Generic[HostT]):
+    """Failsafes, checked ten times a second. Each acts once and reports it with a text.
 
-
-class Failsafes:
-    """`watch` is called ten times a second; each failsafe acts once when it starts and says so.
-
-    A kind of vehicle says in `watch` what it looks at, and in `act_on_battery` what its numbers mean.
+    A subclass overrides `update` with the checks of its firmware and `act_on_battery` with the battery actions.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = ()
-    """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, the gravest first."""
+    """Actions of BATT_FS_LOW_ACT and BATT_FS_CRT_ACT, most severe first."""
 
-    def __init__(self, vehicle: Host) -> None:
-        self._vehicle = vehicle
+    def __init__(self, vehicle: HostT) -> None:
+        self.vehicle = vehicle
         self.battery: BatteryFailsafe = BatteryFailsafe(vehicle, self.BATTERY_PRIORITIES, self.act_on_battery)
         self.ground_station = False
         self.estimator = False
-        self.radio = False
-        """Whether the pilot's radio counts as lost; it is not armed then."""
+        self.radio = False  # True while the RC link counts as lost; the vehicle cannot be armed then.
         self.ground_station_seen_at: float = math.nan
-        """When the last heartbeat of the ground station MAV_GCS_SYSID came."""
-        self.radio_heard_at: float = math.nan
-        """When the last pulses of the radio came, or what RC_CHANNELS_OVERRIDE put in their place."""
+        """Time of the last heartbeat of the ground station MAV_GCS_SYSID."""
+        self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
 
     def start(self) -> None:
-        """Watch from now on."""
-        self._vehicle.every(_PERIOD_S, self.watch)
+        self.vehicle.every(_PERIOD_S, self.update)
 
     @property
     def battery_is_low(self) -> bool:
-        """Whether the battery was low, or worse, while the vehicle was armed."""
+        """True if the battery was low or critical while the vehicle was armed."""
         return self.battery.level > 0
 
     @property
     def battery_is_critical(self) -> bool:
-        """Whether the battery was critical while the vehicle was armed."""
         return self.battery.level > 1
 
     @property
@@ -128,27 +119,223 @@ class Failsafes:
         return self.battery_is_low or self.ground_station or self.estimator or self.radio
 
     @property
-    def hears_radio(self) -> bool:
-        """Whether SYS_STATUS calls the radio healthy."""
+    def is_radio_healthy(self) -> bool:
+        """Health of the RC receiver in SYS_STATUS."""
         return not self.radio
 
     @property
     def ground_station_silence(self) -> float:
-        """Seconds since the ground station was heard last; NaN before the first time, which is more than nothing."""
-        return self._vehicle.now - self.ground_station_seen_at
+        """Seconds since the last heartbeat of the ground station; NaN before the first one."""
+        return self.vehicle.now - self.ground_station_seen_at
 
-    def watch(self) -> None:
-        """Look at everything once: here at battery and fence."""
+    def update(self) -> None:
+        """Run all checks once: here battery and fence."""
         self.battery.update()
-        self._vehicle.fence.update()
+        self.vehicle.fence.update()
 
     def act_on_battery(self, action: int) -> None:
-        """Do what BATT_FS_LOW_ACT or BATT_FS_CRT_ACT says."""
+        """Execute the action of BATT_FS_LOW_ACT or BATT_FS_CRT_ACT."""
         raise NotImplementedError
 
-    def say(self, text: str, severity: int = MavSeverity.WARNING) -> None:
-        self._vehicle.send_text(severity, text)
+    def warn(self, text: str, severity: int = MavSeverity.WARNING) -> None:
+        self.vehicle.send_text(severity, text)
 
     def change_to(self, *modes: int) -> bool:
-        """Go into the first of these modes that can be entered; whether there is one."""
-        return any(self._vehicle.set_mode(mode) for mode in modes)
+        """Change to the first of these modes that can be entered; return False if none can."""
+        return any(self.vehicle.set_mode(mode) for mode in modes)
+
+
+_CHECK_INTERVAL_S = 1.0
+_REPORT_INTERVAL_S, _MIN_REPORT_INTERVAL_S = 30.0, 4.0
+_CENTRED_STICKS = (("Roll", 1), ("Pitch", 2), ("Yaw", 4))
+_CHECK_THROTTLE, _SKIP_STICKS = 1 << 5, 1 << 6
+_NOT_REQUIRED = 0
+
+
+class ArmingCheck(IntFlag):
+    """Bits of ARMING_CHECK."""
+
+    ALL = 1
+    GPS = 8
+    INS = 16
+    PARAMETERS = 32
+    RC = 64
+    BATTERY = 256
+    MISSION = 16384
+
+
+class ArduPilotArming(Generic[HostT]):
+    """Runs the arming checks once a second, reports failures every 30 s while disarmed, arms and disarms.
+
+    `common_reasons` has the checks of all firmwares; a new failure of one of them is reported at once. A subclass adds
+    its own checks in `own_reasons` and `final_reasons`.
+    """
+
+    ARMED_TEXT: ClassVar[str] = "Throttle armed"
+    DISARMED_TEXT: ClassVar[str] = "Throttle disarmed"
+
+    def __init__(self, vehicle: HostT) -> None:
+        self.vehicle = vehicle
+        self.passes: bool = False  # Health of the pre-arm checks in SYS_STATUS.
+        self._reported_at = -math.inf
+        self._passed_common = self._is_news = False
+        self._needs_no_arming = False
+
+    def start(self) -> None:
+        self._reported_at = self.vehicle.now
+        self.vehicle.every(_CHECK_INTERVAL_S, self._check)
+
+    def is_checked(self, check: ArmingCheck) -> bool:
+        return bool(int(self.vehicle.parameters["ARMING_CHECK"]) & (ArmingCheck.ALL | check))
+
+    @property
+    def checks_nothing(self) -> bool:
+        return int(self.vehicle.parameters["ARMING_CHECK"]) == 0
+
+    def reasons(self) -> list[str]:
+        """Return the firmware's texts of the failing checks; empty if the vehicle can be armed."""
+        if not self.vehicle.is_initialised:
+            return ["System not initialised"]
+        if self.checks_nothing:
+            return self.mandatory_reasons()
+        return [*self.common_reasons(), *self.own_reasons()]
+
+    def common_reasons(self) -> list[str]:
+        """Run the checks of all firmwares, in their order."""
+        vehicle, check = self.vehicle, ArmingCheck
+        found = list(vehicle.faults.prearm_failures)
+        if vehicle.calibrations.is_compass_running:
+            found.append("Compass calibration running")
+        if self.is_checked(check.INS):
+            found += self.ahrs_reasons()
+        found += self.position_reasons()
+        if self.is_checked(check.BATTERY):
+            found += _listed(vehicle.failsafes.battery.reason_not_to_arm())
+        if self.is_checked(check.RC) and vehicle.failsafes.radio:
+            found.append("Radio failsafe on")
+        if self.is_checked(check.MISSION) and vehicle.mode.needs_mission and not vehicle.mission.is_present:
+            found.append("Mode requires mission")
+        return found + _listed(vehicle.fence.reason_not_to_arm())
+
+    def own_reasons(self) -> list[str]:
+        return []
+
+    def mandatory_reasons(self) -> list[str]:
+        """Run the checks that a forced arming does not skip."""
+        return []
+
+    def final_reasons(self) -> list[str]:
+        """Run the checks that only an arming request triggers: here that the sticks are centred."""
+        options = int(self.vehicle.parameters["RC_OPTIONS"])
+        if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
+            return []
+        sticks = () if options & _SKIP_STICKS else _CENTRED_STICKS
+        if options & _CHECK_THROTTLE:
+            sticks = (*sticks, ("Throttle", 3))
+        return [f"{name} (RC{number}) is not neutral" for name, number in sticks if self._is_moved(number)]
+
+    def _is_moved(self, number: int) -> bool:
+        parameters = self.vehicle.parameters
+        middle, dead_zone = parameters[f"RC{number}_TRIM"], parameters[f"RC{number}_DZ"]
+        return abs(self.vehicle.rc[number - 1] - middle) > dead_zone
+
+    def ahrs_reasons(self) -> Sequence[str]:
+        """Check the estimator."""
+        nav = self.vehicle.navigation
+        if nav.flags is None:
+            return ("AHRS: EKF3 not started",)
+        if not nav.has_attitude:
+            return ("AHRS: EKF3 still initialising",)
+        return () if nav.is_healthy else ("AHRS: Not healthy",)
+
+    def gps_reasons(self) -> Sequence[str]:
+        """Check the GPS receiver and home."""
+        nav = self.vehicle.navigation
+        if nav.fix_type < GpsFixType.TYPE_3D_FIX:
+            return ("GPS 1: Bad fix" if nav.is_gps_detected else "GPS 1: not healthy",)
+        return () if nav.home is not None else ("AHRS: waiting for home",)
+
+    def position_reasons(self) -> Sequence[str]:
+        """Check the position; here every mode needs GPS."""
+        return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
+
+    def _check(self) -> None:
+        self._follow_requirement()
+        vehicle = self.vehicle
+        if vehicle.motors.is_armed:
+            self.passes = True
+            return
+        reasons = self.reasons()
+        passes_common = not self.common_reasons()
+        self._is_news |= self._passed_common and not passes_common
+        self._passed_common, self.passes = passes_common, not reasons
+        waited = vehicle.now - self._reported_at
+        if waited >= _REPORT_INTERVAL_S or (self._is_news and waited > _MIN_REPORT_INTERVAL_S):
+            self._reported_at, self._is_news = vehicle.now, False
+            self._send_reasons("PreArm", reasons)
+
+    def report(self) -> None:
+        """Run the checks now and report the failures (MAV_CMD_RUN_PREARM_CHECKS)."""
+        reasons = self.reasons()
+        self.passes = not reasons
+        self._send_reasons("PreArm", reasons)
+
+    def _send_reasons(self, prefix: str, reasons: Sequence[str]) -> None:
+        for reason in reasons:
+            self.vehicle.send_text(MavSeverity.CRITICAL, f"{prefix}: {reason}"[:50])
+
+    @property
+    def needs_arming(self) -> bool:
+        """False with ARMING_REQUIRE 0: the vehicle is always armed then."""
+        return self.vehicle.parameters.get("ARMING_REQUIRE", 1) != _NOT_REQUIRED
+
+    def _follow_requirement(self) -> None:
+        vehicle, needs_none = self.vehicle, not self.needs_arming
+        if needs_none != self._needs_no_arming:
+            self._needs_no_arming = needs_none
+            if needs_none != vehicle.motors.is_armed:
+                vehicle.motors.set_armed(needs_none, vehicle.now)
+                vehicle.set_ticking(True)
+
+    def arm(self, *, force: bool = False) -> bool:
+        """Arm and return True, or report the failing checks."""
+        vehicle = self.vehicle
+        reasons = self.mandatory_reasons() if force else self.reasons()
+        if not reasons and not force and not self.checks_nothing:
+            reasons = self.final_reasons()
+        if not vehicle.is_initialised:
+            reasons = ["System not initialised"]
+        if reasons:
+            self._send_reasons("Arm", reasons)
+            return False
+        if self.checks_nothing and not force:
+            vehicle.send_text(MavSeverity.WARNING, "Warning: Arming Checks Disabled")
+        vehicle.fence.armed()
+        if vehicle.navigation.home is not None and not vehicle.navigation.home_is_locked:
+            vehicle.navigation.set_home(vehicle.motion.place, lock=False)
+        vehicle.info(self.ARMED_TEXT)
+        vehicle.motors.set_armed(True, vehicle.now)
+        vehicle.mode.enter(force=False)
+        vehicle.set_ticking(True)
+        self.armed()
+        return True
+
+    def armed(self) -> None:
+        """Called after arming."""
+
+    def disarm(self, *, force: bool = True) -> bool:
+        """Stop the motors and return True; without ``force`` only on the ground."""
+        vehicle = self.vehicle
+        if not vehicle.motors.is_armed:
+            return True
+        if not self.needs_arming or (not force and not vehicle.is_landed):
+            return False
+        vehicle.fence.disarmed()
+        vehicle.info(self.DISARMED_TEXT)
+        vehicle.motors.set_armed(False, vehicle.now)
+        vehicle.mission.disarmed()
+        return True
+
+
+def _listed(reason: str | None) -> list[str]:
+    return [] if reason is None else [reason]

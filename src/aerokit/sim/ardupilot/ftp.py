@@ -1,16 +1,27 @@
-"""MAVFTP as ArduPilot 4.7 serves it: one session for everybody, one worker with a short queue."""
+"""MAVFTP server of ArduPilot 4.7: one session at a time, one worker with a short queue."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode, MavSeverity
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.channel import Channel
-from aerokit.sim.file_tree import EISDIR, ENOENT, Entry, FileFault, FileTree, OpenFile
-from aerokit.sim.ftp import FtpPacket, FtpServer, path_in, read_crc32
+from aerokit.sim.ftp import (
+    EISDIR,
+    ENOENT,
+    Entry,
+    FileFault,
+    FileHandle,
+    FileTree,
+    FtpPacket,
+    FtpServer,
+    path_in,
+    read_crc32,
+)
 from aerokit.sim.vehicle import SimulatedVehicle
 
 _SESSION_TIMEOUT_S = 3.0
@@ -23,17 +34,24 @@ _NO_SESSION = 0xFF
 Op = MavFtpOpcode
 
 
-class ArduPilotFtp(FtpServer):
-    """The worker looks at its queue every 2 ms; requests beyond five are lost, and so is what comes during a burst
-    beyond five. A burst cannot be stopped. The last reply is repeated for the same sequence number.
+class _Refused(Exception):
+    def __init__(self, code: int) -> None:
+        self.code = code
 
-    A session is what the client calls it. While it has a file open and was used in the last 3 s, requests of
-    other sessions are refused; nobody closes it but its client, or the next session after those 3 s. A close
-    is always acknowledged, whatever becomes of what was written.
+
+class ArduPilotFtp(FtpServer):
+    """MAVFTP with the limits of the firmware (GCS_FTP.cpp).
+
+    The worker processes its queue every 2 ms. Requests beyond five are lost, also during a burst. A burst cannot be
+    stopped. A repeated sequence number gets the last reply again.
+
+    The client chooses the session number. While a session has an open file and was used in the last 3 s, requests of
+    other sessions are refused. Only its client closes it, or the next session after those 3 s. A close is always
+    acknowledged, even if writing failed.
     """
 
     burst_interval_s: float
-    """Between two blocks of a burst: no time with flow control, else so much that a third of the link is used."""
+    """Seconds between two blocks of a burst: 0 with flow control, else a burst uses a third of the link."""
 
     def __init__(
         self,
@@ -51,7 +69,7 @@ class ArduPilotFtp(FtpServer):
     def restart(self) -> None:
         self._queue: deque[tuple[FtpPacket, Channel]] = deque()
         self._is_awake = False
-        self._file: OpenFile | None = None
+        self._file: FileHandle | None = None
         self._writing = False
         self._session = _NO_SESSION
         self._used_at = float("-inf")
@@ -60,7 +78,7 @@ class ArduPilotFtp(FtpServer):
 
     @property
     def open_sessions(self) -> int:
-        """1 while a file is open that keeps other sessions out."""
+        """1 while an open file blocks other sessions, else 0."""
         return int(self._file is not None and not self._is_idle())
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
@@ -71,7 +89,7 @@ class ArduPilotFtp(FtpServer):
             self._vehicle.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Do what is queued; a burst goes on by itself and comes back here."""
+        """Process the queue. A burst continues by its own timer and calls this at its end."""
         while self._queue:
             request, channel = self._queue.popleft()
             if self._is_repeated(request):
@@ -109,14 +127,18 @@ class ArduPilotFtp(FtpServer):
             if self._file is not None and not self._is_idle():
                 return request.refuse(MavFtpErr.INVALIDSESSION)
             self._close()
-        if request.opcode == Op.BURSTREADFILE:
-            return self._start_burst(request, channel)
         handler = _HANDLERS.get(request.opcode)
         if handler is None:
             self._vehicle.send_text(MavSeverity.DEBUG, f"Unsupported FTP: {request.opcode}")
             return request.refuse(MavFtpErr.FAIL)
         try:
+            if request.opcode == Op.BURSTREADFILE:
+                self._opened(writing=False)
+                self._burst(request, channel, 0)
+                return None
             return handler(self, request)
+        except _Refused as refused:
+            return request.refuse(refused.code)
         except FileFault as fault:
             is_open = request.opcode in (Op.OPENFILERO, Op.OPENFILEWO, Op.CREATEFILE)
             return request.refuse_errno(ENOENT if is_open and fault.errno == EISDIR else fault.errno)
@@ -126,11 +148,8 @@ class ArduPilotFtp(FtpServer):
         if file is None:
             return
         self._session = _NO_SESSION
-        with suppress(FileFault):  # as in the firmware, nobody is told
+        with suppress(FileFault):  # the firmware does not report it either
             file.close()
-
-    def _none(self, request: FtpPacket) -> FtpPacket:
-        return request.acknowledge()
 
     def _terminate(self, request: FtpPacket) -> FtpPacket:
         self._close()
@@ -142,9 +161,7 @@ class ArduPilotFtp(FtpServer):
             self._close()
         if self._file is not None:
             return request.refuse(MavFtpErr.FAIL)
-        if not _is_path(request):
-            return request.refuse(MavFtpErr.INVALIDDATASIZE)
-        path = path_in(request.data)
+        path = _path(request)
         size = self.files.size(path)
         self._file, self._writing, self._session = self.files.open(path), False, request.session
         self._banner_wanted = path.startswith("@PARAM/param.pck")
@@ -153,41 +170,30 @@ class ArduPilotFtp(FtpServer):
     def _open_for_writing(self, request: FtpPacket) -> FtpPacket:
         if self._file is not None:
             return request.refuse(MavFtpErr.FAIL)
-        if not _is_path(request):
-            return request.refuse(MavFtpErr.INVALIDDATASIZE)
         create = request.opcode == Op.CREATEFILE
-        self._file = self.files.open(path_in(request.data), writing=True, create=create)
+        self._file = self.files.open(_path(request), writing=True, create=create)
         self._writing, self._session = True, request.session
         return request.acknowledge()
 
-    def _read(self, request: FtpPacket) -> FtpPacket:
+    def _opened(self, *, writing: bool) -> FileHandle:
         if self._file is None:
-            return request.refuse(MavFtpErr.FILENOTFOUND)
-        if self._writing:
-            return request.refuse(MavFtpErr.FAIL)
-        data = self._file.read(request.offset, request.size)
+            raise _Refused(MavFtpErr.FILENOTFOUND)
+        if self._writing != writing:
+            raise _Refused(MavFtpErr.FAIL)
+        return self._file
+
+    def _read(self, request: FtpPacket) -> FtpPacket:
+        data = self._opened(writing=False).read(request.offset, request.size)
         if not data:
             return request.refuse(MavFtpErr.EOF)
         return request.acknowledge(data, offset=request.offset)
 
     def _write(self, request: FtpPacket) -> FtpPacket:
-        if self._file is None:
-            return request.refuse(MavFtpErr.FILENOTFOUND)
-        if not self._writing:
-            return request.refuse(MavFtpErr.FAIL)
-        self._file.write(request.offset, request.data[: request.size])
+        self._opened(writing=True).write(request.offset, request.data[: request.size])
         return request.acknowledge(offset=request.offset)
 
-    def _start_burst(self, request: FtpPacket, channel: Channel) -> FtpPacket | None:
-        if self._file is None:
-            return request.refuse(MavFtpErr.FILENOTFOUND)
-        if self._writing:
-            return request.refuse(MavFtpErr.FAIL)
-        self._burst(request, channel, 0)
-        return None
-
     def _burst(self, request: FtpPacket, channel: Channel, number: int) -> None:
-        """Send one block, and plan the next; the session cannot change meanwhile."""
+        """Send one block and schedule the next. The session cannot change meanwhile."""
         step = request.size or DATA_SIZE
         offset = request.offset + number * step
         try:
@@ -211,14 +217,14 @@ class ArduPilotFtp(FtpServer):
         if is_last:
             self._vehicle.call_later(self.burst_interval_s, self._work)
         else:
-            again = lambda: self._burst(request, channel, number + 1)  # noqa: E731
-            self._vehicle.call_later(self.burst_interval_s, again)
+            following = partial(self._burst, request, channel, number + 1)
+            self._vehicle.call_later(self.burst_interval_s, following)
 
     def _list(self, request: FtpPacket) -> FtpPacket:
-        if not _is_path(request):
-            return request.refuse(MavFtpErr.INVALIDDATASIZE).replace(offset=request.offset)
         try:
-            entries = self._entries(path_in(request.data))
+            entries = self._entries(_path(request))
+        except _Refused as refused:
+            return request.refuse(refused.code).replace(offset=request.offset)
         except FileFault as fault:
             return request.refuse_errno(fault.errno).replace(offset=request.offset)
         listing = b""
@@ -232,7 +238,7 @@ class ArduPilotFtp(FtpServer):
         return request.acknowledge(listing, offset=request.offset)
 
     def _entries(self, path: str) -> list[Entry]:
-        """With the folder itself and the one above, as on Linux; in the root, with the mounts that can be listed."""
+        """List a folder with `.` and `..`, as on Linux; the root also lists its mounts."""
         entries = self.files.entries(path)
         if self.files.mounted(path) is not None:
             return entries
@@ -246,16 +252,14 @@ class ArduPilotFtp(FtpServer):
         return self._change(request, self._remove_either)
 
     def _remove_either(self, path: str) -> None:
-        """RemoveFile and RemoveDirectory are one and the same."""
+        # In the firmware RemoveFile and RemoveDirectory are the same operation.
         try:
             self.files.remove_folder(path)
         except FileFault:
             self.files.remove_file(path)
 
     def _change(self, request: FtpPacket, change: Callable[[str], None]) -> FtpPacket:
-        if not _is_path(request):
-            return request.refuse(MavFtpErr.INVALIDDATASIZE)
-        path = path_in(request.data)
+        path = _path(request)
         if self.files.mounted(path) is not None:
             return request.refuse_errno(ENOENT)
         change(path)
@@ -273,25 +277,26 @@ class ArduPilotFtp(FtpServer):
         return request.acknowledge()
 
     def _crc32(self, request: FtpPacket) -> FtpPacket:
-        if not _is_path(request):
-            return request.refuse(MavFtpErr.INVALIDDATASIZE)
-        checksum = read_crc32(self.files, path_in(request.data), _CRC_BLOCK)
+        checksum = read_crc32(self.files, _path(request), _CRC_BLOCK)
         return request.acknowledge(checksum.to_bytes(4, "little"))
 
 
-def _is_path(request: FtpPacket) -> bool:
-    """The size must be that of the text; one more for its NUL is fine."""
+def _path(request: FtpPacket) -> str:
+    """Return the path, whose size must be that of the text, with or without its NUL."""
     length = len(request.data.partition(b"\0")[0])
-    return request.size != 0 and request.size - length in (0, 1)
+    if request.size == 0 or request.size - length not in (0, 1):
+        raise _Refused(MavFtpErr.INVALIDDATASIZE)
+    return path_in(request.data)
 
 
 _HANDLERS: dict[int, Callable[[ArduPilotFtp, FtpPacket], FtpPacket]] = {
-    Op.NONE: ArduPilotFtp._none,
+    Op.NONE: lambda _, request: request.acknowledge(),
     Op.TERMINATESESSION: ArduPilotFtp._terminate,
     Op.RESETSESSION: ArduPilotFtp._terminate,
     Op.LISTDIRECTORY: ArduPilotFtp._list,
     Op.OPENFILERO: ArduPilotFtp._open,
     Op.READFILE: ArduPilotFtp._read,
+    Op.BURSTREADFILE: ArduPilotFtp._read,
     Op.CREATEFILE: ArduPilotFtp._open_for_writing,
     Op.OPENFILEWO: ArduPilotFtp._open_for_writing,
     Op.WRITEFILE: ArduPilotFtp._write,

@@ -1,7 +1,7 @@
-"""A servo gimbal (MNT1_TYPE 1) with three axes on a simulated ArduPilot.
+"""Servo gimbal (MNT1_TYPE 1) of a simulated ArduPilot.
 
-Servos tell nothing: what the vehicle tells is what it has the servos do, at once. Pitch and roll are from the
-horizon, yaw is from the vehicle's nose or from north. With MNT1_TYPE 0 there is none, and orders FAIL.
+Servos report nothing, so the telemetry is the set-point. Pitch and roll are relative to the horizon, yaw to the
+vehicle's nose or to north. With MNT1_TYPE 0 there is no gimbal and its commands fail.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from aerokit.mavlink.enums import (
     MavSeverity,
 )
 from aerokit.mavlink.messages import GlobalPositionInt
-from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.channel import Channel
-from aerokit.sim.local_frame import Ned
-from aerokit.sim.motion import quaternion_from_euler
+from aerokit.sim.motion import Ned, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
 _DEVICE_ID = 1
@@ -48,13 +47,13 @@ DEFAULTS = {
     "MNT1_YAW_MAX": 180.0,
     **dict.fromkeys((f"MNT1_{place}_{axis}" for place in ("RETRACT", "NEUTRAL") for axis in "XYZ"), 0.0),
 }
-"""Of parameters that a small table may be without."""
+"""Defaults of parameters that a small table may not contain."""
 _UNTURNED = frozenset({MavMountMode.RETRACT, MavMountMode.NEUTRAL})
 
 
 @dataclass(frozen=True)
-class Target:
-    """Where it is to point: degrees; ``rates`` in degrees per second change them from ``since`` on."""
+class MountTarget:
+    """Target in degrees; ``rates`` in degrees per second change it from time ``since``."""
 
     roll: float = 0.0
     pitch: float = 0.0
@@ -64,35 +63,32 @@ class Target:
     since: float = 0.0
 
 
-class Gimbal:
-    """Mode, target and who is in control; :attr:`angles` is where it points now."""
+class ArduPilotGimbal:
+    """Mode, target and control of the gimbal; :attr:`angles` is its direction."""
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))
-        """MAV_MOUNT_MODE."""
-        self.is_yaw_locked: bool = False
-        """Whether the pilot's stick turns it from north."""
-        self.in_control: tuple[int, int] = (0, 0)
-        """System and component id of who has said that he is."""
-        self._target = Target()
+        self.mode: int = int(self.setting("MNT1_DEFLT_MODE"))  # MAV_MOUNT_MODE.
+        self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
+        self.in_control: tuple[int, int] = (0, 0)  # System and component id in control.
+        self._target = MountTarget()
         self._region: Ned | None = None
         self._followed = 0
         self._follows: Ned | None = None
-        vehicle.overhear(GlobalPositionInt, self._hear_place)
+        vehicle.observe(GlobalPositionInt, self._on_global_position)
 
     @property
     def is_fitted(self) -> bool:
         return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
-        """A parameter."""
+        """Return a parameter."""
         parameters = self._vehicle.parameters
         return parameters[name] if name in parameters else DEFAULTS[name]
 
     @property
     def angles(self) -> tuple[float, float, float]:
-        """Roll, pitch, yaw in degrees that the servos are to make, yaw from the nose."""
+        """Roll, pitch and yaw (from the nose) of the servos in degrees."""
         if self.mode in _UNTURNED:
             return (self.target.roll, self.target.pitch, self.target.yaw)
         target, motion = self.target, self._vehicle.motion
@@ -104,22 +100,22 @@ class Gimbal:
         return self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw
 
     @property
-    def target(self) -> Target:
-        if self.mode == MavMountMode.RC_TARGETING:  # no stick turns it: all of them are in the middle
-            return Target(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
+    def target(self) -> MountTarget:
+        if self.mode == MavMountMode.RC_TARGETING:  # No stick moves: all channels are centred.
+            return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _UNTURNED:
             place = MavMountMode(self.mode).name
             roll, pitch, yaw = (self.setting(f"MNT1_{place}_{axis}") for axis in "XYZ")
-            return Target(roll, pitch, yaw)
+            return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
-            return self._towards(self._region)
+            return self._angles_to(self._region)
         if self.mode == MavMountMode.SYSID_TARGET:
-            return self._towards(self._follows)
+            return self._angles_to(self._follows)
         if self.mode == MavMountMode.HOME_LOCATION:
-            return self._towards(self._vehicle.navigation.home)
-        return self._moved(self._target)
+            return self._angles_to(self._vehicle.navigation.home)
+        return self._stabilized(self._target)
 
-    def _moved(self, target: Target) -> Target:
+    def _stabilized(self, target: MountTarget) -> MountTarget:
         if not any(target.rates):
             return target
         seconds = self._vehicle.now - target.since
@@ -129,16 +125,16 @@ class Gimbal:
         yaw = math.remainder(yaw, 360.0) if target.is_from_north else self._limited("YAW", yaw)
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
-    def _towards(self, place: Ned | None) -> Target:
-        """Of a place that is not known, or without a position, it stays as it was."""
+    def _angles_to(self, place: Ned | None) -> MountTarget:
+        """Return the angles to a position; the current target without a position."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             north, east, down = place[0] - motion.north, place[1] - motion.east, place[2] - motion.down
             pitch = math.degrees(math.atan2(-down, math.hypot(north, east)))
-            self._target = Target(0.0, pitch, math.degrees(math.atan2(east, north)), True)
+            self._target = MountTarget(0.0, pitch, math.degrees(math.atan2(east, north)), True)
         return self._target
 
-    def _from_nose(self, target: Target) -> float:
+    def _from_nose(self, target: MountTarget) -> float:
         if not target.is_from_north:
             return target.yaw
         return math.remainder(target.yaw - math.degrees(self._vehicle.motion.yaw), 360.0)
@@ -150,29 +146,29 @@ class Gimbal:
         return (self.setting(f"MNT1_{axis}_MIN") + self.setting(f"MNT1_{axis}_MAX")) / 2.0
 
     def set_mode(self, mode: int) -> None:
-        """A MAV_MOUNT_MODE; others are ignored."""
+        """Set a MAV_MOUNT_MODE; others are ignored."""
         if mode in list(MavMountMode):
             self._target = self.target
             self.mode = mode
 
     def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn to these angles, in degrees, as far as it goes."""
+        """Turn to these angles in degrees, within the limits."""
         if not from_north:
             yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
-        self._target = Target(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
+        self._target = MountTarget(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Keep turning at these rates, in degrees per second, from where it points."""
+        """Turn at these rates in degrees per second from the current direction."""
         now = self.target
         start = self._from_nose(now)
         if from_north:
             start = now.yaw if now.is_from_north else start + math.degrees(self._vehicle.motion.yaw)
-        self._target = Target(now.roll, now.pitch, start, from_north, (roll, pitch, yaw), self._vehicle.now)
+        self._target = MountTarget(now.roll, now.pitch, start, from_north, (roll, pitch, yaw), self._vehicle.now)
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
-        """Keep pointing at a place; None ends it."""
+        """Point at a position; None stops that."""
         self._region = place
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)
@@ -180,17 +176,17 @@ class Gimbal:
             self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
 
     def follow(self, system_id: int) -> None:
-        """Keep pointing at another vehicle, from when it tells where it is."""
+        """Point at another vehicle once its position is received."""
         self._followed, self._follows = system_id, None
         self.set_mode(MavMountMode.SYSID_TARGET)
 
-    def _hear_place(self, told: GlobalPositionInt, _: Channel) -> None:
-        if sender_of(told)[0] == self._followed:
-            place = self._vehicle.point(told.lat, told.lon, told.alt * 1e-3, MavFrame.GLOBAL)
+    def _on_global_position(self, message: GlobalPositionInt, _: Channel) -> None:
+        if sender_of(message)[0] == self._followed:
+            place = self._vehicle.point(message.lat, message.lon, message.alt * 1e-3, MavFrame.GLOBAL)
             self._follows = self._follows if place is None else place
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
-        """As MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE says it; False for numbers that mean nothing."""
+        """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE; return False for invalid ids."""
         if not (-3 <= system <= 255 and -3 <= component <= 255):
             return False
         before = self.in_control
@@ -201,18 +197,16 @@ class Gimbal:
         elif system != -1:
             self.in_control = (system, component)
         if self.in_control != before:
-            self._vehicle.call_later(0.0, self._tell_control)
+            self._vehicle.call_later(0.0, self._send_status)
         return True
 
-    def _tell_control(self) -> None:
+    def _send_status(self) -> None:
         status = self.manager_status()
         if status is not None:
             self._vehicle.send(status)
 
-    def manage(
-        self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]
-    ) -> int:
-        """Flags (GIMBAL_MANAGER_FLAGS) and either angles or rates, roll, pitch, yaw, the others NaN; a MAV_RESULT."""
+    def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates (roll, pitch, yaw; NaN if unset); return a MAV_RESULT."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         if flags & GimbalManagerFlags.RETRACT:
             self.set_mode(MavMountMode.RETRACT)
@@ -229,7 +223,7 @@ class Gimbal:
         return MavResult.ACCEPTED
 
     def warn(self) -> None:
-        """Of angles that are none, in hundredths of degrees for example."""
+        """Warn about invalid angles, such as hundredths of degrees."""
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
@@ -262,7 +256,7 @@ class Gimbal:
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
     def manager_status(self) -> m.GimbalManagerStatus | None:
-        """GIMBAL_MANAGER_STATUS: who is in control."""
+        """Return GIMBAL_MANAGER_STATUS."""
         if not self.is_fitted:
             return None
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
@@ -272,11 +266,9 @@ class Gimbal:
         return m.GimbalManagerStatus(self._vehicle.time_boot_ms, flags, _DEVICE_ID, system, component, 0, 0)
 
 
-def _device_flags(gimbal: Gimbal) -> int:
-    """Yaw is told from the nose whatever it is locked to."""
-    flags = (
-        GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
-    )
+def _device_flags(gimbal: ArduPilotGimbal) -> int:
+    """Yaw is reported relative to the nose, even if it is locked to north."""
+    flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
     if gimbal.mode == MavMountMode.RETRACT:
         flags |= GimbalDeviceFlags.RETRACT
     elif gimbal.mode == MavMountMode.NEUTRAL:

@@ -1,160 +1,333 @@
-"""What the parts of a simulated ArduPilot use of the vehicle that they belong to.
+"""Base classes below all parts of a simulated ArduPilot: the vehicle as its parts see it, flight modes, motors.
 
-`Host` lies below all parts: none of them imports the vehicle, which is made of them. Of each other they see the
-protocols here.
+No part imports the vehicle that is composed of them. Parts see each other through the protocols defined here.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar, Protocol
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFrame
+from aerokit.mavlink.enums import MavFrame, MavSeverity
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import BootTimeline, Kind
 from aerokit.sim.ardupilot.mission_lists import CommandList
-from aerokit.sim.ardupilot.mode import VehicleMode
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.autopilot import SimulatedAutopilot
-from aerokit.sim.battery import Battery
+from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame, Ned
+from aerokit.sim.commands import rotated
 from aerokit.sim.missions import MissionStore
-from aerokit.sim.motion import Motion
-from aerokit.sim.parameters import Parameters
+from aerokit.sim.motion import GRAVITY_M_S2, GlobalPoint, LocalFrame, Motion, Ned
+from aerokit.sim.parameters import SimParameters
+
+HostT = TypeVar("HostT", bound="ArduPilotHost")
+
+
+class ArduPilotMode:
+    """A flight mode. The defaults here refuse or do nothing."""
+
+    number: int
+    name: str
+    needs_position: bool = True
+    needs_mission: bool = False
+    has_manual_throttle: bool = False
+    can_arm: bool = True
+    arms_with_raised_throttle: bool = False
+    can_change_speed: bool = False
+    refused_because: str = "init failed"
+    """Reason reported when `enter` returns False."""
+    returns_on_path: bool = False
+    """True for SMART_RTL, which drives back along the recorded path."""
+    notices_landing: bool = True
+    """True if the land detector may declare the vehicle landed in this mode."""
+    is_landing: bool = False
+    is_taking_off: bool = False
+    is_available: bool = True
+    """False for a mode whose requirements are never met."""
+    entry_texts: tuple[str, ...] = ()
+    """Texts sent when the mode is entered or refused, with `entry_severity`."""
+    entry_severity: int = MavSeverity.INFO
+
+    def __init__(self, vehicle: Any) -> None:
+        self.vehicle = vehicle
+
+    def enter(self, *, force: bool) -> bool:
+        """Start the mode; return False to refuse. ``force`` is True while the vehicle is disarmed."""
+        for text in self.entry_texts:
+            self.vehicle.send_text(self.entry_severity, text)
+        return self.is_available
+
+    def leave(self) -> None:
+        """Called when another mode takes over."""
+
+    def update(self, dt: float) -> None:
+        """Set the targets of motors and motion for the next ``dt`` seconds."""
+
+    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
+        """Climb to metres above home; return False if the mode has no take-off by command."""
+        return False
+
+    def pause(self) -> bool:
+        """Stop in place; return False if there is nothing to pause."""
+        return False
+
+    def resume(self) -> bool:
+        return False
+
+    def go_to(self, position: Ned) -> None:
+        """Go to a point of the world frame and stay there; only the guided mode implements it."""
+        raise NotImplementedError
+
+    @property
+    def destination(self) -> Ned | None:
+        return None
+
+
+def variant(
+    make: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
+) -> Callable[[HostT], ArduPilotMode]:
+    """Return a row of a mode table: another mode's behaviour under a new name, with some traits changed."""
+
+    def build(host: HostT) -> ArduPilotMode:
+        mode = make(host)
+        mode.number, mode.name = number, name
+        for trait, value in traits.items():
+            assert hasattr(mode, trait), trait
+            setattr(mode, trait, value)
+        return mode
+
+    return build
+
+
+class ConditionTimer:
+    """Measures for how long a condition has been true."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def seconds(self, condition: bool, now: float) -> float:
+        """Return seconds since the condition became true; 0 at its first check and while it is false."""
+        if not condition:
+            self._since = None
+        elif self._since is None:
+            self._since = now
+        return 0.0 if self._since is None else now - self._since
+
+    def reset(self) -> None:
+        self._since = None
+
+
+_ARMING_DELAY_S = 2.0
+_SPOOL_UP_S = 1.3
+_SPOOL_DOWN_S = 1.1
+_HOVER_THROTTLE = 0.36
+_AMPERES_AT_FULL = 78.0
+_STOPPED_PWM, _IDLE_PWM, _FULL_PWM = 1000, 1100, 2000
+
+
+class ArduPilotMotors:
+    """Arming delay, spool-up and power consumption of the motors of a quadrotor.
+
+    ``spool`` goes from 0 (idle or stopped) to 1 (able to lift); setting ``wanted`` requests spool-up.
+    """
+
+    def __init__(self, vehicle: Any) -> None:
+        self.vehicle = vehicle
+        self.is_armed: bool = False
+        self.armed_at: float = -math.inf
+        self.disarmed_at: float = -math.inf
+        self.may_turn: bool = False  # True once the arming delay is over.
+        self.wanted: bool = False
+        self.spool: float = 0.0
+        self.throttle: float = 0.0  # 0 to 1; VFR_HUD reports it in percent.
+
+    @property
+    def can_lift(self) -> bool:
+        return self.is_armed and self.spool >= 1.0
+
+    @property
+    def is_idle(self) -> bool:
+        """True while the motors turn at their lowest speed or stand still."""
+        return self.spool <= 0.0
+
+    @property
+    def current_a(self) -> float:
+        """Current of all motors and the electronics."""
+        return 0.08 * self.is_armed + self.throttle * _AMPERES_AT_FULL
+
+    @property
+    def pwm(self) -> int:
+        """Pulse of each motor in SERVO_OUTPUT_RAW; minimal until the arming delay is over."""
+        if not (self.is_armed and self.may_turn):
+            return _STOPPED_PWM
+        return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
+
+    def set_armed(self, armed: bool, now: float) -> None:
+        if self.is_armed and not armed:
+            self.disarmed_at = now
+        self.is_armed, self.armed_at = armed, now
+        self.may_turn = self.wanted = False
+        self.spool = self.throttle = 0.0
+
+    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
+        """Advance spool and throttle by ``dt`` seconds; ``motion`` is the vehicle's motion model."""
+        self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
+        if self.may_turn and self.wanted:
+            if self.spool < 1.0:
+                self.spool = min(1.0, self.spool + dt / _SPOOL_UP_S)
+        else:
+            self.spool = max(0.0, self.spool - dt / _SPOOL_DOWN_S)
+        if landed or not self.is_armed:
+            self.throttle = 0.05 * self.spool
+            return
+        lean = math.cos(motion.roll) * math.cos(motion.pitch)
+        lift = 1.0 - motion.acceleration_down / GRAVITY_M_S2
+        throttle = _HOVER_THROTTLE * lift / (lean if lean > 0.5 else 0.5)
+        self.throttle = 0.0 if throttle < 0.0 else throttle if throttle < 1.0 else 1.0
+
+
+# The parts as other parts see them.
+
+
+class ArduPilotNavigationHost(Protocol):
+    origin: Ned | None
+    home: Ned | None
+    home_is_locked: bool
+    flags: int | None
+    fix_type: int
+    is_gps_detected: bool
+    is_healthy: bool
+
+    @property
+    def has_position(self) -> bool: ...
+    @property
+    def has_attitude(self) -> bool: ...
+    @property
+    def position(self) -> GlobalPoint | None: ...
+    @property
+    def altitude_above_home(self) -> float: ...
+    def set_home(self, point: Ned, *, lock: bool) -> None: ...
+    def world(self, local: Ned) -> Ned: ...
+
+
+class ArduPilotArmingHost(Protocol):
+    ARMED_TEXT: ClassVar[str]
+    passes: bool
+
+    def start(self) -> None: ...
+    def reasons(self) -> list[str]: ...
+    def report(self) -> None: ...
+    def arm(self, *, force: bool = False) -> bool: ...
+    def disarm(self, *, force: bool = True) -> bool: ...
+
+
+class ArduPilotMissionHost(Protocol):
+    nav_index: int
+
+    @property
+    def is_being_flown(self) -> bool: ...
+    @property
+    def is_present(self) -> bool: ...
+    def set_current(self, index: int) -> bool: ...
+    def start_or_resume(self) -> None: ...
+    def update(self) -> None: ...
+    def stop(self) -> None: ...
+    def reset(self) -> None: ...
+    def disarmed(self) -> None: ...
+    def clear(self) -> None: ...
+    def message(self, seq: int | None = None) -> m.MissionCurrent: ...
+
+
+class ArduPilotMissionsHost(MissionStore, Protocol):
+    commands: CommandList
+
+
+class ArduPilotRadioHost(Protocol):
+    def __getitem__(self, index: int, /) -> int: ...
+    @property
+    def is_receiving(self) -> bool: ...
+    def override(self, pulses: Mapping[int, int]) -> None: ...
+
+
+class ArduPilotBatteryHost(Protocol):
+    def reason_not_to_arm(self) -> str | None: ...
+
+
+class ArduPilotFailsafesHost(Protocol):
+    ground_station_seen_at: float
+    radio: bool
+
+    @property
+    def battery(self) -> ArduPilotBatteryHost: ...
+
+
+class ArduPilotFenceHost(Protocol):
+    def update(self) -> None: ...
+    def armed(self) -> None: ...
+    def disarmed(self) -> None: ...
+    def reason_not_to_arm(self) -> str | None: ...
+
+
+class ArduPilotCameraHost(Protocol):
+    def run(self, item: MissionItem) -> None: ...
+
+
+class ArduPilotGimbalHost(Protocol):
+    @property
+    def is_fitted(self) -> bool: ...
+
+
+class ArduPilotCalibrationsHost(Protocol):
+    @property
+    def is_compass_running(self) -> bool: ...
+
 
 _RELATIVE = frozenset({MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT})
 _TERRAIN = frozenset({MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT})
 _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
-class NavigationPart(Protocol):
-    """What the vehicle knows of its place."""
-
-    home: Ned | None
-
-    @property
-    def has_position(self) -> bool: ...
-
-    @property
-    def position(self) -> GlobalPoint | None: ...
-
-    @property
-    def altitude_above_home(self) -> float: ...
-
-
-class ArmingPart(Protocol):
-    """Checks, arming and disarming."""
-
-    ARMED_TEXT: ClassVar[str]
-    passes: bool
-
-    def start(self) -> None: ...
-
-    def reasons(self) -> list[str]: ...
-
-    def report(self) -> None: ...
-
-    def arm(self, *, force: bool = False) -> bool: ...
-
-    def disarm(self, *, force: bool = True) -> bool: ...
-
-
-class MissionPart(Protocol):
-    """The place in the mission."""
-
-    nav_index: int
-
-    @property
-    def is_being_flown(self) -> bool: ...
-
-    def set_current(self, index: int) -> bool: ...
-
-    def clear(self) -> None: ...
-
-    def message(self, seq: int | None = None) -> m.MissionCurrent: ...
-
-
-class MissionsPart(MissionStore, Protocol):
-    """What is stored of missions, fence and rally points."""
-
-    commands: CommandList
-
-
-class RadioPart(Protocol):
-    """The pilot's channels."""
-
-    def override(self, pulses: Mapping[int, int]) -> None: ...
-
-
-class FailsafesPart(Protocol):
-    """When the ground station was heard last."""
-
-    ground_station_seen_at: float
-
-
-class FencePart(Protocol):
-    """Looks where the vehicle is."""
-
-    def update(self) -> None: ...
-
-
-class CameraPart(Protocol):
-    """Carries out what a mission wants of a camera."""
-
-    def run(self, item: MissionItem) -> None: ...
-
-
-class GimbalPart(Protocol):
-    """Whether there is one."""
-
-    @property
-    def is_fitted(self) -> bool: ...
-
-
-class Host(SimulatedAutopilot):
-    """What every kind of ArduPilot has, as far as its parts need it; `ArduPilotVehicle` puts them together."""
+class ArduPilotHost(SimulatedAutopilot):
+    """A simulated ArduPilot as its parts see it; `ArduPilotVehicle` composes them."""
 
     KIND: ClassVar[Kind]
-    """Which table of parameters."""
+    """Firmware; selects the parameter table."""
     FIRMWARE: ClassVar[str]
-    """As the banner has it."""
+    """Firmware name in the banner."""
     FRAME: ClassVar[str | None] = None
-    """What the banner says of the frame."""
+    """Frame text in the banner, if any."""
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
 
-    parameters: Parameters
-    """By name; change them as a test needs it. They survive a reboot."""
+    parameters: SimParameters
+    """SimParameters by name. A test may change them; they survive a reboot."""
     timeline: BootTimeline
     uid: bytes
-    battery: Battery
+    battery: SimulatedBattery
     motion: Motion
-    motors: Motors
+    motors: ArduPilotMotors
     frame: LocalFrame
-    """The world: metres north and east of where it was switched on."""
-    mode: VehicleMode
+    """World frame: metres north and east of the power-on location."""
+    mode: ArduPilotMode
     is_initialised: bool
     is_landed: bool
-    navigation: NavigationPart
-    arming: ArmingPart
-    mission: MissionPart
-    missions: MissionsPart
-    failsafes: FailsafesPart
-    fence: FencePart
-    camera: CameraPart
-    gimbal: GimbalPart
-    rc: RadioPart
+    navigation: ArduPilotNavigationHost
+    arming: ArduPilotArmingHost
+    mission: ArduPilotMissionHost
+    missions: ArduPilotMissionsHost
+    failsafes: ArduPilotFailsafesHost
+    fence: ArduPilotFenceHost
+    camera: ArduPilotCameraHost
+    gimbal: ArduPilotGimbalHost
+    rc: ArduPilotRadioHost
+    calibrations: ArduPilotCalibrationsHost
 
     @property
-    def guided(self) -> VehicleMode:
-        """Its mode for targets of a program."""
+    def guided(self) -> ArduPilotMode:
         raise NotImplementedError
 
     @property
     def is_armed(self) -> bool:
-        """Whether the motors are armed."""
         return self.motors.is_armed
 
     @property
@@ -163,31 +336,40 @@ class Host(SimulatedAutopilot):
         return self.navigation.altitude_above_home
 
     def set_mode(self, number: int) -> bool:
-        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
+        """Change the mode and broadcast a heartbeat; return False and send a text if it is refused."""
         raise NotImplementedError
 
     def available_modes(self) -> list[m.AvailableModes]:
-        """AVAILABLE_MODES, as ArduPilot numbers and names them."""
+        """Return AVAILABLE_MODES with ArduPilot's numbers and names."""
         raise NotImplementedError
 
     def announce_parameter(self, name: str) -> None:
-        """Tell a parameter to everybody."""
+        """Broadcast PARAM_VALUE."""
         raise NotImplementedError
 
     def send_home(self, channel: Channel | None = None) -> None:
-        """GPS_GLOBAL_ORIGIN and HOME_POSITION, as far as they are known."""
+        """Send GPS_GLOBAL_ORIGIN and HOME_POSITION if they are set."""
         self.send_built(m.GpsGlobalOrigin.ID, channel)
         self.send_built(m.HomePosition.ID, channel)
 
+    def local_point(self, target: m.SetPositionTargetLocalNed, body_frames: Collection[int]) -> Ned:
+        """Convert the position of a local target to the world frame."""
+        offset, motion = (target.x, target.y, target.z), self.motion
+        if target.coordinate_frame == MavFrame.LOCAL_NED:
+            return self.navigation.world(offset)
+        if target.coordinate_frame in body_frames:
+            offset = rotated(offset, motion.yaw)
+        return (motion.north + offset[0], motion.east + offset[1], motion.down + offset[2])
+
     def send_banner(self) -> None:
-        """Firmware, hash and frame as texts."""
+        """Send firmware, hash and frame as texts."""
         self.info(f"{self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})")
         self.info(self.uid.hex()[:32])
         if self.FRAME is not None:
             self.info(self.FRAME)
 
     def point(self, latitude_e7: int, longitude_e7: int, altitude: float, frame: int) -> Ned | None:
-        """A place on the globe in the world's frame; None when it is none, or the frame is unknown."""
+        """Convert a global position to the world frame; None for invalid values or an unknown frame."""
         valid = abs(latitude_e7) <= 900_000_000 and abs(longitude_e7) <= 1_800_000_000
         if not valid or not math.isfinite(altitude):
             return None

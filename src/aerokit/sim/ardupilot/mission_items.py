@@ -1,6 +1,6 @@
-"""What ArduPilot keeps of a mission item: fifteen bytes, so that parameters lose digits or are lost.
+"""Mission items as ArduPilot stores them: in fifteen bytes, so that params lose digits or are dropped.
 
-`stored` is the way into the storage and back in one step: what a client that downloads its own mission sees.
+`stored` converts an item to its storage and back, as a client sees it that uploads and downloads a mission.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.missions import float32
 
-_HIGHEST_M = 83000.0
+_MAX_ALTITUDE_M = 83000.0
 _GIVEN_BACK: dict[int, int] = {
     MavFrame.MISSION: MavFrame.GLOBAL,
     MavFrame.GLOBAL: MavFrame.GLOBAL,
@@ -32,14 +32,14 @@ _C = MavCmd
 
 
 class StoredCommand(NamedTuple):
-    """How a command is kept."""
+    """Storage of a command."""
 
     name: str
-    """What status texts call it; empty for one that no mission has."""
+    """Name in status texts; empty if no mission can contain it."""
     parameters: str
-    """How each of params 1 to 4 (and x, y, z where they are no place) is kept; see `_KEEPERS`. Empty: not at all."""
+    """Storage of params 1 to 4 (and x, y, z if they are no position), see `_KEEPERS`. Empty: not at all."""
     has_place: bool
-    """Whether ``x``, ``y`` and ``z`` are a place, and not plain numbers or nothing."""
+    """True if ``x``, ``y`` and ``z`` are a position."""
 
 
 def _read_commands() -> dict[int, StoredCommand]:
@@ -54,8 +54,8 @@ def _read_commands() -> dict[int, StoredCommand]:
 STORED_COMMANDS: dict[int, StoredCommand] = _read_commands()
 _UNKNOWN = StoredCommand("?", "", has_place=False)
 
+# Differences of ArduPlane: acceptance radius and passing distance are stored; there are no splines.
 _OF_A_PLANE: dict[int, str] = {_C.NAV_WAYPOINT: "-BB-", _C.NAV_SPLINE_WAYPOINT: ""}
-"""What it keeps otherwise: the radius within which it arrives and the distance at which it passes; no splines."""
 
 _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
     _C.NAV_WAYPOINT: (3,),
@@ -68,17 +68,19 @@ _NAN_ALLOWED: dict[int, tuple[int, ...]] = {
 
 
 def command_name(command: int) -> str:
-    """What status texts call a command."""
+    """Return the name of a command in status texts."""
     return STORED_COMMANDS.get(command, _UNKNOWN).name or _UNKNOWN.name
 
 
 def has_location(command: int) -> bool:
-    """Whether ``x``, ``y`` and ``z`` are a place, and not plain numbers or nothing."""
+    """Return True if ``x``, ``y`` and ``z`` of a command are a position."""
     return STORED_COMMANDS.get(command, _UNKNOWN).has_place
 
 
 def is_place(latitude_e7: float, longitude_e7: float) -> int:
-    """ACCEPTED, or which of the two cannot be; compared as 32-bit floats, so that some units more pass."""
+    """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate. Compared in single precision, as in the
+    firmware.
+    """
     if not abs(float32(latitude_e7)) <= 900_000_000:
         return MavMissionResult.INVALID_PARAM5_X
     in_range = abs(float32(longitude_e7)) <= 1_800_000_000
@@ -86,12 +88,12 @@ def is_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """The frame in which an altitude is given back; None when the vehicle does not know the frame."""
+    """Return the frame in which an altitude is downloaded; None for an unsupported frame."""
     return _GIVEN_BACK.get(frame)
 
 
 def stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
-    """The item as it comes back, or the MAV_MISSION_RESULT that refuses it."""
+    """Return the item as downloaded, or the MAV_MISSION_RESULT that refuses it."""
     result = _check_numbers(item)
     if result == MavMissionResult.ACCEPTED and item.command in (0, 1):
         result = MavMissionResult.INVALID
@@ -128,7 +130,7 @@ def _kept_place(item: MissionItem) -> tuple[float, float, float, int] | int:
     result = is_place(item.x, item.y)
     if result != MavMissionResult.ACCEPTED:
         return result
-    if not abs(item.z) < _HIGHEST_M:
+    if not abs(item.z) < _MAX_ALTITUDE_M:
         return MavMissionResult.INVALID_PARAM7
     frame = altitude_frame(item.frame)
     if frame is None:
@@ -138,7 +140,7 @@ def _kept_place(item: MissionItem) -> tuple[float, float, float, int] | int:
 
 
 def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
-    """Turns and radius in a byte each: parts of a turn in 256ths, a radius above 255 m in tens of metres."""
+    """Turns and radius have a byte each: fractions of a turn in 256ths, a radius above 255 m in tens of metres."""
     turns, radius = item.param1, abs(item.param3)
     is_part = 0 < turns < 1
     count = int(min(255.0, turns * 256 if is_part else turns)) & 0xFF
@@ -148,7 +150,7 @@ def _kept_turns(item: MissionItem) -> tuple[float, float, float, float]:
 
 
 def whole(value: float) -> int:
-    """As a C program on a processor makes a whole number of a float: towards zero, nothing of what is too large."""
+    """Truncate towards zero, as C does; 0 for values beyond the range."""
     return int(value) if abs(value) < 2**31 else 0
 
 
@@ -168,6 +170,7 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
+# Conversions by storage type: a C type, hundredths, a sign, an angle, a boolean, or not stored.
 _KEEPERS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
@@ -187,4 +190,3 @@ _KEEPERS: dict[str, Callable[[float], float]] = {
     "p": lambda value: float(_whole_within(value, -90, 90)),
     "w": lambda value: float(_whole_within(value, -180, 360)),
 }
-"""How a number is kept: as a C type, in hundredths, with a sign, as an angle, as a yes or no, or not at all."""

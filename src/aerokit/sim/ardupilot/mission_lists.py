@@ -1,7 +1,7 @@
-"""ArduPilot's three lists of mission items, as its transfer protocol changes them.
+"""ArduPilot's lists of mission items: commands, fence and rally points.
 
-Commands and rally points are changed in place, item by item, while they come: an upload that breaks off leaves a list
-that is neither the old nor the new one. A fence is put together aside and checked as a whole at the end.
+An upload changes commands and rally points in place, item by item, so an aborted upload leaves a mixture of the old
+and the new list. A fence is collected separately and validated as a whole at the end.
 """
 
 from __future__ import annotations
@@ -15,59 +15,56 @@ from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.ardupilot.mission_items import altitude_frame, is_place, stored, whole
 from aerokit.sim.missions import float32
 
-_LOWEST_RALLY_M, _HIGHEST_RALLY_M = -32768, 32767
+_MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
 
 
 class ItemList:
-    """What the protocol needs of a list. Results are MAV_MISSION_RESULTs."""
+    """A list as the mission protocol uses it. Results are MAV_MISSION_RESULTs."""
 
     name: ClassVar[str]
-    """How texts call an upload."""
+    """Name of the list in texts about uploads."""
 
     def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        """How many items fit."""
+        self.capacity = capacity  # Maximum number of items.
 
     @property
     def count(self) -> int:
-        """How many items there are, as the protocol tells it now."""
+        """Number of items that MISSION_COUNT reports now."""
         raise NotImplementedError
 
     def items(self) -> list[MissionItem]:
-        """All of them, as they are given back."""
+        """Return all stored items as a download returns them."""
         return [item for seq in range(self.count) if not isinstance(item := self.item(seq), int)]
 
     def item(self, seq: int) -> MissionItem | int:
-        """One of them, or the result that says why not."""
+        """Return an item, or the result if there is none."""
         raise NotImplementedError
 
     def begin(self, count: int) -> None:
-        """A new list of this length is going to be sent."""
+        """Start an upload of a new list of this length."""
         raise NotImplementedError
 
     def begin_update(self) -> None:
-        """Some of the items are going to be sent."""
+        """Start a partial upload."""
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Store what was sent; ``last`` is the number of the last item of this transfer."""
+        """Store a received item; ``last`` is the last sequence number of the upload."""
         raise NotImplementedError
 
-    def finish(self, say: Callable[[str], None]) -> int:
-        """Everything was sent; ``say`` takes warnings."""
+    def finish(self, warn: Callable[[str], None]) -> int:
+        """Complete an upload; ``warn`` sends a text."""
         return MavMissionResult.ACCEPTED
 
     def abandon(self) -> None:
-        """Nothing more will be sent."""
+        """Abort an upload."""
 
     def clear(self) -> bool:
-        """Forget all items; False when it may not be done now."""
+        """Delete all items; return False if that is not allowed now."""
         raise NotImplementedError
 
 
 class CommandList(ItemList):
-    """The mission. Item 0 is home, which is never stored: it is where home is when somebody asks."""
-
-    version: int
+    """The mission. Item 0 is home; it is not stored but read from ``home`` at each download."""
 
     name = "Mission"
 
@@ -82,25 +79,23 @@ class CommandList(ItemList):
         self._kind: Kind = kind
         self._home, self._is_running = home, is_running
         self._commands: list[MissionItem] = []  # [0] only holds home's place
-        self.version = 0
-        """Changes whenever an item changes."""
+        self.version: int = 0  # Incremented whenever an item changes.
 
     @property
     def count(self) -> int:
         return len(self._commands)
 
     def item(self, seq: int) -> MissionItem | int:
-        """Home can be read even when there is no mission."""
-        if seq == 0:
+        if seq == 0:  # home can be read without a mission
             return self._home()
         return self._commands[seq] if seq < len(self._commands) else MavMissionResult.INVALID_SEQUENCE
 
     def command(self, index: int) -> MissionItem | None:
-        """What the execution reads; None beyond the end."""
+        """Return a command for execution; None beyond the end and for home."""
         return self._commands[index] if 0 < index < len(self._commands) else None
 
     def add_home(self) -> None:
-        """Home became known: from now on it is item 0 of an empty mission."""
+        """Called when home is set: it becomes item 0 of an empty mission."""
         if not self._commands:
             self._commands.append(self._home())
 
@@ -109,7 +104,7 @@ class CommandList(ItemList):
         self.version += 1
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Replace or append; item 0 is checked and then ignored, but an empty list gets its home first."""
+        """Replace or append an item. Item 0 is validated and ignored; an empty list gets its home first."""
         kept = stored(item, self._kind)
         if isinstance(kept, int):
             return kept
@@ -139,7 +134,7 @@ class CommandList(ItemList):
         return True
 
     def write_file(self, items: list[MissionItem], start: int) -> int:
-        """Put items one after the other until one cannot be stored."""
+        """Store the items of an uploaded file, until one is refused."""
         for seq, item in enumerate(items):
             kept = stored(item, self._kind)
             if isinstance(kept, int):
@@ -153,7 +148,7 @@ class CommandList(ItemList):
 
 
 class RallyList(ItemList):
-    """Rally points: latitude, longitude, whole metres and the frame of the altitude are kept."""
+    """Rally points: position, altitude in whole metres, and altitude frame are stored."""
 
     name = "Rally"
 
@@ -166,7 +161,7 @@ class RallyList(ItemList):
         return len(self._points)
 
     def item(self, seq: int) -> MissionItem | int:
-        """A point at 0, 0 counts as none."""
+        """Return a point; one at 0, 0 counts as missing."""
         if seq >= len(self._points):
             return MavMissionResult.INVALID_SEQUENCE
         point = self._points[seq]
@@ -176,7 +171,7 @@ class RallyList(ItemList):
         del self._points[count:]
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        kept = _kept_rally_point(item)
+        kept = _stored_rally_point(item)
         if isinstance(kept, int):
             return kept
         if seq > len(self._points) or seq >= self.capacity:
@@ -189,13 +184,13 @@ class RallyList(ItemList):
         return True
 
 
-def _kept_rally_point(item: MissionItem) -> MissionItem | int:
+def _stored_rally_point(item: MissionItem) -> MissionItem | int:
     if item.command != MavCmd.NAV_RALLY_POINT:
         return MavMissionResult.UNSUPPORTED
     result = is_place(item.x, item.y)
     if result != MavMissionResult.ACCEPTED:
         return result
-    if not _LOWEST_RALLY_M <= item.z <= _HIGHEST_RALLY_M:
+    if not _MIN_RALLY_M <= item.z <= _MAX_RALLY_M:
         return MavMissionResult.INVALID_PARAM7
     frame = altitude_frame(item.frame)
     if frame is None or item.frame == MavFrame.MISSION:
@@ -216,25 +211,24 @@ _TYPE_NUMBERS: dict[int, int] = {
 }
 _STORAGE_BYTES = 560
 _BYTES_PER_POINT = 8
-_MOST_VERTICES = 255
+_MAX_VERTICES = 255
 
-Say = Callable[[str], None]
+Warn = Callable[[str], None]
 
 
 class FenceList(ItemList):
-    """While an upload goes on, its items count and the stored ones are what is read."""
+    """Fence. During an upload `count` is that of the upload, while `item` reads the stored fence."""
 
     name = "Fence"
 
     def __init__(self, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT) -> None:
         super().__init__(capacity)
         self._stored: list[MissionItem] = []
-        self._coming: list[MissionItem | None] | None = None
+        self._uploaded: list[MissionItem | None] | None = None
 
     @property
     def count(self) -> int:
-        """How many are stored; of an upload, how many are to come."""
-        return len(self._stored if self._coming is None else self._coming)
+        return len(self._stored if self._uploaded is None else self._uploaded)
 
     def items(self) -> list[MissionItem]:
         return list(self._stored)
@@ -243,74 +237,72 @@ class FenceList(ItemList):
         return self._stored[seq] if seq < len(self._stored) else MavMissionResult.INVALID_SEQUENCE
 
     def begin(self, count: int) -> None:
-        """Make room beside the stored fence."""
-        coming: list[MissionItem | None] = [None for _ in range(count)]
-        self._coming = coming
+        self._uploaded = [None for _ in range(count)]
 
     def begin_update(self) -> None:
-        self._coming = list(self._stored)
+        self._uploaded = list(self._stored)
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        assert self._coming is not None
-        if seq >= len(self._coming):
+        assert self._uploaded is not None
+        if seq >= len(self._uploaded):
             return MavMissionResult.INVALID_SEQUENCE
-        kept = _kept(item)
+        kept = _stored_fence_item(item)
         if isinstance(kept, int):
             return kept
-        self._coming[seq] = kept
+        self._uploaded[seq] = kept
         return MavMissionResult.ACCEPTED
 
-    def finish(self, say: Say) -> int:
-        assert self._coming is not None
-        return self.store([item for item in self._coming if item is not None], say)
+    def finish(self, warn: Warn) -> int:
+        assert self._uploaded is not None
+        return self.store([item for item in self._uploaded if item is not None], warn)
 
     def abandon(self) -> None:
-        self._coming = None
+        self._uploaded = None
 
     def clear(self) -> bool:
         self._stored = []
         return True
 
-    def store(self, items: Sequence[MissionItem], say: Say) -> int:
-        """Put a fence into force if it is one; the result."""
+    def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
+        """Store a fence if it is valid."""
         problem = _problem(items)
         if problem is not None:
-            say(problem)
-            say("Fence validation failed")
+            warn(problem)
+            warn("Fence validation failed")
             return MavMissionResult.ERROR
         if _storage_needed(items) > _STORAGE_BYTES:
-            say("Fence exceeds storage size")
+            warn("Fence exceeds storage size")
             return MavMissionResult.ERROR
         self._stored = list(items)
         return MavMissionResult.ACCEPTED
 
-    def replace(self, items: Sequence[MissionItem], say: Say) -> int:
-        kept = [_kept(item) for item in items]
-        for item in kept:
-            if isinstance(item, int):
-                return item
-        return self.store([item for item in kept if not isinstance(item, int)], say)
+    def replace(self, items: Sequence[MissionItem], warn: Warn) -> int:
+        kept: list[MissionItem] = []
+        for item in items:
+            converted = _stored_fence_item(item)
+            if isinstance(converted, int):
+                return converted
+            kept.append(converted)
+        return self.store(kept, warn)
 
 
-def _kept(item: MissionItem) -> MissionItem | int:
+def _stored_fence_item(item: MissionItem) -> MissionItem | int:
     if item.frame == MavFrame.MISSION or altitude_frame(item.frame) is None:
         return MavMissionResult.UNSUPPORTED_FRAME
     size = 0.0
     if item.command in _POLYGONS:
-        if item.param1 > _MOST_VERTICES:
+        if item.param1 > _MAX_VERTICES:
             return MavMissionResult.INVALID_PARAM1
         size = float(whole(item.param1) & 0xFF)
     elif item.command in _CIRCLES:
         size = float32(item.param1)
     elif item.command != _C.NAV_FENCE_RETURN_POINT:
         return MavMissionResult.UNSUPPORTED
-    return MissionItem(
-        item.command, MavFrame.GLOBAL, size, x=int(item.x), y=int(item.y), z=0.0, autocontinue=False
-    )
+    return MissionItem(item.command, MavFrame.GLOBAL, size, x=int(item.x), y=int(item.y), z=0.0, autocontinue=False)
 
 
 def _problem(items: Sequence[MissionItem]) -> str | None:
-    """What is wrong with a fence, as the firmware words it."""
+    """Return the firmware's text about an invalid fence; None if it is valid."""
     wanted, vertices, missing, has_return_point = 0, 0.0, 0, False
     for item in items:
         if item.command in _POLYGONS:

@@ -1,90 +1,115 @@
-"""Where an ArduPilot is in its mission: which navigation command and which other command run, and what comes next.
+"""Execution of a mission by a simulated ArduPilot (AP_Mission).
 
-Navigation commands follow each other; the other commands between two of them ("do" and "condition") are started one
-after the other while the second of the two runs. The mode that flies the mission starts and verifies.
+Navigation commands run one after the other. The "do" and "condition" commands between two of them run while the second
+one does. The mode that flies the mission starts and verifies the commands.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
+import math
+from collections.abc import Callable, Iterator
 
-from aerokit.mavlink.enums import MavCmd, MissionState
+from aerokit.mavlink.enums import MavCmd, MavSeverity, MissionState
 from aerokit.mavlink.messages import MissionCurrent
 from aerokit.missions import MissionItem
-from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode
 from aerokit.sim.ardupilot.mission_items import command_name
+from aerokit.sim.motion import Ned
 
 _C = MavCmd
 _FIRST = 1
-_MOST_JUMPS, _MOST_STEPS = 64, 255
-_FOREVER = -1
+_MAX_JUMPS, _MAX_STEPS = 64, 255
+_UNLIMITED = -1
 _WITH_TARGET = frozenset({_C.DO_JUMP, _C.JUMP_TAG, _C.DO_JUMP_TAG})
 _TAKE_OFFS = frozenset({_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF})
 _BEFORE_TAKE_OFF = frozenset({_C.DO_AUX_FUNCTION, _C.NAV_DELAY})
 _NAVIGATION_BEYOND = frozenset({_C.NAV_SET_YAW_SPEED, _C.NAV_SCRIPT_TIME, _C.NAV_ATTITUDE_TIME})
-_DONE_AT_ONCE = frozenset(
+# Commands that complete at once on every vehicle, without a report.
+_INSTANT = frozenset(
     {
-        _C.DO_GRIPPER,
-        _C.DO_SET_SERVO,
-        _C.DO_SET_RELAY,
-        _C.DO_REPEAT_SERVO,
-        _C.DO_REPEAT_RELAY,
-        _C.DO_DIGICAM_CONFIGURE,
-        _C.DO_DIGICAM_CONTROL,
-        _C.DO_SET_CAM_TRIGG_DIST,
-        _C.DO_PARACHUTE,
-        _C.DO_SEND_SCRIPT_MESSAGE,
-        _C.DO_SPRAYER,
-        _C.DO_AUX_FUNCTION,
-        _C.DO_SET_RESUME_REPEAT_DIST,
-        _C.DO_GIMBAL_MANAGER_PITCHYAW,
-        _C.JUMP_TAG,
-        _C.IMAGE_START_CAPTURE,
-        _C.IMAGE_STOP_CAPTURE,
-        _C.SET_CAMERA_ZOOM,
-        _C.SET_CAMERA_FOCUS,
-        _C.SET_CAMERA_SOURCE,
-        _C.VIDEO_START_CAPTURE,
+        _C.DO_GRIPPER, _C.DO_SET_SERVO, _C.DO_SET_RELAY, _C.DO_REPEAT_SERVO, _C.DO_REPEAT_RELAY,
+        _C.DO_DIGICAM_CONFIGURE, _C.DO_DIGICAM_CONTROL, _C.DO_SET_CAM_TRIGG_DIST, _C.DO_PARACHUTE,
+        _C.DO_SEND_SCRIPT_MESSAGE, _C.DO_SPRAYER, _C.DO_AUX_FUNCTION, _C.DO_SET_RESUME_REPEAT_DIST,
+        _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.JUMP_TAG, _C.IMAGE_START_CAPTURE, _C.IMAGE_STOP_CAPTURE,
+        _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.SET_CAMERA_SOURCE, _C.VIDEO_START_CAPTURE,
         _C.VIDEO_STOP_CAPTURE,
     }
-)
-"""Commands that every vehicle carries out in passing: nothing is flown, nobody is told."""
+)  # fmt: skip
 
 
-class MissionFlyer(Protocol):
-    """The mode that carries commands out."""
+class MissionMode(ArduPilotMode):
+    """Base of the AUTO modes. A subclass fills ``handlers`` with the mission commands that it supports."""
 
-    is_paused: bool
-    """Whether somebody stopped it on its way."""
+    needs_mission = True
+    can_change_speed = True
 
-    def start_command(self, index: int, item: MissionItem) -> bool:
-        """Begin; False when this vehicle cannot, and the next one is to be tried."""
-        ...
+    def __init__(self, vehicle: ArduPilotHost) -> None:
+        super().__init__(vehicle)
+        self.speed: float = 0.0  # Limit in m/s.
+        self.may_lift_off: bool = False
+        """True once MISSION_START or a raised throttle permits a take-off from the ground."""
+        self.is_paused: bool = False
+        self.is_waiting: bool = False  # True from entering the mode until the mission starts.
+        self.handlers: dict[int, Callable[[MissionItem], None]] = {}
+
+    def disarmed(self) -> None:
+        """Called after the motors have stopped."""
+        # An unfinished mission starts again and waits on the ground.
+        if self.vehicle.mode is self:
+            self.vehicle.mission.update()
+
+    def leave(self) -> None:
+        self.is_waiting = False
+        self.vehicle.mission.stop()
+
+    def wait_for_origin(self) -> None:
+        """Start the mission once the estimator has an origin, also while disarmed."""
+        self.is_waiting = True
+        self.vehicle.call_later(0.0, self.start_if_waiting)
+
+    def start_if_waiting(self) -> None:
+        vehicle = self.vehicle
+        if self.is_waiting and vehicle.mode is self and vehicle.navigation.origin is not None:
+            self.is_waiting = False
+            vehicle.mission.start_or_resume()
+            self.mission_started()
+
+    def mission_started(self) -> None:
+        """Called after the mission has started or resumed in this mode."""
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
-        """Whether it is done; called again and again."""
-        ...
+        """Return True once the command is complete; polled at every tick."""
+        raise NotImplementedError
 
     def end_mission(self) -> None:
-        """There is nothing more to do."""
-        ...
+        """Called after the last command."""
+        raise NotImplementedError
+
+    def start_command(self, item: MissionItem) -> bool:
+        """Start a mission command; return False to skip it because it is not supported."""
+        handler = self.handlers.get(item.command)
+        if handler is not None:
+            handler(item)
+        return handler is not None
+
+    def warn_if_unknown(self, item: MissionItem) -> None:
+        if item.command not in self.handlers:
+            self.vehicle.send_text(MavSeverity.WARNING, f"Skipping invalid cmd #{item.command}")
 
 
 def is_navigation(item: MissionItem) -> bool:
-    """Whether a command leads somewhere, and so ends what the one before it did."""
+    """Return True for a navigation command, which ends the navigation command before it."""
     return item.command <= _C.NAV_LAST or item.command in _NAVIGATION_BEYOND
 
 
 class MissionRun:
-    """The position in the mission. An index counts home, so 1 is the first command and 0 means none."""
+    """CommandProgress in the mission. Index 0 is home (meaning no command), 1 the first command."""
 
-    def __init__(self, vehicle: Host, flyer: MissionFlyer) -> None:
-        self._vehicle, self._flyer = vehicle, flyer
+    def __init__(self, vehicle: ArduPilotHost, mode: MissionMode) -> None:
+        self._vehicle, self._mode = vehicle, mode
         self._list = vehicle.missions.commands
         self._state = MissionState.NOT_STARTED
-        self.nav_index: int = 0
-        """The navigation command that runs, or is to be resumed."""
+        self.nav_index: int = 0  # Index of the navigation command that runs or will be resumed.
         self._nav: MissionItem | None = None
         self._do: tuple[int, MissionItem] | None = None
         self._do_index = 0
@@ -92,33 +117,32 @@ class MissionRun:
 
     @property
     def is_present(self) -> bool:
-        """Whether there is more than home."""
+        """True if there are commands besides home."""
         return self._list.count > 1
 
     @property
     def is_running(self) -> bool:
-        """Whether commands are being carried out."""
         return self._state == MissionState.ACTIVE
 
     @property
     def is_being_flown(self) -> bool:
-        """Running with the motors armed: the mission cannot be cleared."""
+        """True while it runs with the motors armed, when it cannot be cleared."""
         return self.is_running and self._vehicle.motors.is_armed
 
     @property
     def state(self) -> int:
-        """MISSION_STATE, as MISSION_CURRENT has it."""
+        """MISSION_STATE of MISSION_CURRENT."""
         if not self.is_present:
             return MissionState.NO_MISSION
-        return MissionState.PAUSED if self.is_running and self._flyer.is_paused else self._state
+        return MissionState.PAUSED if self.is_running and self._mode.is_paused else self._state
 
     @property
     def count(self) -> int:
-        """Commands without home."""
+        """Number of commands, without home."""
         return max(0, self._list.count - 1)
 
     def message(self, seq: int | None = None) -> MissionCurrent:
-        """MISSION_CURRENT; ``seq`` says another number than that of the command that is flown."""
+        """Build MISSION_CURRENT; ``seq`` replaces the index of the current command."""
         seq = self.nav_index if seq is None else seq
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
@@ -127,19 +151,21 @@ class MissionRun:
         return self.is_take_off(begin)
 
     def is_take_off(self, index: int) -> bool:
-        """Whether a take-off is the first thing from there on, apart from waiting."""
+        """Return True if the first navigation command from ``index`` on, except delays, is a take-off."""
         for _, item in self.navigation_from(index):
             if item.command not in _BEFORE_TAKE_OFF:
                 return item.command in _TAKE_OFFS
         return False
 
     def navigation_from(self, index: int) -> Iterator[tuple[int, MissionItem]]:
-        """The next navigation commands, jumps followed; at most sixteen."""
+        """Yield at most sixteen navigation commands in the order of execution, following jumps."""
         for _ in range(16):
             found = self._next(index, counts=False)
-            while found is not None and not is_navigation(found[1]):
+            for _ in range(_MAX_STEPS):
+                if found is None or is_navigation(found[1]):
+                    break
                 found = self._next(found[0] + 1, counts=False)
-            if found is None:
+            if found is None or not is_navigation(found[1]):
                 return
             yield found
             index = found[0] + 1
@@ -149,7 +175,7 @@ class MissionRun:
         return self._vehicle.parameters["MIS_RESTART"] == 1
 
     def start_or_resume(self) -> None:
-        """As MIS_RESTART wants it."""
+        """Start or resume the mission, as MIS_RESTART selects."""
         has_place = self._state != MissionState.COMPLETE and self._list.command(self.nav_index) is not None
         if self._restarts or not has_place:
             self._start()
@@ -164,22 +190,26 @@ class MissionRun:
             self._complete()
 
     def stop(self) -> None:
-        """Another mode takes over; the place in the mission is remembered."""
+        """Stop because another mode takes over; the progress is kept."""
         if self.is_running:
             self._state = MissionState.NOT_STARTED
 
     def reset(self) -> None:
-        """Forget the place and how often was jumped, as disarming does."""
+        """Reset progress and jump counters, as disarming does."""
         self.nav_index, self._nav, self._do, self._do_index = 0, None, None, 0
         self._jumps.clear()
 
+    def disarmed(self) -> None:
+        self.reset()
+        self._vehicle.call_later(0.0, self._mode.disarmed)
+
     def clear(self) -> None:
-        """There is no mission any more."""
+        """Called when the mission has been cleared."""
         self.reset()
         self._state = MissionState.NOT_STARTED
 
     def set_current(self, index: int) -> bool:
-        """Go on from this command; False when there is none."""
+        """Continue from this command; return False if it does not exist."""
         if index >= self._list.count or self._list.count == 1:
             return False
         self._do, self._do_index, self._nav = None, 0, None
@@ -194,12 +224,11 @@ class MissionRun:
         return self._set_place(index)
 
     def _set_place(self, index: int) -> bool:
-        """Where a stopped mission is to be resumed."""
-        while True:
+        """Set the command at which a stopped mission will resume."""
+        for _ in range(_MAX_STEPS):
             found = self._next(index, counts=True)
             if found is None:
-                self.nav_index = 0
-                return False
+                break
             if is_navigation(found[1]):
                 self.nav_index, self._nav = found
                 self._state = MissionState.NOT_STARTED
@@ -207,9 +236,11 @@ class MissionRun:
             if self._do is None:
                 self._do, self._do_index = found, found[0]
             index = found[0] + 1
+        self.nav_index = 0
+        return False
 
     def update(self) -> None:
-        """Look at what runs and start what comes next."""
+        """Verify the running commands and start the next ones."""
         if not self.is_running or not self._list.count:
             return
         if self._nav is None or self._is_complete(self.nav_index, self._nav):
@@ -226,7 +257,7 @@ class MissionRun:
         """Start the next navigation command, and the first other command before it."""
         index = start or (self.nav_index + 1 if self.nav_index else _FIRST)
         self._do, self._do_index = None, 0
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             found = self._next(index, counts=True)
             if found is None:
                 return False
@@ -242,7 +273,7 @@ class MissionRun:
         return False
 
     def _advance_do(self) -> None:
-        """Start the next command that is no navigation, of those before the next navigation command."""
+        """Start the next "do" command before the next navigation command."""
         if not self._do_index:
             return
         found = self._next(self._do_index + 1, counts=False)
@@ -257,19 +288,19 @@ class MissionRun:
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
         self._vehicle.info(f"Mission: {index} {name}{target}")
         self._vehicle.camera.run(item)
-        return item.command in _DONE_AT_ONCE or self._flyer.start_command(index, item)
+        return item.command in _INSTANT or self._mode.start_command(item)
 
     def _is_complete(self, index: int, item: MissionItem) -> bool:
-        return item.command in _DONE_AT_ONCE or self._flyer.is_complete(index, item)
+        return item.command in _INSTANT or self._mode.is_complete(index, item)
 
     def _complete(self) -> None:
         self._state = MissionState.COMPLETE
-        self._flyer.end_mission()
+        self._mode.end_mission()
 
     def _next(self, index: int, *, counts: bool) -> tuple[int, MissionItem] | None:
-        """The first command at or after ``index`` that is no jump; jumps are followed, and counted when told so."""
+        """Return the first command from ``index`` on that is no jump, following jumps. ``counts`` counts them."""
         first_jump = 0
-        for _ in range(_MOST_JUMPS):
+        for _ in range(_MAX_JUMPS):
             while (item := self._list.command(index)) is not None and item.command not in (
                 _C.DO_JUMP,
                 _C.DO_JUMP_TAG,
@@ -294,14 +325,29 @@ class MissionRun:
         return 0
 
     def _jump(self, index: int, times: int, *, counts: bool) -> bool:
-        """Whether this jump is to be made once more."""
+        """Return True if the jump at ``index`` has repetitions left."""
         done = self._jumps.get(index, 0)
-        if times != _FOREVER and done >= times:
+        if times != _UNLIMITED and done >= times:
             if counts:
                 self._jumps.pop(index, None)
             return False
         if counts:
             self._jumps[index] = done + 1
-            of = "unlimited" if times == _FOREVER else str(times)
+            of = "unlimited" if times == _UNLIMITED else str(times)
             self._vehicle.info(f"Mission: {index} Jump {done + 1}/{of}")
         return True
+
+
+def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
+    """Return the horizontal distance to a place in metres; 0 without one."""
+    motion = vehicle.motion
+    return 0.0 if place is None else math.hypot(place[0] - motion.north, place[1] - motion.east)
+
+
+def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
+    """Execute DO_SET_HOME of a mission: the position of the item, or the present one if it has none."""
+    point: Ned | None = vehicle.motion.place
+    if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
+        point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+    if point is not None:
+        vehicle.navigation.set_home(point, lock=False)

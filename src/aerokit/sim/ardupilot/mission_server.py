@@ -1,7 +1,8 @@
-"""ArduPilot's side of the mission protocol: it asks for what is uploaded, and answers whoever asks.
+"""Mission protocol of ArduPilot.
 
-One upload at a time of each kind (mission, fence, rally points). Meanwhile nobody else may upload that kind or read it.
-A download has no state: any item can be asked for at any time. https://mavlink.io/en/services/mission.html
+It accepts one upload at a time for each list (mission, fence, rally points); meanwhile other components can neither
+upload nor download that list. Downloads are stateless: any item can be requested at any time.
+https://mavlink.io/en/services/mission.html
 """
 
 from __future__ import annotations
@@ -13,25 +14,22 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavMissionType, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
-from aerokit.missions.wire import to_wire
-from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.ardupilot.mission_items import has_location, stored, whole
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.channel import Channel
-from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float
+from aerokit.sim.missions import AnyItem, float32, item_from, item_message_float, item_message_int
 from aerokit.sim.vehicle import sender_of
 
-_ASK_AGAIN_S, _GIVE_UP_S = 1.0, 8.0
+_RETRY_INTERVAL_S, _UPLOAD_TIMEOUT_S = 1.0, 8.0
 _DEGREE = 1e7
-_COMMANDS_IN_MEMORY, _RALLY_POINTS_IN_MEMORY = 650, 46
+_MAX_COMMANDS, _MAX_RALLY_POINTS = 650, 46
 _GUIDED_TARGET, _ALTITUDE_CHANGE = 2, 3
 _R = MavMissionResult
 
 
 @dataclass
 class _Upload:
-    """Items on their way from somebody."""
-
     items: ItemList
     mission_type: int
     partner: tuple[int, int]
@@ -39,21 +37,21 @@ class _Upload:
     next: int
     last: int
     received_at: float
-    asked_at: float
+    requested_at: float
     has_warned: bool = False
 
 
-class MissionServer:
-    """Mission, fence and rally points: kept here, sent and received here."""
+class ArduPilotMissionServer:
+    """Stores mission, fence and rally points, and transfers them."""
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.commands: CommandList = CommandList(
-            _COMMANDS_IN_MEMORY, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
+            _MAX_COMMANDS, self._home, lambda: vehicle.mission.is_being_flown, vehicle.KIND
         )
-        """The mission, for its execution."""
+        """The mission."""
         self.fence: FenceList = FenceList()
-        self.rally: RallyList = RallyList(_RALLY_POINTS_IN_MEMORY)
+        self.rally: RallyList = RallyList(_MAX_RALLY_POINTS)
         self._lists: dict[int, ItemList] = {
             MavMissionType.MISSION: self.commands,
             MavMissionType.FENCE: self.fence,
@@ -63,7 +61,6 @@ class MissionServer:
         self._has_warned_of_request: set[int] = set()
 
     def listen(self) -> None:
-        """Hear the protocol's messages."""
         on = self._vehicle.on
         on(m.MissionRequestList, self._on_request_list)
         on(m.MissionRequestInt, self._on_request_int)
@@ -80,14 +77,14 @@ class MissionServer:
         return bool(self._uploads)
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """All items as they are given back, home first; empty for an unknown type."""
+        """Return the items as downloaded, home first; empty for an unknown type."""
         items = self._lists.get(mission_type)
         return [] if items is None else items.items()
 
-    def replace(
-        self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True
-    ) -> int:
-        """Store items as a file does; the MAV_MISSION_RESULT. Without ``clear`` only commands can be changed."""
+    def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
+        """Store items as a file upload does; return the MAV_MISSION_RESULT. ``clear`` False is supported for the
+        mission only.
+        """
         if mission_type == MavMissionType.MISSION:
             if clear:
                 self._clear(self.commands)
@@ -104,7 +101,7 @@ class MissionServer:
         return _R.ACCEPTED
 
     def reset(self) -> None:
-        """A reboot: uploads are forgotten, items are not."""
+        """Handle a reboot: uploads are dropped, items stay."""
         self._uploads.clear()
 
     def _home(self) -> MissionItem:
@@ -113,9 +110,7 @@ class MissionServer:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
         place = self._vehicle.frame.to_global(*home)
         altitude = float32(round(place.altitude_m * 100) * float32(0.01))
-        return MissionItem(
-            MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL, x=place.latitude_e7, y=place.longitude_e7, z=altitude
-        )
+        return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL, x=place.latitude_e7, y=place.longitude_e7, z=altitude)
 
     def _warn(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.WARNING, text)
@@ -123,8 +118,8 @@ class MissionServer:
     def _acknowledge(self, message: Message, result: int, mission_type: int, channel: Channel) -> None:
         self._vehicle.send(m.MissionAck(*sender_of(message), result, mission_type), channel)
 
-    def _find(self, message: Message, mission_type: int, channel: Channel) -> ItemList | None:
-        """The list of that type, if it can be talked about on this channel; else the refusal is sent."""
+    def _list_for(self, message: Message, mission_type: int, channel: Channel) -> ItemList | None:
+        """Return the list of this type, or refuse the request and return None."""
         items = self._lists.get(mission_type)
         if items is not None and mission_type != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
@@ -134,12 +129,12 @@ class MissionServer:
         return items
 
     def _capacity(self, items: ItemList) -> int:
-        """The mission's memory is known only once the vehicle is initialised."""
+        """Return the capacity; that of the mission is 0 until the vehicle is initialised."""
         return 0 if items is self.commands and not self._vehicle.is_initialised else items.capacity
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         mission_type = request.mission_type
-        items = self._find(request, mission_type, channel)
+        items = self._list_for(request, mission_type, channel)
         if items is None:
             return
         if mission_type in self._uploads:
@@ -149,7 +144,7 @@ class MissionServer:
 
     def _on_request_int(self, request: m.MissionRequestInt, channel: Channel) -> None:
         mission_type = request.mission_type
-        if mission_type not in self._lists or (items := self._find(request, mission_type, channel)) is None:
+        if mission_type not in self._lists or (items := self._list_for(request, mission_type, channel)) is None:
             return
         if mission_type in self._uploads:
             self._acknowledge(request, _R.DENIED, mission_type, channel)
@@ -162,19 +157,12 @@ class MissionServer:
             self._acknowledge(request, item, mission_type, channel)
             return
         current = self._is_current(item, mission_type)
-        message = to_wire(
-            item,
-            request.seq,
-            target_system=to[0],
-            target_component=to[1],
-            mission_type=mission_type,
-            current=current,
-        )
+        message = item_message_int(item, request.seq, to, mission_type, current=current)
         self._vehicle.send(message, channel)
 
     def _on_request(self, request: m.MissionRequest, channel: Channel) -> None:
         mission_type = request.mission_type
-        if mission_type not in self._lists or (items := self._find(request, mission_type, channel)) is None:
+        if mission_type not in self._lists or (items := self._list_for(request, mission_type, channel)) is None:
             return
         item = items.item(request.seq)
         if isinstance(item, int):
@@ -191,12 +179,12 @@ class MissionServer:
         self._vehicle.send(item_message_float(item, place, request.seq, to, mission_type, current), channel)
 
     def _is_current(self, item: MissionItem, mission_type: int) -> bool:
-        """As in the firmware, which compares the item's command with the number of the current item."""
+        """The firmware compares the item's command with the index of the current item."""
         return mission_type == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
 
     def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
         mission_type = count.mission_type
-        items = self._find(count, mission_type, channel)
+        items = self._list_for(count, mission_type, channel)
         if items is None or not self._cancel(count, mission_type, channel):
             return
         if count.count > self._capacity(items):
@@ -212,7 +200,7 @@ class MissionServer:
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         mission_type, start, end = request.mission_type, request.start_index, request.end_index
-        items = self._find(request, mission_type, channel)
+        items = self._list_for(request, mission_type, channel)
         if items is None:
             return
         if mission_type in self._uploads:
@@ -225,7 +213,7 @@ class MissionServer:
             self._start(self._upload(items, request, mission_type, channel, start, end))
 
     def _cancel(self, message: Message, mission_type: int, channel: Channel) -> bool:
-        """Whether a new transfer may begin: whoever is uploading may start again, nobody else may."""
+        """Cancel the sender's upload; return False if another component is uploading."""
         upload = self._uploads.get(mission_type)
         if upload is None:
             return True
@@ -244,36 +232,36 @@ class MissionServer:
     def _start(self, upload: _Upload) -> None:
         self._uploads[upload.mission_type] = upload
         self._has_warned_of_request.discard(upload.mission_type)
-        self._ask(upload)
+        self._request_item(upload)
         self._watch(upload)
 
     def _end(self, upload: _Upload) -> None:
         self._uploads.pop(upload.mission_type, None)
         upload.items.abandon()
 
-    def _ask(self, upload: _Upload) -> None:
-        upload.asked_at = self._vehicle.now
+    def _request_item(self, upload: _Upload) -> None:
+        upload.requested_at = self._vehicle.now
         if self._vehicle.is_initialised:
             request = m.MissionRequest(*upload.partner, upload.next, upload.mission_type)
             self._vehicle.send(request, upload.channel)
 
     def _watch(self, upload: _Upload) -> None:
-        """Ask again and give up at the right time; one timer for each upload."""
-        due = min(upload.asked_at + _ASK_AGAIN_S, upload.received_at + _GIVE_UP_S)
+        """Schedule the next retry or the time-out."""
+        due = min(upload.requested_at + _RETRY_INTERVAL_S, upload.received_at + _UPLOAD_TIMEOUT_S)
         self._vehicle.call_at(due, lambda: self._check(upload))
 
     def _check(self, upload: _Upload) -> None:
         if self._uploads.get(upload.mission_type) is not upload:
             return
         now = self._vehicle.now
-        if now >= upload.received_at + _GIVE_UP_S:
+        if now >= upload.received_at + _UPLOAD_TIMEOUT_S:
             self._end(upload)
             self._warn(f"{upload.items.name} upload timeout")
             ack = m.MissionAck(*upload.partner, _R.OPERATION_CANCELLED, upload.mission_type)
             self._vehicle.send(ack, upload.channel)
             return
-        if now >= upload.asked_at + _ASK_AGAIN_S:
-            self._ask(upload)
+        if now >= upload.requested_at + _RETRY_INTERVAL_S:
+            self._request_item(upload)
         self._watch(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
@@ -298,9 +286,9 @@ class MissionServer:
         if isinstance(message, m.MissionItem) and not upload.has_warned:
             upload.has_warned = True
             self._warn("got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
-        self._take(upload, message, item)
+        self._receive_item(upload, message, item)
 
-    def _take(self, upload: _Upload, message: AnyItem, item: MissionItem) -> None:
+    def _receive_item(self, upload: _Upload, message: AnyItem, item: MissionItem) -> None:
         def refuse(result: int) -> None:
             self._acknowledge(message, result, upload.mission_type, upload.channel)
 
@@ -317,7 +305,7 @@ class MissionServer:
             if upload.next > upload.last:
                 self._complete(upload)
             else:
-                self._ask(upload)
+                self._request_item(upload)
 
     def _complete(self, upload: _Upload) -> None:
         result = upload.items.finish(self._warn)
@@ -336,7 +324,7 @@ class MissionServer:
         self._acknowledge(request, _R.ACCEPTED if done else _R.ERROR, mission_type, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """Answered with the number that was asked for, also when another one is flown."""
+        """The answer has the requested index, even if another item is flown."""
         if self._vehicle.mission.set_current(request.seq):
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
@@ -347,7 +335,7 @@ class MissionServer:
         return done
 
     def _guide(self, item: MissionItem, current: int) -> int:
-        """An item that is no item but a target for GUIDED; `current` says so."""
+        """Handle an item that is a target for GUIDED, as its ``current`` specifies."""
         kept = stored(item, self._vehicle.KIND)
         if isinstance(kept, int):
             return kept
@@ -362,7 +350,7 @@ class MissionServer:
 
 
 def _without_floats(item: MissionItem) -> MissionItem | int:
-    """MISSION_ITEM's degrees as the integers that they are meant to be, with a float's seven digits."""
+    """Convert the degrees of a MISSION_ITEM to integers, in single precision."""
     if not has_location(item.command):
         return item.replace(x=whole(item.x), y=whole(item.y))
     if not abs(item.x) <= 90.0:

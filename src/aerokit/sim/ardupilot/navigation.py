@@ -1,48 +1,37 @@
-"""What a simulated ArduPilot knows of where it is: GPS, estimator, origin and home."""
+"""Position estimate of a simulated ArduPilot: GPS, estimator, origin and home, rally points, the path of SMART_RTL."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from aerokit.mavlink.enums import EkfStatusFlags as Ekf
-from aerokit.mavlink.enums import GpsFixType, MavMissionType
-from aerokit.sim.ardupilot.host import Host
-from aerokit.sim.local_frame import GlobalPoint, LocalFrame, Ned
+from aerokit.mavlink.enums import GpsFixType, MavMissionType, MavSeverity
+from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.motion import GlobalPoint, LocalFrame, Ned
 
-# plain numbers: the operators of flags are slow, and these are looked at all the time
+# Plain integers, because operators of flags are slow and these are tested at every tick.
 _ATTITUDE, _POS_HORIZ_ABS, _POS_VERT_ABS = map(int, (Ekf.ATTITUDE, Ekf.POS_HORIZ_ABS, Ekf.POS_VERT_ABS))
-_ATTITUDE_ONLY = int(
-    Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.CONST_POS_MODE
-)
-_WITH_POSITION = int(
-    Ekf.ATTITUDE
-    | Ekf.VELOCITY_HORIZ
-    | Ekf.VELOCITY_VERT
-    | Ekf.POS_HORIZ_REL
-    | Ekf.POS_HORIZ_ABS
-    | Ekf.POS_VERT_ABS
-    | Ekf.PRED_POS_HORIZ_REL
-    | Ekf.PRED_POS_HORIZ_ABS
-)
 _DEAD_RECKONING = int(Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS)
-_GIVE_UP_S, _STOP_AIDING_S = 7.0, 15.0
-_CHECK_S = 0.1
+_ATTITUDE_ONLY = int(_DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.CONST_POS_MODE)
+_WITH_POSITION = int(
+    _DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS
+    | Ekf.PRED_POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_ABS
+)  # fmt: skip
+_POSITION_TIMEOUT_S, _AIDING_TIMEOUT_S = 7.0, 15.0
+_GPS_CHECK_INTERVAL_S = 0.1
 
 
-class Navigation:
-    """Grows with the boot, suffers under ``faults.gps_lost`` and SIM_GPS1_ENABLE 0.
+class ArduPilotNavigation:
+    """Estimator state. It advances along the boot timeline and degrades with ``faults.gps_lost`` or SIM_GPS1_ENABLE 0.
 
-    Positions are kept in the world's frame (`frame`, around the place where the vehicle was created);
-    ``origin`` and
-    ``home`` are points of it, None until they are known.
+    Positions are in the world frame, whose origin is the power-on location.
     """
 
-    def __init__(self, vehicle: Host, frame: LocalFrame) -> None:
+    def __init__(self, vehicle: ArduPilotHost, frame: LocalFrame) -> None:
         self._vehicle = vehicle
         self.frame = frame
-        self.flags: int | None = None
-        """EKF_STATUS_FLAGS; None while there is no estimator to ask."""
+        self.flags: int | None = None  # EKF_STATUS_FLAGS; None until the estimator runs.
         self.fix_type: int = GpsFixType.NO_GPS
         self.is_gps_detected: bool = False
         self.is_healthy: bool = False
@@ -52,15 +41,12 @@ class Navigation:
         self._lost_at = math.nan
 
     def start(self) -> None:
-        """Follow the boot timeline from now on."""
-        vehicle, line = self._vehicle, self._vehicle.timeline
-        later = vehicle.call_later
-        later(
-            line.ready + 0.5 * (line.estimator_active - line.ready),
-            lambda: self._set_flags(int(Ekf.UNINITIALIZED)),
-        )
+        """Schedule the events of the boot timeline."""
+        line, later = self._vehicle.timeline, self._vehicle.call_later
+        unaligned = line.ready + 0.5 * (line.estimator_active - line.ready)
+        later(unaligned, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
         later(line.estimator_active, self._activate)
-        later(line.tilt_aligned, lambda: self._say_cores("tilt alignment complete"))
+        later(line.tilt_aligned, lambda: self._report_cores("tilt alignment complete"))
         later(line.yaw_aligned, self._align)
         later(line.gps_detected, self._detect_gps)
         later(line.gps_fix, self._get_fix)
@@ -70,7 +56,7 @@ class Navigation:
 
     @property
     def has_position(self) -> bool:
-        """Whether the estimator has a position that is good enough to fly by."""
+        """True while the estimated position is good enough to navigate."""
         return self.flags is not None and self.flags & _POS_HORIZ_ABS != 0
 
     @property
@@ -79,75 +65,68 @@ class Navigation:
 
     @property
     def has_attitude(self) -> bool:
-        """Whether the estimator knows up from down."""
         return self.flags is not None and self.flags & _ATTITUDE != 0
 
     @property
     def has_altitude(self) -> bool:
-        """Whether the estimator has a height."""
         return self.flags is not None and self.flags & _POS_VERT_ABS != 0
 
     @property
     def position(self) -> GlobalPoint | None:
-        """Where the vehicle believes to be; None before the first fix."""
+        """Estimated position; None before the first fix."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
             return None
-        motion = self._vehicle.motion
-        return self.frame.to_global(*motion.place)
+        return self.frame.to_global(*self._vehicle.motion.place)
 
     @property
     def altitude_above_home(self) -> float:
-        """Metres above home, or above the ground it was switched on while home is unknown."""
+        """Metres above home, or above the ground while home is not set."""
         reference = self._vehicle.motion.ground_down if self.home is None else self.home[2]
         return reference - self._vehicle.motion.down
 
     def local(self, point: Ned) -> Ned:
-        """A point of the world, relative to the estimator's origin."""
+        """Convert a point of the world frame to the estimator's frame."""
         north, east, down = (0.0, 0.0, 0.0) if self.origin is None else self.origin
         return (point[0] - north, point[1] - east, point[2] - down)
 
     def world(self, local: Ned) -> Ned:
-        """A point relative to the estimator's origin, in the world."""
+        """Convert a point of the estimator's frame to the world frame."""
         north, east, down = (0.0, 0.0, 0.0) if self.origin is None else self.origin
         return (local[0] + north, local[1] + east, local[2] + down)
 
     def set_home(self, point: Ned, *, lock: bool) -> None:
-        """Make a point home and tell everybody."""
+        """Set home and broadcast it; with ``lock`` arming does not move it any longer."""
         self.home = point
         self.home_is_locked = self.home_is_locked or lock
         self._vehicle.missions.commands.add_home()
         self._vehicle.call_later(0.0, self._vehicle.send_home)
 
     def set_origin(self, point: Ned) -> bool:
-        """Make a point the estimator's origin; False when it has one, or is not there yet."""
+        """Set the estimator's origin; return False if it is set already or the vehicle still boots."""
         if self.origin is not None or not self._vehicle.is_initialised:
             return False
         self.origin = point
-        self._tell_origin()
-        return True
-
-    def _tell_origin(self) -> None:
-        assert self.origin is not None
-        self._say_cores("origin set")
+        self._report_cores("origin set")
         if self._vehicle.KIND != "sub":
-            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - self.origin[2]:.0f}m")
+            self._vehicle.info(f"Field Elevation Set: {self.frame.origin.altitude_m - point[2]:.0f}m")
+        return True
 
     def _set_flags(self, flags: int) -> None:
         self.flags = flags
 
-    def _say_cores(self, text: str) -> None:
+    def _report_cores(self, text: str) -> None:
         for core in (0, 1):
             self._vehicle.info(f"EKF3 IMU{core} {text}")
 
     def _activate(self) -> None:
         self.flags = 0
-        self._say_cores("initialised")
+        self._report_cores("initialised")
         if self._vehicle.timeline.estimator_leads_early:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _align(self) -> None:
         self.flags = _ATTITUDE_ONLY
-        self._say_cores("MAG0 initial yaw alignment complete")
+        self._report_cores("MAG0 initial yaw alignment complete")
 
     def _detect_gps(self) -> None:
         self.is_gps_detected = True
@@ -160,22 +139,18 @@ class Navigation:
             self.fix_type = GpsFixType.RTK_FIXED
             if not self._vehicle.timeline.estimator_leads_early:
                 self._set_first_home()
-        self._vehicle.every(_CHECK_S, self._watch_gps)
+        self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_gps)
 
     def _set_origin(self) -> None:
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._vehicle.call_later(1.0, self._set_origin)
             return
-        if self.origin is None:
-            motion = self._vehicle.motion
-            self.origin = motion.place
-            self._tell_origin()
+        self.set_origin(self._vehicle.motion.place)
         if not self.home_is_locked:
             self._set_first_home()
 
     def _set_first_home(self) -> None:
-        motion = self._vehicle.motion
-        self.home = motion.place
+        self.home = self._vehicle.motion.place
         self._vehicle.missions.commands.add_home()
         self._vehicle.send_home()
 
@@ -187,34 +162,38 @@ class Navigation:
             self._vehicle.call_later(1.0, self._use_gps)
             return
         self.flags = _WITH_POSITION
-        self._say_cores("is using GPS")
+        self._report_cores("is using GPS")
         if not self._vehicle.timeline.estimator_leads_early:
             self._vehicle.info("AHRS: EKF3 active")
 
-    def _watch_gps(self) -> None:
+    def _check_gps(self) -> None:
         now, lost = self._vehicle.now, self.gps_is_lost
         if lost and math.isnan(self._lost_at):
             self._lost_at, self.fix_type = now, GpsFixType.NO_FIX
-        elif lost and self.has_position and now - self._lost_at >= _GIVE_UP_S:
+        elif lost and self.has_position and now - self._lost_at >= _POSITION_TIMEOUT_S:
             self.flags = _DEAD_RECKONING | (Ekf.VELOCITY_HORIZ if self._vehicle.is_landed else 0)
-        elif lost and self.flags != _ATTITUDE_ONLY and now - self._lost_at >= _STOP_AIDING_S:
+        elif lost and self.flags != _ATTITUDE_ONLY and now - self._lost_at >= _AIDING_TIMEOUT_S:
             self.flags = _ATTITUDE_ONLY
-            self._say_cores("stopped aiding")
+            self._report_cores("stopped aiding")
         elif not lost and self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._lost_at, self.fix_type = math.nan, GpsFixType.RTK_FIXED
             if self.origin is not None and not self.has_position:
                 self._use_gps()
 
 
-def best_return_place(vehicle: Host, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
-    """The nearest rally point that is allowed, with its own height; home when there is none or it is to be preferred.
+def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
+    """Return the place where RTL ends: the nearest allowed rally point at its own height, or home.
 
-    Rally points farther than RALLY_LIMIT_KM are none (0 means that there is no limit). With RALLY_INCL_HOME home is one
-    of the places.
+    Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME home competes with
+    the rally points.
     """
     here = (vehicle.motion.north, vehicle.motion.east)
     parameters = vehicle.parameters
-    places = [place for place in _rally_points(vehicle) if is_allowed(place)]
+    points = (
+        vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        for item in vehicle.missions.items(MavMissionType.RALLY)
+    )
+    places = [point for point in points if point is not None and is_allowed(point)]
     if not places:
         return home
     nearest = min(places, key=lambda place: math.dist(place[:2], here))
@@ -226,9 +205,164 @@ def best_return_place(vehicle: Host, home: Ned, *, is_allowed: Callable[[Ned], b
     return nearest
 
 
-def _rally_points(vehicle: Host) -> list[Ned]:
-    points = (
-        vehicle.point(int(item.x), int(item.y), item.z, item.frame)
-        for item in vehicle.missions.items(MavMissionType.RALLY)
-    )
-    return [point for point in points if point is not None]
+_PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 1.0 / 3.0, 15.0, 10.0
+_CLEAN_UP_AFTER_POINTS = 50
+_LOW_SPACE_POINTS = 9
+# Shares of SRTL_ACCURACY: smaller bends are removed, parts that come closer to each other are joined.
+_BEND, _LOOP = 0.5, 0.99
+
+
+class SmartPath:
+    """Path that SMART_RTL returns on: at most SRTL_POINTS points, SRTL_ACCURACY metres apart.
+
+    It starts where the vehicle was armed or first had a position. After 15 s without a position, or when there is no
+    space left, the path is deactivated and SMART_RTL is refused.
+    """
+
+    def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
+        self._vehicle = vehicle
+        self._only_armed = only_armed
+        self._points: list[Ned] = []
+        self._cleaned = 0
+        self._good_at = self._saved_at = self._warned_at = -math.inf
+        self._is_started = False
+        self.is_active: bool = False  # True while SMART_RTL is possible.
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def start(self) -> None:
+        """Update the path three times a second from now on."""
+        self._vehicle.every(_PERIOD_S, self.update)
+
+    def reset(self) -> None:
+        """Discard the path and start a new one here, as arming does. Without a position the path is inactive."""
+        parameters = self._vehicle.parameters
+        self._points.clear()
+        self._cleaned, self.is_active, self._is_started = 0, False, True
+        if parameters["SRTL_POINTS"] <= 0 or parameters["SRTL_ACCURACY"] <= 0:
+            return
+        if self._vehicle.navigation.has_position:
+            self._points.append(self._vehicle.motion.place)
+            self._good_at = self._saved_at = self._vehicle.now
+            self.is_active = True
+
+    def take_way_back(self) -> list[Ned]:
+        """Return the simplified path, last point first, and stop recording it."""
+        accuracy = self._vehicle.parameters["SRTL_ACCURACY"]
+        way = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
+        self._points.clear()
+        self._cleaned = 0
+        return way[::-1]
+
+    def restore(self, way: Sequence[Ned]) -> None:
+        """Put the points of `take_way_back` that were not reached back into the path."""
+        self._points[:] = list(way)[::-1]
+        self._cleaned = len(self._points)
+
+    def update(self) -> None:
+        """Record the present position if it is far enough from the last point."""
+        vehicle = self._vehicle
+        if not self.is_active:
+            if not self._is_started and vehicle.navigation.has_position:
+                self.reset()
+            return
+        if vehicle.mode.returns_on_path or (self._only_armed and not vehicle.motors.is_armed):
+            return
+        if not vehicle.navigation.has_position:
+            if vehicle.now - self._good_at > _FAILURE_TIMEOUT_S:
+                self._deactivate("bad position")
+            return
+        self._good_at = vehicle.now
+        if self._add(self._vehicle.motion.place):
+            self._saved_at = vehicle.now
+        elif vehicle.now - self._saved_at > _FAILURE_TIMEOUT_S:
+            self._deactivate("buffer full")
+
+    def _add(self, place: Ned) -> bool:
+        parameters = self._vehicle.parameters
+        accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
+        if self._points and math.dist(self._points[-1], place) < accuracy:
+            return True
+        if len(self._points) - self._cleaned >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
+            self._points = simplify(self._points, _BEND * accuracy)
+            if len(self._points) >= maximum - _LOW_SPACE_POINTS:
+                self._points = prune(self._points, _LOOP * accuracy)
+            self._cleaned = len(self._points)
+        if (
+            len(self._points) >= maximum - _LOW_SPACE_POINTS
+            and self._vehicle.now - self._warned_at > _LOW_SPACE_REPORT_INTERVAL_S
+        ):
+            self._warned_at = self._vehicle.now
+            self._vehicle.info("SmartRTL Low on space!")
+        if len(self._points) >= maximum:
+            return False
+        self._points.append(place)
+        return True
+
+    def _deactivate(self, reason: str) -> None:
+        self.is_active = False
+        self._vehicle.send_text(MavSeverity.WARNING, f"SmartRTL deactivated: {reason}")
+
+
+def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
+    """Return the path without points that are within ``tolerance`` metres of the line through the others."""
+    if len(path) < 3:
+        return list(path)
+    distances = [_distance_to_line(point, path[0], path[-1]) for point in path[1:-1]]
+    farthest = max(range(len(distances)), key=distances.__getitem__)
+    if distances[farthest] <= tolerance:
+        return [path[0], path[-1]]
+    middle = farthest + 1
+    return simplify(path[: middle + 1], tolerance)[:-1] + simplify(path[middle:], tolerance)
+
+
+def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
+    """Return the path without loops: parts that come within ``tolerance`` metres of each other are joined.
+
+    The earliest loop is removed first, and of several the longest.
+    """
+    points = list(path)
+    first = 0
+    while first < len(points) - 3:
+        for last in range(len(points) - 2, first + 1, -1):
+            meeting = _closest_approach(points[first], points[first + 1], points[last], points[last + 1])
+            if meeting is not None and meeting[0] < tolerance:
+                points[first + 1 : last + 1] = [meeting[1]]
+                break
+        first += 1
+    return points
+
+
+def _minus(one: Ned, other: Ned) -> Ned:
+    return (one[0] - other[0], one[1] - other[1], one[2] - other[2])
+
+
+def _dot(one: Ned, other: Ned) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def _along(start: Ned, line: Ned, share: float) -> Ned:
+    return (start[0] + share * line[0], start[1] + share * line[1], start[2] + share * line[2])
+
+
+def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
+    line = _minus(end, start)
+    length2 = _dot(line, line)
+    share = 0.0 if length2 == 0.0 else max(0.0, min(1.0, _dot(_minus(point, start), line) / length2))
+    return math.dist(point, _along(start, line, share))
+
+
+def _closest_approach(one: Ned, one_end: Ned, other: Ned, other_end: Ned) -> tuple[float, Ned] | None:
+    """Return the distance of two line segments and the point midway; None if they are parallel."""
+    line1, line2, between = _minus(one_end, one), _minus(other_end, other), _minus(one, other)
+    a, b, c = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
+    d, e = _dot(line1, between), _dot(line2, between)
+    determinant = a * c - b * b
+    if determinant < 1e-6 * max(a * c, 1e-9):
+        return None
+    share1 = max(0.0, min(1.0, (b * e - c * d) / determinant))
+    share2 = max(0.0, min(1.0, (b * share1 + e) / c))
+    share1 = max(0.0, min(1.0, (b * share2 - d) / a))
+    place1, place2 = _along(one, line1, share1), _along(other, line2, share2)
+    return math.dist(place1, place2), _along(place1, _minus(place2, place1), 0.5)

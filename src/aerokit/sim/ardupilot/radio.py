@@ -1,32 +1,34 @@
-"""The pilot's radio, and what RC_CHANNELS_OVERRIDE puts in its place."""
+"""RC channels of a simulated ArduPilot (transmitter, RC_CHANNELS_OVERRIDE, MANUAL_CONTROL), servos and relays."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import ClassVar
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.messages import ManualControl
-from aerokit.sim.ardupilot.host import Host
+from aerokit.mavlink.enums import MavResult
+from aerokit.sim.ardupilot.host import ArduPilotHost
+from aerokit.sim.ardupilot.kinds import Kind
 from aerokit.sim.channel import Channel
+from aerokit.sim.commands import ReceivedCommand, whole
 from aerokit.sim.vehicle import sender_of
 
 _AT_REST = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
 _OVERRIDABLE, _CHANNELS = 16, 18
+# Values of SIM_RC_FAIL.
 _NO_PULSES, _LOW_THROTTLE = 1, 2
-"""SIM_RC_FAIL."""
 _LOW_THROTTLE_PWM = 950
-_SAME_AS_BEFORE, _RELEASE_UPPER = 0xFFFF, 0xFFFE
+_UNCHANGED, _RELEASE_UPPER = 0xFFFF, 0xFFFE
+_ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
 
 
-class Radio:
-    """What the vehicle hears: ``radio[2]`` is the throttle, in microseconds, overridden or not.
+class ArduPilotRadio:
+    """RC channels in microseconds, from index 0 (``radio[2]`` is the throttle), overrides included.
 
-    Setting an item moves a stick or switch of the transmitter, of which there are eight.
+    Setting an item moves a stick or switch of the transmitter, which has eight.
     """
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self._sticks: list[int] = list(_AT_REST)
         self._overrides: dict[int, tuple[int, float]] = {}
@@ -51,14 +53,14 @@ class Radio:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """All 18 that RC_CHANNELS has; those that nobody sends are 0."""
+        """The 18 channels of RC_CHANNELS; 0 where the transmitter has none."""
         if not self._overrides and self._failure != _LOW_THROTTLE:
             return (*self._sticks, *(0,) * (_CHANNELS - len(self._sticks)))
         return tuple(self[index] for index in range(_CHANNELS))
 
     @property
-    def is_heard(self) -> bool:
-        """Whether there are pulses: of the transmitter, or of RC_CHANNELS_OVERRIDE in its place."""
+    def is_receiving(self) -> bool:
+        """True while the transmitter or RC_CHANNELS_OVERRIDE provides pulses."""
         vehicle = self._vehicle
         if not (vehicle.faults.rc_lost or self._failure == _NO_PULSES):
             return True
@@ -66,7 +68,7 @@ class Radio:
         return any(value and since > limit for value, since in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
-        """Put these in the place of channels, from 0, as long as RC_OVERRIDE_TIME says; 0 gives one back."""
+        """Override channels, by index from 0, for RC_OVERRIDE_TIME; 0 releases a channel."""
         for index, value in pulses.items():
             self._overrides[index] = (value, self._vehicle.now)
 
@@ -75,31 +77,27 @@ class Radio:
         return self._vehicle.parameters.get("SIM_RC_FAIL", 0.0)
 
     def release_overrides(self) -> None:
-        """Forget what was overridden, as a lost ground station makes the vehicle do."""
+        """Drop all overrides, as a reboot or a lost ground station does."""
         self._overrides.clear()
 
     def listen(self) -> None:
-        """Hear RC_CHANNELS_OVERRIDE."""
+        """Register the handler of RC_CHANNELS_OVERRIDE."""
         self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
-    def reset(self) -> None:
-        """Forget what was overridden, as a reboot does."""
-        self._overrides.clear()
-
     def _override_time(self) -> float:
-        """Seconds for which an override holds; below 0 means for ever."""
+        """Seconds that an override is valid; a negative RC_OVERRIDE_TIME means no limit."""
         seconds = self._vehicle.parameters["RC_OVERRIDE_TIME"]
         return math.inf if seconds < 0 else seconds
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        """Only of the vehicle's own ground station. 0 leaves channels above 8 as they are, and releases the others."""
+        """Accept overrides of the ground station MAV_GCS_SYSID only. 0 releases channels 1 to 8 only."""
         vehicle = self._vehicle
         if sender_of(override)[0] != vehicle.parameters["MAV_GCS_SYSID"]:
             return
         vehicle.failsafes.ground_station_seen_at = vehicle.now
         for index in range(_OVERRIDABLE):
             value = getattr(override, f"chan{index + 1}_raw")
-            if value == _SAME_AS_BEFORE or (value == 0 and index >= len(self._sticks)):
+            if value == _UNCHANGED or (value == 0 and index >= len(self._sticks)):
                 continue
             if value == _RELEASE_UPPER and index >= len(self._sticks):
                 value = 0
@@ -107,30 +105,29 @@ class Radio:
 
 
 _NO_VALUE = 0x7FFF
-_ROLL, _PITCH, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
-_CENTRE, _SUB_LOWEST, _SUB_HIGHEST = 1500, 1100, 1900
+_CENTRE, _SUB_MIN_PWM, _SUB_MAX_PWM, _SUB_SCALE = 1500, 1100, 1900, 0.4
 
 
-class Joystick:
-    """Copter and Plane: x is pitch, y roll, z throttle (0 to 1000), r yaw, each -1000 to 1000 else.
+class ArduPilotJoystick:
+    """MANUAL_CONTROL of Copter and Plane: x is pitch, y roll, z throttle (0 to 1000), r yaw (-1000 to 1000).
 
-    Only of the vehicle's own ground station, and for this vehicle; it counts as a heartbeat of it. An axis that has no
-    value is given back to the radio. It holds as long as RC_CHANNELS_OVERRIDE does.
+    Only messages of the ground station MAV_GCS_SYSID to this vehicle count; they also count as its heartbeat. Axes are
+    overrides like those of RC_CHANNELS_OVERRIDE; an axis without a value releases its channel.
     """
 
-    def __init__(self, vehicle: Host) -> None:
+    def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        vehicle.on(ManualControl, self._on_message)
+        vehicle.on(m.ManualControl, self._on_message)
 
-    def _on_message(self, axes: ManualControl, _: Channel) -> None:
+    def _on_message(self, axes: m.ManualControl, _: Channel) -> None:
         vehicle = self._vehicle
         if sender_of(axes)[0] != vehicle.parameters["MAV_GCS_SYSID"] or axes.target != vehicle.system_id:
             return
         vehicle.rc.override(self.sticks(axes))
         vehicle.failsafes.ground_station_seen_at = vehicle.now
 
-    def sticks(self, axes: ManualControl) -> Mapping[int, int]:
-        """Channel, from 0, → pulse in microseconds; 0 gives it back."""
+    def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
+        """Return pulses in microseconds by channel index; 0 releases a channel."""
         if axes.z < 0:
             return {}
         return {
@@ -141,43 +138,105 @@ class Joystick:
         }
 
     def pulse(self, channel: int, value: int, *, lowest: int = -1000, reverse: bool = False) -> int:
-        """Between RCn_MIN and RCn_MAX; 0 of an axis without a value."""
+        """Scale an axis to RCn_MIN … RCn_MAX; 0 if it has no value."""
         if value == _NO_VALUE:
             return 0
         low, high = self.setting(f"RC{channel + 1}_MIN", 1100.0), self.setting(f"RC{channel + 1}_MAX", 1900.0)
         share = ((-value if reverse else value) - lowest) / (1000 - lowest)
-        return int(low + (high - low) * share) & 0xFFFF  # nothing checks the range of an axis
+        return int(low + (high - low) * share) & 0xFFFF  # the firmware does not check the range of an axis
 
     def setting(self, name: str, default: float) -> float:
-        """A parameter that a small table may be without."""
+        """Return a parameter that a small parameter table may lack."""
         return self._vehicle.parameters.get(name, default)
 
 
-class LevelJoystick(Joystick):
-    """Rover: y steers, z drives, -1000 to 1000."""
+class RoverJoystick(ArduPilotJoystick):
+    """MANUAL_CONTROL of Rover: y steers, z is the throttle, -1000 to 1000."""
 
-    def sticks(self, axes: ManualControl) -> Mapping[int, int]:
-        return {
-            _ROLL: self.pulse(_ROLL, axes.y),
-            _THROTTLE: self.pulse(_THROTTLE, axes.z),
-        }
+    def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
+        return {_ROLL: self.pulse(_ROLL, axes.y), _THROTTLE: self.pulse(_THROTTLE, axes.z)}
 
 
-class SubJoystick(Joystick):
-    """Sub: x is forward, y sideways, z up and down (500 is the middle), r yaw; s and t pitch and roll.
+class SubJoystick(ArduPilotJoystick):
+    """MANUAL_CONTROL of Sub: x is forward, y sideways, z vertical (500 is the middle), r yaw, s pitch and t roll.
 
-    Scaled by JS_GAIN_DEFAULT, and z by JS_THR_GAIN besides. Buttons do nothing.
+    The axes are scaled by JS_GAIN_DEFAULT, z also by JS_THR_GAIN. Buttons are ignored.
     """
 
-    _SCALE: ClassVar[float] = 0.4
-
-    def sticks(self, axes: ManualControl) -> Mapping[int, int]:
+    def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
         gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
-        throttle_scale = 2 * self._SCALE * gain * self.setting("JS_THR_GAIN", 1.0)
+        throttle_scale = 2 * _SUB_SCALE * gain * self.setting("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale
         levers = {
-            _ROLL: axes.s, _PITCH: axes.t, _YAW: axes.r * self._SCALE * gain,
-            _FORWARD: axes.x * self._SCALE * gain, _LATERAL: axes.y * self._SCALE * gain,
+            _ROLL: axes.s, _PITCH: axes.t, _YAW: axes.r * _SUB_SCALE * gain,
+            _FORWARD: axes.x * _SUB_SCALE * gain, _LATERAL: axes.y * _SUB_SCALE * gain,
         }  # fmt: skip
         pulses = {channel: _CENTRE + value for channel, value in levers.items()} | {_THROTTLE: throttle}
-        return {channel: int(max(_SUB_LOWEST, min(_SUB_HIGHEST, pulse))) for channel, pulse in pulses.items()}
+        return {channel: int(max(_SUB_MIN_PWM, min(_SUB_MAX_PWM, pulse))) for channel, pulse in pulses.items()}
+
+
+_SERVOS = 32
+_RELAYS = {"rover": 2}
+_FUNCTIONS = 320
+_SAVE_WAYPOINT = 7
+# RC options that the firmwares refused in SITL.
+_REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
+    "copter": (0,),
+    "plane": (0, _SAVE_WAYPOINT),
+    "rover": (),
+    "sub": (0, _SAVE_WAYPOINT),
+}
+_FREE_FUNCTIONS = frozenset({0, 1, *range(51, 67)})
+_AUX_POSITIONS = (0.0, 1.0, 2.0)
+
+
+class AuxiliaryOutputs:
+    """Servos, relays and auxiliary switches, as DO_SET_SERVO, DO_SET_RELAY and DO_AUX_FUNCTION set them."""
+
+    def __init__(self, vehicle: ArduPilotHost) -> None:
+        self._vehicle = vehicle
+        self.servos: dict[int, int] = {}  # Output number, from 1 → pulse in microseconds.
+        self.relays: int = 0  # Bit mask of the relays that are on.
+        self.functions: dict[int, int] = {}  # RC option → switch position: 0 low, 1 middle, 2 high.
+
+    @property
+    def relay_count(self) -> int:
+        return _RELAYS.get(self._vehicle.KIND, 1)
+
+    def is_free(self, output: int) -> bool:
+        """Return True if an output has no function (SERVOn_FUNCTION), or follows a stick."""
+        return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
+
+    def set_servo(self, command: ReceivedCommand) -> int:
+        """Execute DO_SET_SERVO, or the first pulse of DO_REPEAT_SERVO."""
+        output = whole(command.param1)
+        if not 1 <= output <= _SERVOS:
+            return MavResult.FAILED
+        if not self.is_free(output):
+            self._vehicle.info(f"ServoRelayEvent: Channel {output} is already in use")
+            return MavResult.FAILED
+        self.servos[output] = whole(command.param2)
+        return MavResult.ACCEPTED
+
+    def set_relay(self, command: ReceivedCommand) -> int:
+        if not 0 <= command.param1 < self.relay_count:
+            return MavResult.FAILED
+        bit = 1 << whole(command.param1)
+        self.relays = self.relays | bit if command.param2 else self.relays & ~bit
+        return MavResult.ACCEPTED
+
+    def repeat_relay(self, command: ReceivedCommand) -> int:
+        """Execute DO_REPEAT_RELAY, which leaves the relay in its present state."""
+        is_valid = 0 <= command.param1 < self.relay_count
+        return MavResult.ACCEPTED if is_valid else MavResult.FAILED
+
+    def switch(self, command: ReceivedCommand) -> int:
+        """Execute DO_AUX_FUNCTION; its effect is not simulated."""
+        function = whole(command.param1)
+        if command.param2 not in _AUX_POSITIONS:
+            return MavResult.DENIED
+        if not 0 <= function < _FUNCTIONS or function in _REFUSED_FUNCTIONS[self._vehicle.KIND]:
+            self._vehicle.info(f"Invalid channel option ({function})")
+            return MavResult.FAILED
+        self.functions[function] = whole(command.param2)
+        return MavResult.ACCEPTED

@@ -1,4 +1,4 @@
-"""What a simulated ArduPilot keeps: files, logs, parameters, the key for signing; and how fast it gives them away."""
+"""Files, logs, parameters and signing key of a simulated ArduPilot, with their servers."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from aerokit.mavlink.enums import MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.signing import ONE_MINUTE, SigningKey, timestamp_at
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
-from aerokit.sim.ardupilot.host import Host
+from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.file_tree import FileTree, TextMount
+from aerokit.sim.ftp import FileTree, TextMount
 from aerokit.sim.logs import ArduPilotLogServer, SimulatedLog
 from aerokit.sim.missions import MissionMount
 from aerokit.sim.parameter_server import ArduPilotParameterServer, rounded
@@ -32,16 +32,16 @@ _PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
 _PARAMETERS_SHARE, _BURST_SHARE, _LOG_SHARE = 0.3, 1 / 3, 0.5
 
 
-class Storage:
-    """Files, logs and parameters, and the servers that give them away.
+class ArduPilotStorage:
+    """Files, logs and parameters with their servers.
 
-    ``link_bytes_per_s`` is what the firmware takes the port to be able to carry when it has no flow control: a
-    list of parameters uses 30 % of it, a burst of a file a third. None: flow control, as on USB and in a network.
+    ``link_bytes_per_s`` is the assumed data rate of a port without flow control: a parameter list uses 30 % of it, a
+    file burst a third. None: flow control, as on USB and in a network.
     """
 
     def __init__(
         self,
-        vehicle: Host,
+        vehicle: ArduPilotHost,
         logs: Sequence[SimulatedLog],
         *,
         parameter_errors: bool,
@@ -72,7 +72,7 @@ class Storage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Transfers end, sessions are gone; files remain."""
+        """Drop transfers and sessions; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -87,7 +87,7 @@ class Storage:
             self.files.remove_file(f"{LOG_FOLDER}/{name}")
 
     def _apply(self, name: str, value: float) -> None:
-        """One parameter of an uploaded file."""
+        """Apply a parameter of an uploaded file."""
         parameters = self._vehicle.parameters
         if name not in self._vehicle.faults.read_only_parameters:
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))
@@ -97,32 +97,32 @@ def _log_path(number: int) -> str:
     return f"{LOG_FOLDER}/{number + 1:08}.BIN"
 
 
-_SAVE_EVERY_S = 30.0
+_SAVE_INTERVAL_S = 30.0
 _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """It says nothing when a key is taken, stores its time stamp every 30 seconds, and begins a minute behind it.
+    """Does not announce a new key, stores its time stamp every 30 seconds, and starts a minute ahead of it.
 
-    The first port counts as secure, as USB is on a flight controller: it signs, and lets everything in; set
+    The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. Set
     ``trusts_first_port`` to False, and call `load`, for a vehicle whose only link is a radio. Bit 0 of MAV1_OPTIONS,
-    MAV2_OPTIONS … turns signing off on the first, second … port from the next boot or SETUP_SIGNING on.
+    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING.
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE
 
-    def __init__(self, vehicle: Host, key: SigningKey | None, timestamp: int) -> None:
+    def __init__(self, vehicle: ArduPilotHost, key: SigningKey | None, timestamp: int) -> None:
         super().__init__(vehicle, key, timestamp)
         self.trusts_first_port = True
         self._ardupilot = vehicle
-        vehicle.when_powered_on(self._keep_time)
+        vehicle.on_power_on(self._keep_time)
 
     def is_for(self, link_id: int) -> bool:
         name, parameters = f"MAV{link_id + 1}_OPTIONS", self._ardupilot.parameters
         return not (name in parameters and int(parameters[name]) & _SIGNING_OFF)
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        return _everything if link_id == 0 and self.trusts_first_port else None
+        return _accept_all if link_id == 0 and self.trusts_first_port else None
 
     def may_change(self) -> bool:
         if self._ardupilot.is_armed:
@@ -131,11 +131,11 @@ class ArduPilotSigning(VehicleSigning):
         return True
 
     def _keep_time(self) -> None:
-        self._ardupilot.every(_SAVE_EVERY_S, self._save)
-        self._ardupilot.call_later(self._ardupilot.timeline.gps_fix, self._hear_gps)
+        self._ardupilot.every(_SAVE_INTERVAL_S, self._save)
+        self._ardupilot.call_later(self._ardupilot.timeline.gps_fix, self._on_gps_time)
 
-    def _hear_gps(self) -> None:
-        """GPS knows the time: stamps are not before it."""
+    def _on_gps_time(self) -> None:
+        """Time stamps are never before GPS time."""
         stamp = timestamp_at(int(self._ardupilot.unix_time))
         for channel in self._ardupilot.channels:
             if channel.signing is not None:
@@ -144,9 +144,9 @@ class ArduPilotSigning(VehicleSigning):
 
     def _save(self) -> None:
         if self.key is not None:
-            used = [each.signing.timestamp for each in self._ardupilot.channels if each.signing is not None]
+            used = [channel.signing.timestamp for channel in self._ardupilot.channels if channel.signing is not None]
             self.timestamp: int = max([self.timestamp, *used])
 
 
-def _everything(_: Frame) -> bool:
+def _accept_all(_: Frame) -> bool:
     return True

@@ -1,78 +1,320 @@
-"""Everything that each simulated ArduPilot can send when it is asked for it by id."""
+"""Messages about the state of a simulated ArduPilot, and the tables of all messages of each firmware."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import PlaneMode
+from aerokit.mavlink.enums import (
+    CopterMode,
+    GpsFixType,
+    MavAutopilot,
+    MavBatteryChargeState,
+    MavLandedState,
+    MavModeFlag,
+    MavState,
+    MavVtolState,
+    PlaneMode,
+    RoverMode,
+    SubMode,
+)
+from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.mavlink.message import Message
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.plane.host import PlaneHost
+from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
-from aerokit.sim.ardupilot.rover.host import RoverHost
-from aerokit.sim.ardupilot.sub.host import SubHost
-from aerokit.sim.ardupilot.telemetry_motion import ATTITUDE_BUILDERS, POSITION_BUILDERS
-from aerokit.sim.ardupilot.telemetry_state import STATE_BUILDERS
+from aerokit.sim.ardupilot.rover_modes import RoverHost
+from aerokit.sim.ardupilot.sub_modes import SubHost
+from aerokit.sim.ardupilot.telemetry_motion import MOTION_BUILDERS
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
 
-_MIDDLE = 1500
-_STICK_RANGE = 500
+Builders = Mapping[int, Callable[[Any], "Message | None"]]
+
+# Plain integers, because operators of flags take ten times as long.
+_FENCE, _PREARM = int(Sensor.MAV_SYS_STATUS_GEOFENCE), int(Sensor.MAV_SYS_STATUS_PREARM_CHECK)
+_AHRS, _LOGGING = int(Sensor.MAV_SYS_STATUS_AHRS), int(Sensor.MAV_SYS_STATUS_LOGGING)
+_RATE, _ATTITUDE = int(Sensor.ANGULAR_RATE_CONTROL), int(Sensor.ATTITUDE_STABILIZATION)
+_YAW, _HEIGHT = int(Sensor.YAW_POSITION), int(Sensor.Z_ALTITUDE_CONTROL)
+_PLACE, _TERRAIN = int(Sensor.XY_POSITION_CONTROL), int(Sensor.MAV_SYS_STATUS_TERRAIN)
+_GPS, _LASER = int(Sensor.GPS), int(Sensor.LASER_POSITION)
+_RADIO, _BATTERY, _PROPULSION = int(Sensor.RC_RECEIVER), int(Sensor.BATTERY), int(Sensor.PROPULSION)
+_BODY = _RADIO | _BATTERY | int(
+    Sensor.SENSOR_3D_GYRO | Sensor.SENSOR_3D_ACCEL | Sensor.SENSOR_3D_MAG | Sensor.ABSOLUTE_PRESSURE
+    | Sensor.MOTOR_OUTPUTS
+)  # fmt: skip
+_ALL_CONTROL = _RATE | _ATTITUDE | _YAW | _HEIGHT | _PLACE
+_LOG_AFTER_DISARMING_S = 15.0
+
+
+@dataclass(frozen=True)
+class _Sensors:
+    """Bits of SYS_STATUS of a firmware, besides GPS."""
+
+    working: int
+    """Present, enabled and healthy from the start."""
+    control: int = _ALL_CONTROL
+    """Supported kinds of control."""
+    always: int = 0
+    """Kinds of control that are enabled in every mode."""
+    only_healthy: int = 0
+    """Healthy, but neither present nor enabled."""
+    unhealthy: int = 0
+    """Present and enabled, but not healthy."""
+
+
+_SENSORS: dict[Kind, _Sensors] = {
+    "copter": _Sensors(
+        _BODY | _TERRAIN | _PROPULSION, always=_RATE | _ATTITUDE | _YAW, only_healthy=int(Sensor.PROXIMITY)
+    ),
+    "plane": _Sensors(_BODY | int(Sensor.DIFFERENTIAL_PRESSURE), unhealthy=_TERRAIN),
+    "rover": _Sensors(_BODY, _ALL_CONTROL & ~_HEIGHT, only_healthy=_LASER),
+    "sub": _Sensors(_BODY | _LASER, always=_RATE | _ATTITUDE | _YAW),
+}
+
+# Kinds of control that are off in a mode: firmware → (bits, modes).
+_UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
+    "copter": (
+        (_HEIGHT | _PLACE, (CopterMode.STABILIZE, CopterMode.ACRO)),
+        (_PLACE, (CopterMode.ALT_HOLD,)),
+    ),
+    "plane": (
+        (_ALL_CONTROL, (PlaneMode.MANUAL, PlaneMode.TRAINING)),
+        (_ALL_CONTROL & ~_RATE, (PlaneMode.ACRO,)),
+        (
+            _YAW | _HEIGHT | _PLACE,
+            (
+                PlaneMode.STABILIZE, PlaneMode.FLY_BY_WIRE_A, PlaneMode.AUTOTUNE, PlaneMode.FLY_BY_WIRE_B,
+                PlaneMode.CRUISE,
+            ),
+        ),
+    ),
+    "rover": (
+        (_ALL_CONTROL, (RoverMode.MANUAL, RoverMode.HOLD)),
+        (_YAW | _PLACE, (RoverMode.ACRO, RoverMode.STEERING, RoverMode.SIMPLE)),
+    ),
+    "sub": (
+        (
+            _HEIGHT | _PLACE,
+            (SubMode.MANUAL, SubMode.STABILIZE, SubMode.ACRO, SubMode.MOTORDETECT, SubMode.SURFTRAK),
+        ),
+    ),
+}  # fmt: skip
+
+
+def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
+    """Return the present, enabled and healthy sensors of SYS_STATUS."""
+    sensors, nav, kind = _SENSORS[vehicle.KIND], vehicle.navigation, vehicle.KIND
+    off = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
+    controls = sensors.always | sensors.control & ~off
+    present = sensors.working | sensors.control | sensors.unhealthy | _PREARM | _AHRS | _LOGGING
+    enabled = sensors.working | sensors.unhealthy | _PREARM | controls
+    health = sensors.working | sensors.only_healthy | _LOGGING | controls
+    if nav.is_gps_detected:
+        present, enabled = present | _GPS, enabled | _GPS
+        health |= 0 if nav.gps_is_lost else _GPS
+    if nav.is_healthy:
+        enabled |= _AHRS
+        health |= _AHRS if vehicle.timeline.estimator_leads_early or nav.has_position else 0
+    if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _LOG_AFTER_DISARMING_S:
+        enabled |= _LOGGING
+    if vehicle.rangefinder_reach_m > 0.0:
+        present, enabled, health = present | _LASER, enabled | _LASER, health | _LASER
+    is_present, is_enforced, is_kept = vehicle.fence.health
+    present |= _FENCE if is_present else 0
+    enabled |= _FENCE if is_enforced else 0
+    health |= _FENCE if is_kept else 0
+    health |= _PREARM if vehicle.arming.passes else 0
+    if not vehicle.failsafes.is_radio_healthy:
+        health &= ~_RADIO
+    if vehicle.failsafes.battery_is_low:
+        health &= ~_BATTERY
+    if vehicle.faults.motor_failed:
+        health &= ~_PROPULSION
+    return present, enabled, health
+
+
+_UNKNOWN_CELL = 0xFFFF
+_UNKNOWN_TEMPERATURE = 32767
+_RSSI = 255
+_NOTHING_REACHED = 0xFFFF
+_AIR_DENSITY = 1.225
+# Output indices of the motors with ESC telemetry.
+_MOTORS = {"copter": (0, 1, 2, 3), "plane": (2,)}
+# Flags and mode before the vehicle is initialised; Copter and Sub report their real mode.
+_BOOT_MODE: dict[str, tuple[int, int]] = {
+    "plane": (MavModeFlag.STABILIZE_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, PlaneMode.INITIALIZING),
+    "rover": (MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED, RoverMode.INITIALIZING),
+}
+
+
+def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
+    """Build HEARTBEAT: BOOT until half a second after initialisation, or CALIBRATING in a boot mode."""
+    base_mode, mode, state = vehicle.base_mode, vehicle.mode.number, MavState.BOOT
+    if not vehicle.is_initialised and vehicle.KIND in _BOOT_MODE:
+        base_mode, mode = _BOOT_MODE[vehicle.KIND]
+        state = MavState.CALIBRATING
+    elif vehicle.has_left_boot:
+        state = MavState.STANDBY if vehicle.is_landed else MavState.ACTIVE
+        if vehicle.failsafes.is_any_active:
+            state = MavState.CRITICAL
+    return m.Heartbeat(vehicle.MAV_TYPE, MavAutopilot.ARDUPILOTMEGA, base_mode, mode, state, 3)
+
+
+def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
+    battery = vehicle.battery
+    voltage, current = round(battery.voltage_v * 1000), round(battery.current_a * 100)
+    return m.SysStatus(*_sensor_status(vehicle), 0, voltage, current, int(battery.percent), 0, 0, 0, 0, 0, 0)
+
+
+def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
+    state = MavLandedState.IN_AIR
+    if vehicle.is_landed:
+        state = MavLandedState.ON_GROUND
+    elif vehicle.mode.is_landing:
+        state = MavLandedState.LANDING
+    elif vehicle.mode.is_taking_off:
+        state = MavLandedState.TAKEOFF
+    lifts = MavVtolState.MC if vehicle.KIND == "copter" else MavVtolState.UNDEFINED
+    return m.ExtendedSysState(lifts, state)
+
+
+def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
+    battery = vehicle.battery
+    voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)
+    charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
+    if vehicle.failsafes.battery_is_critical:
+        charge = MavBatteryChargeState.CRITICAL
+    current, consumed = round(battery.current_a * 100), round(battery.consumed_mah)
+    energy, percent = round(battery.consumed_wh * 36), int(battery.percent)
+    return m.BatteryStatus(0, 0, 0, _UNKNOWN_TEMPERATURE, voltages, current, consumed, energy, percent, 0, charge)
+
+
+def _system_time(vehicle: ArduPilotVehicle) -> m.SystemTime:
+    unix = round(vehicle.unix_time * 1e6) if vehicle.navigation.fix_type >= GpsFixType.TYPE_3D_FIX else 0
+    return m.SystemTime(unix, vehicle.time_boot_ms)
+
+
+def _rc_channels(vehicle: ArduPilotVehicle) -> m.RcChannels:
+    fields = [vehicle.time_boot_ms, len(vehicle.rc), *vehicle.rc.channels, _RSSI]
+    return m.RcChannels(*fields)
+
+
+def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
+    fields = [vehicle.time_boot_ms, 0, *vehicle.rc, _RSSI]
+    return m.RcChannelsRaw(*fields)
+
+
+def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
+    size = 0.003 + 0.3 * vehicle.motors.throttle
+    x, y, z = (abs(vehicle.rng.gauss(0.0, size)) for _ in range(3))
+    return m.Vibration(vehicle.time_boot_us, x, y, z, 0, 0, 0)
+
+
+def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
+    current = round(vehicle.battery.current_a * 25)
+    rpm = round(vehicle.motors.throttle * 15000)
+    count = int(vehicle.uptime * 100) & 0xFFFF
+    voltage = round(vehicle.battery.voltage_v * 100)
+    fitted = [int(index in _MOTORS[vehicle.KIND]) for index in range(4)]
+    voltages, currents, rpms, counts = ([value * bit for bit in fitted] for value in (voltage, current, rpm, count))
+    return m.EscTelemetry1To4(bytes(32 * bit for bit in fitted), voltages, currents, (0,) * 4, rpms, counts)
+
+
+def _autopilot_version(vehicle: ArduPilotVehicle) -> m.AutopilotVersion:
+    hashes = (vehicle.GIT_HASH, bytes(8), bytes(8))
+    return m.AutopilotVersion(vehicle.capabilities, vehicle.version_number, 0, 0, 0, *hashes, 0, 0, 0, vehicle.uid)
+
+
+def _relay_status(vehicle: ArduPilotVehicle) -> m.RelayStatus:
+    outputs = vehicle.accessories
+    return m.RelayStatus(vehicle.time_boot_ms, outputs.relays, (1 << outputs.relay_count) - 1)
+
+
+def _angle_of_attack(plane: PlaneHost) -> m.AoaSsa:
+    motion = plane.motion
+    slope = math.atan2(-motion.velocity_down, max(motion.airspeed_m_s, 1.0))
+    attack = 0.0 if plane.is_landed else math.degrees(motion.pitch - slope)
+    return m.AoaSsa(plane.time_boot_us, attack, 0.0)
+
+
+def _airspeed(plane: PlaneHost) -> m.Airspeed:
+    speed = plane.motion.airspeed_m_s
+    return m.Airspeed(0, speed, _UNKNOWN_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
+
+
+def _display_value(sub: SubHost) -> m.NamedValueFloat:
+    name = next(sub.display_names)
+    return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
+
+
+def _rover_hud(rover: RoverHost) -> m.VfrHud:
+    # Without airspeed and climb; the throttle is positive also in reverse.
+    motion, place = rover.motion, rover.navigation.position
+    heading = int(math.degrees(motion.yaw) % 360.0)
+    throttle = round(abs(rover.motors.throttle) * 100)
+    altitude = 0.0 if place is None else place.altitude_m
+    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
+
+
+_MIDDLE, _STICK_RANGE = 1500, 500
+# A surface or thruster goes from 1100 to 1900.
 _SURFACE_RANGE = 400
-"""A surface or thruster goes from 1100 to 1900."""
 _ROVER_DEADZONE = 30
 _OUTPUTS = 16
-_FULL_ROLL_RATE = 1.5
-_FULL_PITCH_RATE = 0.5
-_PITCH, _ROLL, _THROTTLE, _YAW, _FORWARD, _LATERAL = range(6)
+_FULL_ROLL_RATE, _FULL_PITCH_RATE = 1.5, 0.5
+_SUB_ROLL, _SUB_YAW, _SUB_FORWARD, _SUB_LATERAL = 1, 3, 4, 5
 
 
-def copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
-    """Four motors, all alike."""
-    pwm = vehicle.motors.pwm
-    return _message(vehicle, pwm, pwm, pwm, pwm)
+def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
+    return _servo_outputs(vehicle, *(vehicle.motors.pwm,) * 4)
 
 
-def plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
-    """Aileron, elevator, throttle, rudder; in MANUAL the sticks, disarmed too, the throttle only when armed."""
-    wing, throttle = plane.wing, 1000
-    if plane.motors.is_armed:
-        throttle += round(1000 * plane.motors.throttle)
+def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
+    """Aileron, elevator, throttle, rudder; the sticks in MANUAL, with the throttle only while armed."""
+    wing, is_armed = plane.wing, plane.motors.is_armed
+    throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
     if plane.mode.number == PlaneMode.MANUAL:
         aileron, elevator, rudder = (_surface(_stick(plane.rc[index])) for index in (0, 1, 3))
-        throttle = max(1000, min(2000, plane.rc[2])) if plane.motors.is_armed else 1000
+        throttle = max(1000, min(2000, plane.rc[2])) if is_armed else 1000
     else:
         aileron = _surface(wing.roll_rate / _FULL_ROLL_RATE)
         elevator = _surface(-wing.pitch_rate / _FULL_PITCH_RATE)
         rudder = _surface(wing.roll_rate / _FULL_ROLL_RATE / 2.0)
-    return _message(plane, aileron, elevator, throttle, rudder)
+    return _servo_outputs(plane, aileron, elevator, throttle, rudder)
 
 
-def rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
-    """Steering is output 1, also disarmed, the motor output 3."""
+def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
+    """Steering (also while disarmed) on output 1, the motor on output 3."""
     if rover.mode.has_manual_throttle:
-        steering = _MIDDLE + _beyond_deadzone(rover.rc[0])
+        away = abs(rover.rc[0] - _MIDDLE) - _ROVER_DEADZONE
+        size = min(_STICK_RANGE, int(away * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
+        steering = 0 if away <= 0 else size if rover.rc[0] > _MIDDLE else -size
     else:
-        steering = _MIDDLE + round(_STICK_RANGE * rover.motion.yaw_rate / rover.motion.wheels.turn_rate_rad_s)
-    throttle = _MIDDLE + round(_STICK_RANGE * rover.motors.throttle)
-    return _message(rover, steering, 0, throttle)
+        steering = round(_STICK_RANGE * rover.motion.yaw_rate / rover.motion.wheels.turn_rate_rad_s)
+    throttle = round(_STICK_RANGE * rover.motors.throttle)
+    return _servo_outputs(rover, _MIDDLE + steering, 0, _MIDDLE + throttle)
 
 
-def sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
-    """Four thrusters aslant on the level, two upright, and the camera's two axes on 8 and 10."""
-    one = two = three = four = left = right = _MIDDLE
+def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
+    """Four vectored and two vertical thrusters; the axes of the camera on outputs 8 and 10."""
+    thrusters = [_MIDDLE] * 6
     if sub.motors.is_armed:
-        yaw, forward, lateral, roll = (_stick(sub.rc[index]) for index in (_YAW, _FORWARD, _LATERAL, _ROLL))
+        yaw, forward, lateral, roll = (
+            _stick(sub.rc[index]) for index in (_SUB_YAW, _SUB_FORWARD, _SUB_LATERAL, _SUB_ROLL)
+        )
         up = 1.0 - 2.0 * sub.motors.throttle
-        one, two = _surface(yaw - forward + lateral), _surface(-yaw - forward - lateral)
-        three, four = _surface(-yaw + forward + lateral), _surface(yaw + forward - lateral)
-        left, right = _surface(up + roll), _surface(up - roll)
-    return _message(sub, one, two, three, four, left, right, 0, _MIDDLE, 0, _MIDDLE)
+        shares = (
+            yaw - forward + lateral, -yaw - forward - lateral, -yaw + forward + lateral, yaw + forward - lateral,
+            up + roll, up - roll,
+        )  # fmt: skip
+        thrusters = [_surface(share) for share in shares]
+    return _servo_outputs(sub, *thrusters, 0, _MIDDLE, 0, _MIDDLE)
 
 
-def _message(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
+def _servo_outputs(vehicle: ArduPilotVehicle, *pulses: int) -> m.ServoOutputRaw:
     outputs = [*pulses, *(0,) * (_OUTPUTS - len(pulses))]
     for number, pulse in vehicle.accessories.servos.items():
         if 1 <= number <= _OUTPUTS:
@@ -88,106 +330,25 @@ def _surface(share: float) -> int:
     return _MIDDLE + round(_SURFACE_RANGE * max(-1.0, min(1.0, share)))
 
 
-def _beyond_deadzone(pwm: int) -> int:
-    """A rover's stick: nothing near the middle, all of the range outside."""
-    away = abs(pwm - _MIDDLE) - _ROVER_DEADZONE
-    if away <= 0:
-        return 0
-    size = min(_STICK_RANGE, int(away * _STICK_RANGE / (_STICK_RANGE - _ROVER_DEADZONE)))
-    return size if pwm > _MIDDLE else -size
-
-
-Builders = Mapping[int, Callable[[Any], "Message | None"]]
-
-_NOTHING_REACHED = 0xFFFF
-_NO_TEMPERATURE = 32767
-_AIR_DENSITY = 1.225
-
-
-def _hwstatus(_: ArduPilotVehicle) -> m.Hwstatus:
-    return m.Hwstatus(5000, 0)
-
-
-def _reached(_: ArduPilotVehicle) -> m.MissionItemReached:
-    return m.MissionItemReached(_NOTHING_REACHED)
-
-
-def _flight(vehicle: ArduPilotVehicle) -> m.FlightInformation:
-    return m.FlightInformation(vehicle.time_boot_ms, 0, 0, 0)
-
-
-_GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
-
-
-def _relays(vehicle: ArduPilotVehicle) -> m.RelayStatus:
-    accessories = vehicle.accessories
-    return m.RelayStatus(vehicle.time_boot_ms, accessories.relays, (1 << accessories.relay_count) - 1)
-
-
-def angles_of_flow(plane: PlaneHost) -> m.AoaSsa:
-    """Angle of attack and side slip in degrees; zeros on the ground."""
-    motion = plane.motion
-    slope = math.atan2(-motion.velocity_down, max(motion.airspeed_m_s, 1.0))
-    attack = 0.0 if plane.is_landed else math.degrees(motion.pitch - slope)
-    return m.AoaSsa(plane.time_boot_us, attack, 0.0)
-
-
-def terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """It has no terrain at all: the whole block around it is missing."""
-    place = vehicle.navigation.position
-    if place is None:
-        return None
-    south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
-    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
-
-
-def outside_pressure(sub: SubHost) -> m.ScaledPressure3:
-    """The third barometer, a thermometer only."""
-    return m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0)
-
-
-EXTRA_BUILDERS: Builders = {
-    m.Hwstatus.ID: _hwstatus,
-    m.MissionItemReached.ID: _reached,
-    m.RelayStatus.ID: _relays,
-    m.FlightInformation.ID: _flight,
-}
-"""Message id → what every kind sends when it is asked for it."""
-
-
-def airspeed(plane: PlaneHost) -> m.Airspeed:
-    speed = plane.motion.airspeed_m_s
-    return m.Airspeed(0, speed, _NO_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
-
-
-def display_value(sub: SubHost) -> m.NamedValueFloat:
-    """The next of `DISPLAY_VALUES`."""
-    name = next(sub.display_names)
-    return m.NamedValueFloat(sub.time_boot_ms, name, DISPLAY_VALUES[name])
-
-
-def scaled_channels(rover: ArduPilotVehicle) -> m.RcChannelsScaled:
-    return m.RcChannelsScaled(rover.time_boot_ms, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255)
-
-
-def rover_hud(rover: RoverHost) -> m.VfrHud:
-    """Without airspeed and climb; the throttle is positive also backwards."""
-    motion, place = rover.motion, rover.navigation.position
-    heading = int(math.degrees(motion.yaw) % 360.0)
-    throttle = round(abs(rover.motors.throttle) * 100)
-    altitude = 0.0 if place is None else place.altitude_m
-    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
-
-
-def no_landed_state(_: ArduPilotVehicle) -> m.ExtendedSysState:
-    """Neither on the ground nor in the air, as far as it tells."""
-    return m.ExtendedSysState(0, 0)
-
-
 _ALL: Builders = {
-    **STATE_BUILDERS,
-    **ATTITUDE_BUILDERS,
-    **POSITION_BUILDERS,
+    **MOTION_BUILDERS,
+    m.Heartbeat.ID: heartbeat,
+    m.SysStatus.ID: _sys_status,
+    m.ExtendedSysState.ID: _extended_sys_state,
+    m.BatteryStatus.ID: _battery_status,
+    m.PowerStatus.ID: lambda _: m.PowerStatus(5000, 0, 0),
+    m.Meminfo.ID: lambda _: m.Meminfo(0, 65535, 524288),
+    m.Hwstatus.ID: lambda _: m.Hwstatus(5000, 0),
+    m.SystemTime.ID: _system_time,
+    m.MissionCurrent.ID: lambda vehicle: vehicle.mission.message(),
+    m.MissionItemReached.ID: lambda _: m.MissionItemReached(_NOTHING_REACHED),
+    m.RcChannels.ID: _rc_channels,
+    m.RcChannelsRaw.ID: _rc_channels_raw,
+    m.Vibration.ID: _vibration,
+    m.EscTelemetry1To4.ID: _esc_telemetry,
+    m.AutopilotVersion.ID: _autopilot_version,
+    m.RelayStatus.ID: _relay_status,
+    m.FlightInformation.ID: lambda vehicle: m.FlightInformation(vehicle.time_boot_ms, 0, 0, 0),
     m.GimbalDeviceAttitudeStatus.ID: lambda vehicle: vehicle.gimbal.attitude_status(),
     m.GimbalManagerInformation.ID: lambda vehicle: vehicle.gimbal.manager_information(),
     m.GimbalManagerStatus.ID: lambda vehicle: vehicle.gimbal.manager_status(),
@@ -195,45 +356,39 @@ _ALL: Builders = {
     m.CameraSettings.ID: lambda vehicle: vehicle.camera.settings(),
     m.CameraCaptureStatus.ID: lambda vehicle: vehicle.camera.capture_status(),
     m.CameraFeedback.ID: lambda vehicle: vehicle.camera.last_feedback(),
-    **EXTRA_BUILDERS,
     m.FenceStatus.ID: lambda vehicle: vehicle.fence.status(),
     m.MagCalProgress.ID: lambda vehicle: vehicle.calibrations.compasses.progress(),
     m.MagCalReport.ID: lambda vehicle: vehicle.calibrations.compasses.report(),
 }
-_FLYING = (m.Wind.ID, m.TerrainReport.ID, m.EscTelemetry1To4.ID)
 _COPTER_TARGETS = (m.AttitudeTarget.ID, m.PositionTargetLocalNed.ID)
 
 
-def _without(*message_ids: int) -> dict[int, Any]:
+def _without(*message_ids: int) -> Builders:
     return {number: builder for number, builder in _ALL.items() if number not in message_ids}
 
 
 BUILDERS_OF_KIND: dict[Kind, Builders] = {
-    "copter": {
-        **_ALL,
-        m.ServoOutputRaw.ID: copter_outputs,
-        m.TerrainRequest.ID: terrain_request,
-    },
+    "copter": {**_without(), m.ServoOutputRaw.ID: _copter_outputs},
     "plane": {
         **_without(*_COPTER_TARGETS),
-        m.ServoOutputRaw.ID: plane_outputs,
-        m.TerrainRequest.ID: terrain_request,
-        m.Airspeed.ID: airspeed,
-        m.AoaSsa.ID: angles_of_flow,
+        m.ServoOutputRaw.ID: _plane_outputs,
+        m.Airspeed.ID: _airspeed,
+        m.AoaSsa.ID: _angle_of_attack,
     },
     "rover": {
-        **_without(*_FLYING, *_COPTER_TARGETS),
-        m.ServoOutputRaw.ID: rover_outputs,
-        m.RcChannelsScaled.ID: scaled_channels,
-        m.VfrHud.ID: rover_hud,
-        m.ExtendedSysState.ID: no_landed_state,
+        **_without(m.Wind.ID, m.TerrainReport.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
+        m.ServoOutputRaw.ID: _rover_outputs,
+        m.RcChannelsScaled.ID: lambda rover: m.RcChannelsScaled(rover.time_boot_ms, *(0,) * 9, 255),
+        m.VfrHud.ID: _rover_hud,
+        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
     "sub": {
-        **_without(m.Wind.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
-        m.ServoOutputRaw.ID: sub_outputs,
-        m.NamedValueFloat.ID: display_value,
-        m.ScaledPressure3.ID: outside_pressure,
-        m.ExtendedSysState.ID: no_landed_state,
+        **_without(m.Wind.ID, m.TerrainRequest.ID, m.EscTelemetry1To4.ID, *_COPTER_TARGETS),
+        m.ServoOutputRaw.ID: _sub_outputs,
+        m.NamedValueFloat.ID: _display_value,
+        # The third barometer is used as a thermometer only.
+        m.ScaledPressure3.ID: lambda sub: m.ScaledPressure3(sub.time_boot_ms, 0.0, 0.0, 3620, 0),
+        m.ExtendedSysState.ID: lambda _: m.ExtendedSysState(0, 0),
     },
 }
-"""Kind → builders; what is not there is not sent."""
+"""Builders of the messages of each firmware; others are not sent."""

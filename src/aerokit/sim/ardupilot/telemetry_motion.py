@@ -1,4 +1,4 @@
-"""Attitude, position, velocity and home, as simulated ArduPilot vehicles tell them."""
+"""Messages about attitude, position, velocity, targets and surroundings of a simulated ArduPilot."""
 
 from __future__ import annotations
 
@@ -9,38 +9,39 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import EkfStatusFlags, GpsFixType, PlaneMode
 from aerokit.mavlink.enums import PositionTargetTypemask as Mask
 from aerokit.mavlink.message import Message
-from aerokit.sim.ardupilot.copter.guided import Guided
+from aerokit.sim.ardupilot.copter_guided import CopterGuided
 from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
-from aerokit.sim.local_frame import Ned
-from aerokit.sim.motion import GRAVITY_M_S2, quaternion_from_euler
+from aerokit.sim.motion import GRAVITY_M_S2, Motion, Ned, quaternion_from_euler
+
+Three = tuple[int, int, int]
+
+
+def _angles(motion: Motion) -> tuple[float, float, float]:
+    return (motion.roll, motion.pitch, motion.yaw)
+
+
+def _angular_rates(motion: Motion) -> tuple[float, float, float]:
+    return (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
+
+
+def _velocity(motion: Motion) -> Ned:
+    return (motion.velocity_north, motion.velocity_east, motion.velocity_down)
 
 
 def _attitude(vehicle: ArduPilotVehicle) -> m.Attitude:
-    motion = vehicle.motion
-    return m.Attitude(
-        vehicle.time_boot_ms,
-        motion.roll,
-        motion.pitch,
-        motion.yaw,
-        motion.roll_rate,
-        motion.pitch_rate,
-        motion.yaw_rate,
-    )
+    return m.Attitude(vehicle.time_boot_ms, *_angles(vehicle.motion), *_angular_rates(vehicle.motion))
 
 
 def _attitude_quaternion(vehicle: ArduPilotVehicle) -> m.AttitudeQuaternion | None:
     if not vehicle.navigation.has_attitude:
         return None
-    motion = vehicle.motion
-    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
-    return m.AttitudeQuaternion(
-        vehicle.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate
-    )
+    q = quaternion_from_euler(*_angles(vehicle.motion))
+    return m.AttitudeQuaternion(vehicle.time_boot_ms, *q, *_angular_rates(vehicle.motion))
 
 
 def _attitude_target(vehicle: ArduPilotVehicle) -> m.AttitudeTarget:
     motion = vehicle.motion
-    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    q = quaternion_from_euler(*_angles(motion))
     return m.AttitudeTarget(vehicle.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, vehicle.motors.throttle)
 
 
@@ -50,129 +51,63 @@ def _ahrs(vehicle: ArduPilotVehicle) -> m.Ahrs:
 
 
 def _ahrs2(vehicle: ArduPilotVehicle) -> m.Ahrs2:
-    motion, place = vehicle.motion, vehicle.navigation.position
-    lat, lon, alt = (
-        (0, 0, 0.0) if place is None else (place.latitude_e7, place.longitude_e7, place.altitude_m)
-    )
-    return m.Ahrs2(motion.roll, motion.pitch, motion.yaw, alt, lat, lon)
+    place = vehicle.navigation.position
+    if place is None:
+        return m.Ahrs2(*_angles(vehicle.motion), 0.0, 0, 0)
+    return m.Ahrs2(*_angles(vehicle.motion), place.altitude_m, place.latitude_e7, place.longitude_e7)
 
 
 def _simstate(vehicle: ArduPilotVehicle) -> m.Simstate:
     motion = vehicle.motion
     place = vehicle.navigation.frame.to_global(*motion.place)
-    return m.Simstate(
-        motion.roll,
-        motion.pitch,
-        motion.yaw,
-        0.0,
-        0.0,
-        -GRAVITY_M_S2,
-        motion.roll_rate,
-        motion.pitch_rate,
-        motion.yaw_rate,
-        place.latitude_e7,
-        place.longitude_e7,
-    )
+    gravity, position = (0.0, 0.0, -GRAVITY_M_S2), (place.latitude_e7, place.longitude_e7)
+    return m.Simstate(*_angles(motion), *gravity, *_angular_rates(motion), *position)
 
 
 def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
     motion, place = vehicle.motion, vehicle.navigation.position
-    return m.VfrHud(
-        motion.airspeed_m_s if vehicle.navigation.has_position else 0.0,
-        motion.ground_speed_m_s,
-        int(math.degrees(motion.yaw) % 360.0),
-        round(vehicle.motors.throttle * 100),
-        0.0 if place is None else place.altitude_m,
-        -motion.velocity_down,
-    )
-
-
-Three = tuple[int, int, int]
+    airspeed = motion.airspeed_m_s if vehicle.navigation.has_position else 0.0
+    heading, throttle = int(math.degrees(motion.yaw) % 360.0), round(vehicle.motors.throttle * 100)
+    altitude = 0.0 if place is None else place.altitude_m
+    return m.VfrHud(airspeed, motion.ground_speed_m_s, heading, throttle, altitude, -motion.velocity_down)
 
 
 def _acceleration(vehicle: ArduPilotVehicle) -> Three:
-    """In mG."""
+    """Return the acceleration in milli-g."""
     motion = vehicle.motion
     lift = -GRAVITY_M_S2 + (0.0 if vehicle.is_landed else motion.acceleration_down)
     x, y = 1000 * math.sin(motion.pitch), -1000 * math.sin(motion.roll)
     return (_int16(x), _int16(y), _int16(lift / GRAVITY_M_S2 * 1000))
 
 
-def _rates(vehicle: ArduPilotVehicle) -> Three:
-    """In mrad/s."""
-    motion = vehicle.motion
-    return (
-        _int16(motion.roll_rate * 1000),
-        _int16(motion.pitch_rate * 1000),
-        _int16(motion.yaw_rate * 1000),
-    )
-
-
-def _field(vehicle: ArduPilotVehicle) -> Three:
-    """In mG (milligauss)."""
+def _magnetic_field(vehicle: ArduPilotVehicle) -> Three:
+    """Return the field in milligauss."""
     yaw = vehicle.motion.yaw
     return (_int16(230 * math.cos(yaw)), _int16(-230 * math.sin(yaw)), -530)
+
+
+def _imu(vehicle: ArduPilotVehicle) -> tuple[int, int, int, int, int, int, int, int, int]:
+    """Return acceleration (milli-g), turn rates (mrad/s) and magnetic field (milligauss)."""
+    roll, pitch, yaw = (_int16(rate * 1000) for rate in _angular_rates(vehicle.motion))
+    return (*_acceleration(vehicle), roll, pitch, yaw, *_magnetic_field(vehicle))
 
 
 def _int16(value: float) -> int:
     return max(-32768, min(32767, round(value)))
 
 
-def _raw_imu(vehicle: ArduPilotVehicle) -> m.RawImu:
-    return m.RawImu(
-        vehicle.time_boot_us, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 0, 3500
-    )
-
-
-def _scaled(numbers: Three, factor: float) -> tuple[float, float, float]:
-    x, y, z = numbers
-    return (x * factor, y * factor, z * factor)
-
-
-def _scaled_imu(vehicle: ArduPilotVehicle) -> m.ScaledImu:
-    return m.ScaledImu(
-        vehicle.time_boot_ms, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 3500
-    )
-
-
 def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
-    pressure, motion = _pressure_hpa(vehicle), vehicle.motion
-    return m.HighresImu(
-        vehicle.time_boot_us,
-        *_scaled(_acceleration(vehicle), GRAVITY_M_S2 / 1000.0),
-        motion.roll_rate,
-        motion.pitch_rate,
-        motion.yaw_rate,
-        *_scaled(_field(vehicle), 1000.0),
-        pressure,
-        0.0,
-        vehicle.navigation.frame.origin.altitude_m - motion.down,
-        28.0,
-        8191,
-    )
-
-
-def _scaled_imu2(vehicle: ArduPilotVehicle) -> m.ScaledImu2:
-    return m.ScaledImu2(
-        vehicle.time_boot_ms, *_acceleration(vehicle), *_rates(vehicle), *_field(vehicle), 3500
-    )
-
-
-def _scaled_imu3(vehicle: ArduPilotVehicle) -> m.ScaledImu3:
-    return m.ScaledImu3(vehicle.time_boot_ms, 0, 0, 0, 0, 0, 0, *_field(vehicle))
+    motion = vehicle.motion
+    x, y, z = (value * (GRAVITY_M_S2 / 1000.0) for value in _acceleration(vehicle))
+    north, east, down = (value * 1000.0 for value in _magnetic_field(vehicle))
+    altitude = vehicle.navigation.frame.origin.altitude_m - motion.down
+    sensors = (x, y, z, *_angular_rates(motion), north, east, down, _pressure_hpa(vehicle))
+    return m.HighresImu(vehicle.time_boot_us, *sensors, 0.0, altitude, 28.0, 8191)
 
 
 def _pressure_hpa(vehicle: ArduPilotVehicle) -> float:
     altitude = vehicle.navigation.frame.origin.altitude_m - vehicle.motion.down
     return float(1013.25 * (1 - 2.25577e-5 * altitude) ** 5.25588)
-
-
-def _scaled_pressure(vehicle: ArduPilotVehicle) -> m.ScaledPressure:
-    return m.ScaledPressure(vehicle.time_boot_ms, _pressure_hpa(vehicle), 0.0, 2800, 0)
-
-
-def _scaled_pressure2(vehicle: ArduPilotVehicle) -> m.ScaledPressure2:
-    return m.ScaledPressure2(vehicle.time_boot_ms, _pressure_hpa(vehicle), 0.0, 2800, 0)
 
 
 def _wind(vehicle: ArduPilotVehicle) -> m.Wind | None:
@@ -184,50 +119,28 @@ def _wind(vehicle: ArduPilotVehicle) -> m.Wind | None:
     return m.Wind(comes_from, speed, 0.0)
 
 
-ATTITUDE_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
-    m.Attitude.ID: _attitude,
-    m.AttitudeQuaternion.ID: _attitude_quaternion,
-    m.AttitudeTarget.ID: _attitude_target,
-    m.Ahrs.ID: _ahrs,
-    m.Ahrs2.ID: _ahrs2,
-    m.Simstate.ID: _simstate,
-    m.VfrHud.ID: _vfr_hud,
-    m.RawImu.ID: _raw_imu,
-    m.ScaledImu.ID: _scaled_imu,
-    m.ScaledImu2.ID: _scaled_imu2,
-    m.HighresImu.ID: _highres_imu,
-    m.ScaledImu3.ID: _scaled_imu3,
-    m.ScaledPressure.ID: _scaled_pressure,
-    m.ScaledPressure2.ID: _scaled_pressure2,
-    m.Wind.ID: _wind,
-}
-"""Message id → what to send now, or None."""
-
-
 _NAN4 = (math.nan,) * 4
 _POS_HORIZ_ABS = int(EkfStatusFlags.POS_HORIZ_ABS)
+_NO_YAW = Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE
+_VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
 _POSITION_ONLY = (
-    Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE
-) | (Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE)
+    Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE | _NO_YAW
+)  # fmt: skip
+# Size and lower left corner of the terrain block around the vehicle, in metres and degrees.
+_GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     motion, nav = vehicle.motion, vehicle.navigation
-    place = nav.position
+    place, time = nav.position, vehicle.time_boot_ms
     relative = round(nav.altitude_above_home * 1000)
     heading = round(math.degrees(motion.yaw) % 360.0 * 100) % 36000 if nav.has_attitude else 0
     if place is None:
-        return m.GlobalPositionInt(vehicle.time_boot_ms, 0, 0, 0, relative, 0, 0, 0, heading)
+        return m.GlobalPositionInt(time, 0, 0, 0, relative, 0, 0, 0, heading)
+    altitude = round(place.altitude_m * 1000)
+    north, east, down = (round(speed * 100) for speed in _velocity(motion))
     return m.GlobalPositionInt(
-        vehicle.time_boot_ms,
-        place.latitude_e7,
-        place.longitude_e7,
-        round(place.altitude_m * 1000),
-        relative,
-        round(motion.velocity_north * 100),
-        round(motion.velocity_east * 100),
-        round(motion.velocity_down * 100),
-        heading,
+        time, place.latitude_e7, place.longitude_e7, altitude, relative, north, east, down, heading
     )
 
 
@@ -235,16 +148,7 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.has_position:
         return None
-    north, east, down = nav.local(motion.place)
-    return m.LocalPositionNed(
-        vehicle.time_boot_ms,
-        north,
-        east,
-        down,
-        motion.velocity_north,
-        motion.velocity_east,
-        motion.velocity_down,
-    )
+    return m.LocalPositionNed(vehicle.time_boot_ms, *nav.local(motion.place), *_velocity(motion))
 
 
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
@@ -254,25 +158,11 @@ def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
         return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 0, 0, 3)
     place = nav.frame.to_global(*motion.place)
-    altitude = round(place.altitude_m * 1000)
-    course = (
-        round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
-    )
-    return m.GpsRawInt(
-        vehicle.time_boot_us,
-        nav.fix_type,
-        place.latitude_e7,
-        place.longitude_e7,
-        altitude,
-        121,
-        200,
-        round(motion.ground_speed_m_s * 100),
-        course,
-        10,
-        altitude,
-        300,
-        300,
-    )
+    altitude, speed = round(place.altitude_m * 1000), round(motion.ground_speed_m_s * 100)
+    track = math.degrees(math.atan2(motion.velocity_east, motion.velocity_north))
+    course = round(track % 360.0 * 100) % 36000
+    position = (place.latitude_e7, place.longitude_e7, altitude)
+    return m.GpsRawInt(vehicle.time_boot_us, nav.fix_type, *position, 121, 200, speed, course, 10, altitude, 300, 300)
 
 
 def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
@@ -283,35 +173,23 @@ def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
     return m.EkfStatusReport(flags, size, size, size / 2, size, 0.0, 0.0)
 
 
-def home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
-    """HOME_POSITION; None without a home. ArduPilot's quaternion is NaN."""
+def _home_position(vehicle: ArduPilotVehicle) -> m.HomePosition | None:
     home = vehicle.navigation.home
     if home is None:
         return None
-    place = vehicle.navigation.frame.to_global(*home)
-    local = vehicle.navigation.local(home)
-    return m.HomePosition(
-        place.latitude_e7,
-        place.longitude_e7,
-        round(place.altitude_m * 1000),
-        *local,
-        _NAN4,
-        0.0,
-        0.0,
-        0.0,
-        vehicle.time_boot_us,
-    )
+    place, local = vehicle.navigation.frame.to_global(*home), vehicle.navigation.local(home)
+    position = (place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000))
+    # ArduPilot sends NaN as the quaternion.
+    return m.HomePosition(*position, *local, _NAN4, 0.0, 0.0, 0.0, vehicle.time_boot_us)
 
 
-def global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
-    """GPS_GLOBAL_ORIGIN; None before the estimator has one."""
+def _global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
     origin = vehicle.navigation.origin
     if origin is None:
         return None
     place = vehicle.navigation.frame.to_global(*origin)
-    return m.GpsGlobalOrigin(
-        place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000), vehicle.time_boot_us
-    )
+    altitude = round(place.altitude_m * 1000)
+    return m.GpsGlobalOrigin(place.latitude_e7, place.longitude_e7, altitude, vehicle.time_boot_us)
 
 
 def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | None:
@@ -319,56 +197,41 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
     if target is None or not vehicle.motors.is_armed:
         return None
     place = vehicle.navigation.frame.to_global(*target)
-    return m.PositionTargetGlobalInt(
-        vehicle.time_boot_ms,
-        0,
-        _POSITION_ONLY | 0xF000,
-        place.latitude_e7,
-        place.longitude_e7,
-        place.altitude_m,
-        *(0.0,) * 8,
-    )
+    position = (place.latitude_e7, place.longitude_e7, place.altitude_m)
+    return m.PositionTargetGlobalInt(vehicle.time_boot_ms, 0, _POSITION_ONLY | 0xF000, *position, *(0.0,) * 8)
 
 
 def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
-    guided = vehicle.mode
-    if not isinstance(guided, Guided):
+    guided, time = vehicle.mode, vehicle.time_boot_ms
+    if not isinstance(guided, CopterGuided):
         return None
     target = guided.destination
     if target is None:
-        mask = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE
-        velocity, acceleration = guided.velocity, guided.acceleration
-        return m.PositionTargetLocalNed(
-            vehicle.time_boot_ms, 1, mask, 0.0, 0.0, 0.0, *velocity, *acceleration, 0.0, 0.0
-        )
+        vectors = (0.0, 0.0, 0.0, *guided.velocity, *guided.acceleration)
+        return m.PositionTargetLocalNed(time, 1, _VELOCITY_ONLY, *vectors, 0.0, 0.0)
     local = vehicle.navigation.local(target)
-    return m.PositionTargetLocalNed(vehicle.time_boot_ms, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
+    return m.PositionTargetLocalNed(time, 1, _POSITION_ONLY, *local, *(0.0,) * 8)
 
 
-def _is_led(vehicle: ArduPilotVehicle) -> bool:
-    """Whether there is somewhere to go; a plane has that in every mode but MANUAL, a rover in few."""
-    if vehicle.KIND == "plane":
-        return vehicle.mode.number != PlaneMode.MANUAL
+def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
+    """Return True in modes with NAV_CONTROLLER_OUTPUT: on Plane all but MANUAL, on Rover a few."""
     mode = vehicle.mode
+    if vehicle.KIND == "plane":
+        return mode.number != PlaneMode.MANUAL
     return vehicle.KIND != "rover" or (mode.needs_position and not mode.has_manual_throttle)
 
 
 def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
-    if not _is_led(vehicle):
+    if not _is_navigating(vehicle):
         return None
     motion, target = vehicle.motion, vehicle.mode.destination
-    roll, pitch, yaw = (math.degrees(angle) for angle in (motion.roll, motion.pitch, motion.yaw))
-    bearing, distance, altitude_error = _to_target(vehicle, target)
+    roll, pitch, yaw = map(math.degrees, _angles(motion))
+    bearing, distance, altitude_error = 0, 0, 0.0
+    if target is not None:
+        north, east = target[0] - motion.north, target[1] - motion.east
+        bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360
+        distance, altitude_error = min(65535, int(math.hypot(north, east))), motion.down - target[2]
     return m.NavControllerOutput(roll, pitch, round(yaw), bearing, distance, altitude_error, 0.0, 0.0)
-
-
-def _to_target(vehicle: ArduPilotVehicle, target: Ned | None) -> tuple[int, int, float]:
-    if target is None:
-        return 0, 0, 0.0
-    motion = vehicle.motion
-    north, east = target[0] - motion.north, target[1] - motion.east
-    bearing = round(math.degrees(math.atan2(east, north)) % 360.0) % 360
-    return bearing, min(65535, int(math.hypot(north, east))), motion.down - target[2]
 
 
 def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
@@ -379,47 +242,63 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
     return m.TerrainReport(place.latitude_e7, place.longitude_e7, 0, 0.0, place.altitude_m, missing, 0)
 
 
+def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
+    """Request the whole block around the vehicle, which has no terrain data."""
+    place = vehicle.navigation.position
+    if place is None:
+        return None
+    south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
+    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, (1 << 56) - 1)
+
+
 def _rangefinder(vehicle: ArduPilotVehicle) -> m.Rangefinder | None:
-    distance = _height_below(vehicle)
+    distance = _height_above_ground(vehicle)
     return None if distance is None else m.Rangefinder(distance, 0.0)
 
 
 def _distance_sensor(vehicle: ArduPilotVehicle) -> m.DistanceSensor | None:
-    distance = _height_below(vehicle)
+    distance = _height_above_ground(vehicle)
     if distance is None:
         return None
     reach = round(vehicle.rangefinder_reach_m * 100)
-    return m.DistanceSensor(
-        vehicle.time_boot_ms,
-        20,
-        reach,
-        min(reach + 10, round(distance * 100)),
-        0,
-        0,
-        25,
-        0,
-        signal_quality=100,
-    )
+    current = min(reach + 10, round(distance * 100))
+    return m.DistanceSensor(vehicle.time_boot_ms, 20, reach, current, 0, 0, 25, 0, signal_quality=100)
 
 
-def _height_below(vehicle: ArduPilotVehicle) -> float | None:
+def _height_above_ground(vehicle: ArduPilotVehicle) -> float | None:
     if vehicle.rangefinder_reach_m <= 0.0:
         return None
     return vehicle.motion.ground_down - vehicle.motion.down + 0.2
 
 
-POSITION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
+MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
+    m.Attitude.ID: _attitude,
+    m.AttitudeQuaternion.ID: _attitude_quaternion,
+    m.AttitudeTarget.ID: _attitude_target,
+    m.Ahrs.ID: _ahrs,
+    m.Ahrs2.ID: _ahrs2,
+    m.Simstate.ID: _simstate,
+    m.VfrHud.ID: _vfr_hud,
+    m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), 0, 3500),
+    m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), 3500),
+    m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), 3500),
+    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
+    m.HighresImu.ID: _highres_imu,
+    m.ScaledPressure.ID: lambda v: m.ScaledPressure(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),
+    m.ScaledPressure2.ID: lambda v: m.ScaledPressure2(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),
+    m.Wind.ID: _wind,
     m.GlobalPositionInt.ID: _global_position,
     m.LocalPositionNed.ID: _local_position,
     m.GpsRawInt.ID: _gps_raw,
     m.EkfStatusReport.ID: _ekf_status,
-    m.HomePosition.ID: home_position,
-    m.GpsGlobalOrigin.ID: global_origin,
+    m.HomePosition.ID: _home_position,
+    m.GpsGlobalOrigin.ID: _global_origin,
     m.PositionTargetGlobalInt.ID: _target_global,
     m.PositionTargetLocalNed.ID: _target_local,
     m.NavControllerOutput.ID: _nav_controller,
     m.TerrainReport.ID: _terrain_report,
+    m.TerrainRequest.ID: _terrain_request,
     m.Rangefinder.ID: _rangefinder,
     m.DistanceSensor.ID: _distance_sensor,
 }
-"""Message id → what to send now, or None."""
+"""Message id → function that builds the message, or None if there is nothing to send."""

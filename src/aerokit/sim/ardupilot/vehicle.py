@@ -1,7 +1,7 @@
-"""What ArduPilot's simulated vehicles have in common: boot, parameters, files, missions, requests, modes, texts."""
+"""`ArduPilotVehicle`: the base of all simulated ArduPilots. It composes their parts, boots, and changes modes."""
 
 # pyright: reportIncompatibleVariableOverride=false
-# The host declares what parts need of each other; here each is what it really is.
+# `ArduPilotHost` declares protocols; here each part has its concrete type.
 
 from __future__ import annotations
 
@@ -14,72 +14,70 @@ from aerokit.mavlink.enums import MavModeFlag, MavResult, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.encoding import UNKNOWN_INDEX
-from aerokit.sim.ardupilot.accessories import Accessories
 from aerokit.sim.ardupilot.calibration import Calibrations
-from aerokit.sim.ardupilot.camera import Camera
-from aerokit.sim.ardupilot.failsafes import Failsafes
-from aerokit.sim.ardupilot.fence import Fence
+from aerokit.sim.ardupilot.camera import ArduPilotCamera
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import ArduPilotFence
 from aerokit.sim.ardupilot.ftp import ArduPilotFtp
-from aerokit.sim.ardupilot.gimbal import Gimbal
-from aerokit.sim.ardupilot.host import ArmingPart, Host
+from aerokit.sim.ardupilot.gimbal import ArduPilotGimbal
+from aerokit.sim.ardupilot.host import ArduPilotHost, ArduPilotMode, ArduPilotMotors
 from aerokit.sim.ardupilot.kinds import BOOT_TIMELINES, BootTimeline, parameters_of
-from aerokit.sim.ardupilot.mission_run import MissionRun
-from aerokit.sim.ardupilot.mission_server import MissionServer
-from aerokit.sim.ardupilot.mode import AutoMode, VehicleMode
-from aerokit.sim.ardupilot.motors import Motors
-from aerokit.sim.ardupilot.navigation import Navigation
-from aerokit.sim.ardupilot.radio import Joystick, Radio
-from aerokit.sim.ardupilot.requests import Requests
-from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, Storage
-from aerokit.sim.battery import Battery
+from aerokit.sim.ardupilot.mission_run import MissionMode, MissionRun
+from aerokit.sim.ardupilot.mission_server import ArduPilotMissionServer
+from aerokit.sim.ardupilot.navigation import ArduPilotNavigation
+from aerokit.sim.ardupilot.radio import ArduPilotJoystick, ArduPilotRadio, AuxiliaryOutputs
+from aerokit.sim.ardupilot.requests import ArduPilotMessageRequests
+from aerokit.sim.ardupilot.storage import DEFAULT_LOGS, ArduPilotSigning, ArduPilotStorage
+from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler
-from aerokit.sim.file_tree import FileTree
-from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame, Ned
+from aerokit.sim.ftp import FileTree
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.motion import Motion, Wind
-from aerokit.sim.parameters import Parameters
-from aerokit.sim.vehicle import Component, sender_of
+from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame, Motion, Ned, SimulatedWind
+from aerokit.sim.parameters import SimParameters
+from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 _REBOOT_SILENCE_S = 1.5
-_TIMESYNC_S = 10.0
+_TIMESYNC_INTERVAL_S = 10.0
 _BEFORE_READY = frozenset({m.Heartbeat.ID, m.AutopilotVersion.ID})
-ModeT = TypeVar("ModeT", bound="VehicleMode")
+ModeT = TypeVar("ModeT", bound="ArduPilotMode")
 
 
-class ArduPilotVehicle(Host):
-    """A subclass says what sets its kind apart: the class attributes, the ``make_…`` methods, commands, motion.
+class ArduPilotVehicle(ArduPilotHost):
+    """Base of the simulated ArduPilots. A subclass sets the class attributes and overrides commands and motion.
 
-    - ``home``: where it is switched on: latitude, longitude (degrees), altitude AMSL (m);
-      ``heading_deg``: where its nose points then
-    - ``boot_time_s``: seconds until the estimator has a position; the real one needs 41.5, 0 is ready at once
-    - ``boot_text``: the plain text that a serial or TCP port gives before the first frame
-    - ``version``: goes into AUTOPILOT_VERSION and the banner; ``parameters``: values other than the defaults,
-      ``parameter_count``: fewer than all, for quick tests; ``parameter_errors``: it says PARAM_ERROR
-    - ``logs``: what earlier runs have left; ``link_bytes_per_s``: see `Storage`
-    - ``battery_percent``: charge at the start; ``battery_capacity_mah``: the size of the pack
-    - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means that there is no range finder
-    - ``unsupported_commands``: MAV_CMDs that this firmware does not know (SET_MESSAGE_INTERVAL if it is old);
-      ``stream_groups`` False: it does not know REQUEST_DATA_STREAM
-    - ``components``: other components on its links: `SimulatedCamera`, `SimulatedGimbal`, or only heartbeats
-    - ``unix_time_at_boot``: what its GPS clock says at simulated second 0
+    - ``home``: power-on location: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
+    - ``boot_time_s``: seconds until the estimator has a position; real hardware takes 41.5, 0 is ready at once
+    - ``boot_text``: the plain text that a serial or TCP port sends before the first frame
+    - ``version``: version in AUTOPILOT_VERSION and the banner; ``parameters``: values that differ from the defaults;
+      ``parameter_count``: fewer parameters than the firmware has, for quick tests; ``parameter_errors``: sends
+      PARAM_ERROR
+    - ``logs``: logs of earlier runs; ``link_bytes_per_s``: see `ArduPilotStorage`
+    - ``battery_percent``: initial charge; ``battery_capacity_mah``: size of the pack
+    - ``wind``: constant wind and gusts; ``rangefinder_reach_m``: 0 means no range finder
+    - ``unsupported_commands``: MAV_CMDs that this firmware does not implement (SET_MESSAGE_INTERVAL if it is old);
+      ``stream_groups`` False: without REQUEST_DATA_STREAM
+    - ``components``: other components on its links: `SimulatedCamera`, `SimulatedGimbal`, or plain heartbeats
+    - ``unix_time_at_boot``: GPS time at simulated second 0
     - ``signing_key``: see `ArduPilotSigning`
     """
 
     MAV_TYPE: ClassVar[int]
     BUILDERS: ClassVar[Mapping[int, Callable[[Any], Message | None]]]
-    """Message id → what to send now, or None."""
-    MODES: ClassVar[tuple[Callable[[Any], VehicleMode], ...]]
-    """Classes of the modes, in the order in which they are listed."""
-    FAILSAFES: ClassVar[type[Failsafes]]
-    """What it does by itself."""
-    FENCE: ClassVar[type[Fence]] = Fence
-    """Where it may be, and what it does elsewhere."""
+    """Message id → function that builds the message, or None if there is nothing to send."""
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]]
+    """Factories of the modes, in the order of AVAILABLE_MODES."""
+    ARMING: ClassVar[type[ArduPilotArming[Any]]]
+    FAILSAFES: ClassVar[type[ArduPilotFailsafes[Any]]]
+    FENCE: ClassVar[type[ArduPilotFence[Any]]] = ArduPilotFence
+    MOTORS: ClassVar[type[ArduPilotMotors]] = ArduPilotMotors
+    JOYSTICK: ClassVar[type[ArduPilotJoystick]] = ArduPilotJoystick
+    """Receiver of MANUAL_CONTROL."""
 
     HOME_NEEDS_ORIGIN: ClassVar[bool] = True
-    """Whether home cannot be set before the estimator has an origin."""
-    TELLS_HOME: ClassVar[bool] = False
-    """Whether a text says where home was set."""
+    """True if home cannot be set before the estimator has an origin."""
+    REPORTS_HOME: ClassVar[bool] = False
+    """True if a text reports the new home."""
 
     def __init__(
         self,
@@ -98,16 +96,16 @@ class ArduPilotVehicle(Host):
         link_bytes_per_s: float | None = None,
         battery_percent: float = 100.0,
         battery_capacity_mah: float = 3300.0,
-        wind: Wind | None = None,
+        wind: SimulatedWind | None = None,
         rangefinder_reach_m: float = 0.0,
         unsupported_commands: Collection[int] = (),
         stream_groups: bool = True,
-        components: Iterable[Component] = (),
+        components: Iterable[AttachableComponent] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
         signing_key: SigningKey | None = None,
     ) -> None:
-        self.parameters: Parameters = parameters_of(self.KIND, parameter_count)
-        """By name; change them as a test needs it. They survive a reboot."""
+        self.parameters: SimParameters = parameters_of(self.KIND, parameter_count)
+        """SimParameters by name. A test may change them; they survive a reboot."""
         self.parameters["MAV_SYSID"] = system_id
         self.parameters.change(parameters or {})
         super().__init__(
@@ -121,145 +119,128 @@ class ArduPilotVehicle(Host):
         )
         self.timeline: BootTimeline = BOOT_TIMELINES[self.KIND].scaled(boot_time_s)
         self.uid: bytes = bytes([0xA0, system_id]) + bytes(16)
-        self.battery: Battery = Battery(battery_capacity_mah, percent=battery_percent)
+        self.battery: SimulatedBattery = SimulatedBattery(battery_capacity_mah, percent=battery_percent)
         self.motion: Motion = self.make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self.rangefinder_reach_m = rangefinder_reach_m
-        self.rc: Radio = Radio(self)
-        """What it hears of sticks and switches; the throttle (index 2) rests at 1000."""
+        self.rc: ArduPilotRadio = ArduPilotRadio(self)  # RC channels; the throttle (index 2) rests at 1000.
         self.calibrations: Calibrations = Calibrations(self)
         self._boot_text = boot_text
         self._stream_groups = stream_groups
         self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-        self.missions: MissionServer = MissionServer(self)
+        self.missions: ArduPilotMissionServer = ArduPilotMissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
         self._reset()
         self._listen()
-        self.storage: Storage = Storage(
+        self.storage: ArduPilotStorage = ArduPilotStorage(
             self, logs, parameter_errors=parameter_errors, link_bytes_per_s=link_bytes_per_s
         )
-        """Files, logs, and the servers of them and of the parameters."""
+        """Files, logs, and their servers."""
         self.files: FileTree = self.storage.files
 
     def _reset(self) -> None:
-        """What a power cycle makes new."""
+        """Create everything that does not survive a power cycle."""
         self.is_initialised: bool = False
         self.has_left_boot: bool = False
         self.is_landed: bool = self.motion.is_on_ground
-        self.motors: Motors = self.make_motors()
-        self.navigation: Navigation = Navigation(self, self.frame)
-        self.arming: ArmingPart = self.make_arming()
-        self.accessories: Accessories = Accessories(self)
-        self.failsafes: Failsafes = self.FAILSAFES(self)
-        self.fence: Fence = self.FENCE(self)
-        self.gimbal: Gimbal = Gimbal(self)
-        self.camera: Camera = Camera(self)
+        self.motors: ArduPilotMotors = self.MOTORS(self)
+        self.navigation: ArduPilotNavigation = ArduPilotNavigation(self, self.frame)
+        self.arming: ArduPilotArming[Any] = self.ARMING(self)
+        self.accessories: AuxiliaryOutputs = AuxiliaryOutputs(self)
+        self.failsafes: ArduPilotFailsafes[Any] = self.FAILSAFES(self)
+        self.fence: ArduPilotFence[Any] = self.FENCE(self)
+        self.gimbal: ArduPilotGimbal = ArduPilotGimbal(self)
+        self.camera: ArduPilotCamera = ArduPilotCamera(self)
         self.calibrations.reset()
-        self.rc.reset()
-        self._modes: dict[int, VehicleMode] = {}
-        for make in self.MODES:
-            mode = make(self)
-            self._modes[mode.number] = mode
+        self.rc.release_overrides()
+        self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in (make(self) for make in self.MODES)}
         self.reset_controllers()
         self.mission: MissionRun = MissionRun(self, self.auto)
         self.missions.reset()
-        self.mode: VehicleMode = self._modes[self.first_mode]
+        self.mode: ArduPilotMode = self._modes[self.first_mode]
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> ArduPilotSigning:
         return ArduPilotSigning(self, key, timestamp)
 
     def _listen(self) -> None:
-        self.requests: Requests = Requests(self, stream_groups=self._stream_groups)
+        self.requests: ArduPilotMessageRequests = ArduPilotMessageRequests(self, stream_groups=self._stream_groups)
         self.serve_commands(self.make_commands())
-        self.hear_setpoints()
+        self.listen_for_setpoints()
         self.on(m.Heartbeat, self._on_heartbeat)
         self.on(m.SetMode, self._on_set_mode)
-        self.listen_to_clocks()
+        self.serve_timesync()
         self.rc.listen()
-        self.make_joystick()
+        self.JOYSTICK(self)
         self.missions.listen()
 
-    def make_motion(self, wind: Wind | None) -> Motion:
-        """What moves it."""
+    def make_motion(self, wind: SimulatedWind | None) -> Motion:
+        """Create the motion model."""
         return Motion(self.rng, wind=wind)
 
-    def make_motors(self) -> Motors:
-        """What drives it."""
-        return Motors()
-
-    def make_arming(self) -> ArmingPart:
-        """Its arming checks."""
-        raise NotImplementedError
-
     def make_commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
+        """Return the handler of each MAV_CMD."""
         raise NotImplementedError
 
-    def hear_setpoints(self) -> None:
-        """Hear the messages that steer it."""
-
-    def make_joystick(self) -> Joystick:
-        """What hears MANUAL_CONTROL."""
-        return Joystick(self)
+    def listen_for_setpoints(self) -> None:
+        """Register the handlers of set-point messages."""
 
     def look_at(self, place: Ned | None) -> None:
         """Point the gimbal, if there is one, at a place; None ends it."""
         self.gimbal.look_at(place)
 
+    def may_go_to(self, place: Ned) -> bool:
+        """Prepare DO_REPOSITION to a place; return False to refuse it."""
+        return True
+
     def reset_controllers(self) -> None:
-        """What a power cycle makes new of its own; the modes are there already."""
+        """Create the controllers of this kind of vehicle after a power cycle. The modes exist already."""
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
-        """Severity and text with which it refuses a mode that it does not have."""
+        """Return severity and text of the refusal of a mode that does not exist."""
         return MavSeverity.WARNING, f"No such mode {number}"
 
-    def refusal(self, mode: VehicleMode, reason: str) -> str:
-        """What it says when it does not go into a mode."""
+    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+        """Return the text of a refused mode change."""
         return f"Mode change to {mode.name} failed: {reason}"
 
     @property
-    def auto(self) -> AutoMode:
-        """Its mode for missions."""
-        raise NotImplementedError
+    def auto(self) -> MissionMode:
+        """The mode that flies missions."""
+        return next(mode for mode in self._modes.values() if isinstance(mode, MissionMode))
 
     @property
     def first_mode(self) -> int:
-        """The number of the mode in which it wakes up."""
+        """Mode number after power-on."""
         return int(self.parameters["INITIAL_MODE"])
 
     @property
     def base_mode(self) -> int:
-        """MAV_MODE_FLAGs of its heartbeat."""
+        """MAV_MODE_FLAGs of the heartbeat."""
         raise NotImplementedError
 
     def move(self, dt: float) -> None:
-        """Move on by one tick, when it is not at rest; notices that it is, too."""
+        """Advance the motion by one tick."""
         raise NotImplementedError
 
     @property
     def ftp(self) -> ArduPilotFtp:
-        """The server of the files."""
+        """The file server."""
         return self.storage.ftp
 
-    def is_for_me(self, message: Message) -> bool:
-        """Also what is for a component of this system that is not there (MAVLink_routing.cpp)."""
+    def is_addressed(self, message: Message) -> bool:
+        """Also accept messages to absent components of this system (MAVLink_routing.cpp)."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        return system in (0, self.system_id) and all(
-            component != each.component_id for each in self.components
-        )
+        return system in (0, self.system_id) and all(component != other.component_id for other in self.components)
 
     def boot(self) -> None:
-        """Say what a booting vehicle says, when it says it."""
-        line, later = self.timeline, self.call_later
+        """Schedule what happens while the vehicle boots."""
         self.storage.restart()
         self.requests.restart()
         if self._boot_text:
             for channel in self.channels:
-                channel.write(
-                    f"\r\n\r\nInit {self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})\r\n".encode()
-                )
+                channel.write(f"\r\n\r\nInit {self.FIRMWARE} V{self.version} ({self.GIT_HASH.decode()})\r\n".encode())
                 channel.write(b"\r\nFree RAM: 524288\r\nBooting 0/0\r\n")
-        later(line.ready, self._become_ready)
+        self.call_later(self.timeline.ready, self._become_ready)
         self.navigation.start()
 
     def _become_ready(self) -> None:
@@ -274,32 +255,32 @@ class ArduPilotVehicle(Host):
         self.has_left_boot = True
 
     def start_channel(self, channel: Channel) -> None:
-        """Heartbeats, time synchronisation, and what the port's parameters (MAV1_EXTRA1 …) say."""
+        """Start heartbeats, time synchronisation and the streams that the port's parameters (MAV1_EXTRA1 …) select."""
         first, ready = self.booted_at + self.timeline.heartbeat, self.booted_at + self.timeline.ready
+        timesync = self.booted_at + _TIMESYNC_INTERVAL_S
         channel.streams.set_interval(m.Heartbeat.ID, 1.0, max(self.now, first))
-        channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_S, max(self.now, self.booted_at + _TIMESYNC_S))
+        channel.streams.set_interval(m.Timesync.ID, _TIMESYNC_INTERVAL_S, max(self.now, timesync))
         self.requests.start_channel(channel, max(self.now, ready))
 
     def restart(self) -> None:
-        """Reboot now: silence, then the whole boot again; stream rates and estimates are forgotten."""
+        """Reboot now: silence, then the whole boot again. Stream rates and estimates are reset."""
         self.parameters["STAT_BOOTCNT"] += 1
         if not self.motion.is_on_ground:
             self.motion.down = self.motion.ground_down
         self.motion.settle()
         self._reset()
         for channel in self.channels:
-            channel.hangs_up = True
+            channel.closes_clients = True
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text: as in the firmware, what explains a refusal leaves after the acknowledgement."""
+        """Queue a text. As in the firmware, the reason of a refusal is sent after the acknowledgement."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:
             super().send_text(severity, text)
 
     def set_mode(self, number: int) -> bool:
-        """Change the mode if the vehicle may; says why not. A change is told by a heartbeat at once."""
         if number == self.mode.number:
             return True
         mode = self._modes.get(number)
@@ -309,13 +290,12 @@ class ArduPilotVehicle(Host):
         if (denied := self.fence.refusal(mode)) is not None:
             self.send_text(*denied)
             return False
-        armed = self.motors.is_armed
+        armed, has_position = (
+            self.motors.is_armed,
+            self.navigation.has_position and not self.failsafes.estimator,
+        )
         reason = None
-        if (
-            armed
-            and mode.needs_position
-            and not (self.navigation.has_position and not self.failsafes.estimator)
-        ):
+        if armed and mode.needs_position and not has_position:
             reason = "requires position"
         elif not mode.enter(force=not armed):
             reason = mode.refused_because
@@ -329,17 +309,17 @@ class ArduPilotVehicle(Host):
         return True
 
     def set_mode_from(self, base_mode: int, custom_mode: int) -> int:
-        """DO_SET_MODE and SET_MODE: only custom modes; the MAV_RESULT. SET_MODE does not tell it."""
+        """Execute DO_SET_MODE or SET_MODE and return the MAV_RESULT. Only custom modes are supported."""
         if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
             return MavResult.DENIED
         return self.change_to(custom_mode)
 
     def change_to(self, number: int) -> int:
-        """`set_mode` for a command: the MAV_RESULT."""
+        """Change the mode for a command and return the MAV_RESULT."""
         return MavResult.ACCEPTED if self.set_mode(number) else MavResult.FAILED
 
     def mode_of(self, kind: type[ModeT]) -> ModeT:
-        """Its mode of this class."""
+        """Return the mode of this class."""
         mode = self._modes[kind.number]
         assert isinstance(mode, kind)
         return mode
@@ -348,15 +328,13 @@ class ArduPilotVehicle(Host):
         self.storage.parameters.send(name, UNKNOWN_INDEX, None)
 
     def available_modes(self) -> list[m.AvailableModes]:
-        """AVAILABLE_MODES, as ArduPilot numbers and names them."""
-        modes = list(self._modes.values())
         return [
-            m.AvailableModes(len(modes), index, 0, mode.number, 0, mode.name)
-            for index, mode in enumerate(modes, start=1)
+            m.AvailableModes(len(self._modes), index, 0, mode.number, 0, mode.name)
+            for index, mode in enumerate(self._modes.values(), start=1)
         ]
 
     def build(self, message_id: int) -> Message | None:
-        """What is to be streamed now."""
+        """Build a message for streaming; None if it is not sent now."""
         builder = self.BUILDERS.get(message_id)
         if builder is not None:
             return builder(self) if self.is_initialised or message_id in _BEFORE_READY else None

@@ -1,4 +1,4 @@
-"""Devices with a component id of their own that are put beside any simulated vehicle: cameras and gimbals.
+"""Cameras and gimbals with a component id of their own, for any simulated vehicle.
 
 ```python
 copter = SimulatedCopter(components=[SimulatedCamera(), SimulatedGimbal()])

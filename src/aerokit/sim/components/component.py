@@ -1,4 +1,4 @@
-"""What each device beside an autopilot is made of: an address, a heartbeat, handlers, streams, faults."""
+"""Base of simulated devices with a component id of their own: heartbeat, commands, streams, settings, faults."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, NamedTuple
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavParamExtType, MavResult, MavState, ParamAck
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandInt, CommandLong, Heartbeat, MessageInterval, Statustext
+from aerokit.parameters import CameraDefinition, SettingValue
+from aerokit.parameters.parameter import setting_bytes, setting_value, settings_equal
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import Command, CommandHandler, CommandServer, whole
+from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand, whole
 from aerokit.sim.faults import Faults
-from aerokit.sim.file_tree import FileTree
-from aerokit.sim.ftp import FtpServer
-from aerokit.sim.local_frame import GlobalPoint, true_place
+from aerokit.sim.ftp import FileTree, FtpServer
+from aerokit.sim.motion import GlobalPoint, true_place
 from aerokit.sim.vehicle import SimulatedVehicle
 
 
 class Pose(NamedTuple):
-    """Angles in radians."""
+    """Position and attitude (radians)."""
 
     place: GlobalPoint
     height_m: float
@@ -30,7 +32,7 @@ class Pose(NamedTuple):
 
 
 def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
-    """None of a vehicle that is nowhere, such as a recording."""
+    """Return the true pose of a vehicle; None if it has none, such as a recording."""
     try:
         place = true_place(vehicle)
     except InvalidArgument:
@@ -41,33 +43,32 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
 
 
 def serve_files(component: SimulatedComponent, files: FileTree) -> FtpServer:
-    """Have a component serve these files by MAVFTP under its own address, as PX4 does; call it in ``listen()``.
+    """Serve files by MAVFTP under the component's address, as PX4 does; call it in ``listen()``.
 
-    The tree may change at any time: `FileTree.put` makes a file and its folders. Sessions end when the power goes,
-    files stay. ``faults.no_ftp`` of the component makes it deaf.
+    The tree may change at any time, see `FileTree.put`. Sessions end at power-off, files stay. ``faults.no_ftp`` of
+    the component turns it off.
     """
-    from aerokit.sim.px4.ftp import Px4Ftp  # what it takes to import is for those who serve files
+    from aerokit.sim.px4.ftp import Px4Ftp  # Imported here because most components serve no files.
 
     server = Px4Ftp(component, files)
-    component.vehicle.when_powered_on(server.restart)
+    component.vehicle.on_power_on(server.restart)
     return server
 
 
-_HEARTBEAT_S = 1.0
+_HEARTBEAT_INTERVAL_S = 1.0
 _MAVLINK_VERSION = 3
 
-Builder = Callable[["Command | None"], "Iterable[Message]"]
-"""Makes the messages of one id that are due now; of a REQUEST_MESSAGE when that command is given."""
+# Returns the messages of one id to send now; the command is given for REQUEST_MESSAGE.
+Builder = Callable[["ReceivedCommand | None"], "Iterable[Message]"]
 
 
 class SimulatedComponent:
-    """A device of its own on a vehicle's links; it is switched on, and reboots, with the vehicle.
+    """A device on a vehicle's links that is switched on and rebooted with the vehicle.
 
-    Messages reach it by its own address or as broadcasts; those of other components it does not see. A broadcast
-    command that it does not know is left to the others; one that is for it alone is UNSUPPORTED. `faults` mistreats
-    what it alone hears and says: what happens to the vehicle's link happens to it besides.
+    It receives messages addressed to it and broadcasts. An unknown broadcast command is ignored, an unknown command
+    to this component is UNSUPPORTED. `faults` apply to its own traffic, in addition to those of the vehicle.
 
-    A component belongs to one vehicle: InvalidArgument when it is given to a second one.
+    A component belongs to one vehicle; adding it to a second one raises InvalidArgument.
     """
 
     TYPE: ClassVar[int]
@@ -76,7 +77,7 @@ class SimulatedComponent:
     def __init__(self, component_id: int, *, system_id: int | None = None) -> None:
         self.component_id = component_id
         self.faults: Faults = Faults()
-        """What goes wrong with it: commands, ``silent``, ``heartbeats_stopped``, losses."""
+        """Faults of the component: commands, ``silent``, ``heartbeats_stopped``, losses."""
         self._system_id = system_id
         self._vehicle: SimulatedVehicle | None = None
         self._commands: dict[int, CommandHandler] = {}
@@ -84,29 +85,29 @@ class SimulatedComponent:
         self._streams: dict[tuple[Channel | None, int], _Stream] = {}
 
     def commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler, besides those for messages."""
+        """Return handlers by MAV_CMD, in addition to the message requests."""
         return {}
 
     def builders(self) -> dict[int, Builder]:
-        """Message id → what REQUEST_MESSAGE and streams send."""
+        """Return builders by message id, for REQUEST_MESSAGE and streams."""
         return {}
 
     def listen(self) -> None:
-        """Hear messages other than commands, with `on`."""
+        """Register handlers of other messages with `on`."""
 
     def start(self) -> None:
-        """The power comes on: begin anew, and say what is said without being asked."""
+        """Called at power-on: reset, and start the default streams."""
 
     @property
     def vehicle(self) -> SimulatedVehicle:
-        """Whose links it is on; InvalidArgument before there is one."""
+        """The vehicle it is on; InvalidArgument before it is added to one."""
         if self._vehicle is None:
-            raise InvalidArgument("the component is not on a vehicle yet: pass it as one of components=")
+            raise InvalidArgument("the component is on no vehicle yet; pass it in components= of a vehicle")
         return self._vehicle
 
     @property
     def system_id(self) -> int:
-        """That of the vehicle unless it was given one of its own."""
+        """The vehicle's system id, unless another one was given."""
         return self.vehicle.system_id if self._system_id is None else self._system_id
 
     @property
@@ -116,13 +117,13 @@ class SimulatedComponent:
 
     @property
     def time_boot_ms(self) -> int:
-        """For the messages."""
+        """Milliseconds since the vehicle booted."""
         return self.vehicle.time_boot_ms
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Called by the vehicle that it is given to."""
+        """Called by the vehicle it is added to."""
         if self._vehicle is not None:
-            raise InvalidArgument("the component is on another vehicle already")
+            raise InvalidArgument("the component is on another vehicle already; create one for each vehicle")
         self._vehicle = vehicle
         self._builders = self.builders()
         self._commands = {
@@ -133,44 +134,47 @@ class SimulatedComponent:
         }
         CommandServer(self, self._commands)
         self.listen()
-        vehicle.when_powered_on(self._power_on)
+        vehicle.on_power_on(self._power_on)
 
     def _power_on(self) -> None:
         self._streams.clear()
-        self.vehicle.every(_HEARTBEAT_S, self._beat)
+        self.vehicle.every(_HEARTBEAT_INTERVAL_S, self._send_heartbeat)
         self.start()
 
-    def _beat(self) -> None:
+    def _send_heartbeat(self) -> None:
         self.send(Heartbeat(self.TYPE, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, _MAVLINK_VERSION))
 
     def on(self, message_class: type[Message], handler: Callable[[Any, Channel], None]) -> None:
-        """Hear such messages from now on, when they are for this component."""
+        """Handle messages of a class that are addressed to this component."""
 
-        def hear(message: Message, channel: Channel) -> None:
-            if self._is_for_me(message) and not self._is_unheard():
+        def on_message(message: Message, channel: Channel) -> None:
+            faults = self.faults
+            if not self._is_addressed(message) or faults.silent or faults.frozen:
+                return
+            if not faults.drops_incoming(self.vehicle.rng):
                 handler(message, channel)
 
-        self.vehicle.overhear(message_class, hear)
+        self.vehicle.observe(message_class, on_message)
 
     def send(self, message: Message, channel: Channel | None = None) -> None:
-        """Send on one channel, or on all."""
-        if not self._is_unsaid(message):
+        """Send on one channel, or on all if it is None."""
+        if not (self.faults.frozen or self.faults.drops_outgoing(message, self.vehicle.rng)):
             self.vehicle.send(message, channel, (self.system_id, self.component_id))
 
     def send_text(self, severity: int, text: str) -> None:
-        """A STATUSTEXT of at most 50 characters."""
+        """Send a STATUSTEXT of at most 50 characters."""
         self.send(Statustext(severity, text[:50], 0, 0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
-        """Do something after ``delay`` seconds; a reboot forgets it."""
+        """Call a function after ``delay`` simulated seconds; a reboot cancels it."""
         self.vehicle.call_later(delay, action)
 
     def call_at(self, when: float, action: Callable[[], None]) -> None:
-        """Do something at this time; a reboot forgets it."""
+        """Call a function at a simulated time; a reboot cancels it."""
         self.vehicle.call_at(when, action)
 
     def stream(self, message_id: int, interval_s: float, channel: Channel | None = None) -> None:
-        """Send messages of an id again and again from now on, on one channel or on all; 0 ends it."""
+        """Stream messages of an id from now on, on one channel or on all; an interval of 0 stops the stream."""
         key = (channel, message_id)
         if interval_s <= 0.0:
             self._streams.pop(key, None)
@@ -181,14 +185,14 @@ class SimulatedComponent:
             self._send_stream(key, self._streams[key])
 
     def _send_stream(self, key: tuple[Channel | None, int], stream: _Stream) -> None:
-        if self._streams.get(key) is not stream:  # another one has taken its place, perhaps just as fast
+        if self._streams.get(key) is not stream:  # Replaced by another stream, perhaps with the same interval.
             return
         channel, message_id = key
         for message in self._builders[message_id](None):
             self.send(message, channel)
         self.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
-    def _is_for_me(self, message: Message) -> bool:
+    def _is_addressed(self, message: Message) -> bool:
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         if system not in (0, self.system_id) or component not in (0, self.component_id):
             return False
@@ -196,29 +200,8 @@ class SimulatedComponent:
             return message.command in self._commands
         return True
 
-    def _is_unheard(self) -> bool:
-        faults = self.faults
-        if faults.silent or faults.frozen:
-            return True
-        if faults.drop_incoming > 0:
-            faults.drop_incoming -= 1
-            return True
-        return faults.loss_incoming > 0.0 and self.vehicle.rng.random() < faults.loss_incoming
-
-    def _is_unsaid(self, message: Message) -> bool:
-        faults = self.faults
-        stopped = faults.heartbeats_stopped and message.ID == Heartbeat.ID
-        if faults.silent or faults.frozen or stopped:
-            return True
-        if faults.lost_messages and faults.loses(message):
-            return True
-        if faults.drop_outgoing > 0:
-            faults.drop_outgoing -= 1
-            return True
-        return faults.loss > 0.0 and self.vehicle.rng.random() < faults.loss
-
-    def answer_with(self, message_id: int, command: Command) -> int:
-        """Send what is asked for; a MAV_RESULT: DENIED of an unknown message, FAILED when there is nothing."""
+    def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
+        """Send the requested messages; return DENIED for an unknown id, FAILED if there is no message."""
         builder = self._builders.get(message_id)
         if builder is None:
             return MavResult.DENIED
@@ -227,11 +210,11 @@ class SimulatedComponent:
             self.send(message, command.channel)
         return MavResult.ACCEPTED if messages else MavResult.FAILED
 
-    def _request_message(self, command: Command) -> int:
+    def _request_message(self, command: ReceivedCommand) -> int:
         return self.answer_with(whole(command.param1), command)
 
-    def _set_interval(self, command: Command) -> int:
-        """0 and -1 stop it: nothing but what `start` began has a default rate."""
+    def _set_interval(self, command: ReceivedCommand) -> int:
+        """0 and -1 stop the stream: only streams of `start` have a default rate."""
         message_id = whole(command.param1)
         if message_id not in self._builders:
             return MavResult.DENIED
@@ -239,7 +222,7 @@ class SimulatedComponent:
         self.stream(message_id, whole(command.param2) / 1e6, command.channel)
         return MavResult.ACCEPTED
 
-    def _get_interval(self, command: Command) -> int:
+    def _get_interval(self, command: ReceivedCommand) -> int:
         message_id = whole(command.param1)
         if message_id not in self._builders:
             return MavResult.DENIED
@@ -250,7 +233,130 @@ class SimulatedComponent:
 
 
 class _Stream:
-    """One order to send messages again and again."""
-
     def __init__(self, interval_s: float) -> None:
         self.interval_s = interval_s
+
+
+_LIST_INTERVAL_S = 0.01
+_ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "string": "", "custom": ""}
+
+
+class ExtendedParameters:
+    """Settings served by PARAM_EXT, defined by a camera definition file; create it in ``listen()``.
+
+    A list is sent at a hundred parameters a second. Values that the definition does not allow are VALUE_UNSUPPORTED;
+    setting a read-only or excluded parameter FAILED. Write-only parameters are not listed. Values survive a reboot.
+    ``mute_parameters`` and ``parameter_limits`` of the component's faults apply.
+
+    https://mavlink.io/en/services/parameter_ext.html
+    """
+
+    def __init__(self, component: SimulatedComponent, definition: CameraDefinition) -> None:
+        self.definition = definition
+        self.values: dict[str, SettingValue] = {}
+        """Current values; may be changed at any time."""
+        self.slow: dict[str, float] = {}
+        """Name → seconds that setting it takes; it is IN_PROGRESS until then."""
+        self._component = component
+        self._pending: set[str] = set()
+        self._list_number = 0
+        self.reset()
+        component.on(m.ParamExtRequestList, self._on_list)
+        component.on(m.ParamExtRequestRead, self._on_read)
+        component.on(m.ParamExtSet, self._on_set)
+
+    def reset(self) -> None:
+        """Restore all defaults."""
+        for name, setting in self.definition.settings.items():
+            self.values[name] = _ZEROS.get(setting.type, 0) if setting.default is None else setting.default
+
+    def refresh(self) -> None:
+        """Called before a value is sent or set, to update values that change by themselves."""
+
+    def can_set(self, name: str) -> bool:
+        """Return True if a setting can be set now; else the answer is FAILED."""
+        return True
+
+    def on_set(self, name: str, value: SettingValue) -> None:
+        """Called when the value of a setting has changed."""
+
+    def restart(self) -> None:
+        """Drop pending changes, as a reboot does."""
+        self._pending.clear()
+        self._list_number += 1
+
+    @property
+    def _names(self) -> list[str]:
+        return [name for name, setting in self.definition.settings.items() if not setting.write_only]
+
+    def _on_list(self, _: m.ParamExtRequestList, channel: Channel) -> None:
+        self._list_number += 1
+        self._send_from(0, self._list_number, channel)
+
+    def _send_from(self, index: int, number: int, channel: Channel) -> None:
+        if number == self._list_number and index < len(self._names):
+            self._send_value(self._names[index], channel)
+            self._component.call_later(_LIST_INTERVAL_S, lambda: self._send_from(index + 1, number, channel))
+
+    def _on_read(self, request: m.ParamExtRequestRead, channel: Channel) -> None:
+        names = self._names
+        if 0 <= request.param_index < len(names):
+            self._send_value(names[request.param_index], channel)
+        elif request.param_index < 0 and request.param_id in names:
+            self._send_value(request.param_id, channel)
+
+    def _send_value(self, name: str, channel: Channel | None) -> None:
+        if name in self._component.faults.mute_parameters:
+            return
+        self.refresh()
+        kind, names = self.definition.settings[name].wire_type, self._names
+        data = setting_bytes(self.values[name], kind)
+        self._component.send(m.ParamExtValue(name, data, kind, len(names), names.index(name)), channel)
+
+    def _on_set(self, request: m.ParamExtSet, _: Channel) -> None:
+        name, kind = request.param_id, request.param_type
+        own = self.definition.settings.get(name)
+        if own is None:
+            self._acknowledge(name, request.param_value, kind, ParamAck.VALUE_UNSUPPORTED)
+            return
+        result, value = self._verdict(name, setting_value(request.param_value, kind), kind)
+        if result == ParamAck.ACCEPTED and name in self.slow and name not in self._pending:
+            self._pending.add(name)
+            self._component.call_later(self.slow[name], lambda: self._finish(name, value))
+        if name in self._pending:
+            self._acknowledge_setting(name, ParamAck.IN_PROGRESS)
+        elif result == ParamAck.ACCEPTED:
+            self._finish(name, value)
+        else:
+            self._acknowledge_setting(name, result)
+
+    def _verdict(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
+        self.refresh()
+        own, definition = self.definition.settings[name], self.definition
+        if own.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):
+            return ParamAck.FAILED, value
+        if kind != own.wire_type:
+            return ParamAck.VALUE_UNSUPPORTED, value
+        low, high = self._component.faults.parameter_limits.get(name, (None, None))
+        if low is not None and high is not None and isinstance(value, (int, float)):
+            value = type(value)(max(low, min(high, value)))
+        try:
+            return ParamAck.ACCEPTED, definition.checked(name, value, self.values)
+        except InvalidArgument:
+            return ParamAck.VALUE_UNSUPPORTED, value
+
+    def _finish(self, name: str, value: SettingValue) -> None:
+        self._pending.discard(name)
+        is_new = not settings_equal(self.values[name], value)
+        self.values[name] = value
+        if is_new:
+            self.on_set(name, value)
+        self._acknowledge_setting(name, ParamAck.ACCEPTED)
+
+    def _acknowledge_setting(self, name: str, result: int) -> None:
+        kind = self.definition.settings[name].wire_type
+        self._acknowledge(name, setting_bytes(self.values[name], kind), kind, result)
+
+    def _acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
+        known = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
+        self._component.send(m.ParamExtAck(name, data, known, result))

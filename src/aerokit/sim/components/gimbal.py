@@ -1,4 +1,4 @@
-"""`SimulatedGimbal`: a gimbal that speaks the MAVLink gimbal protocol v2 with a component id of its own.
+"""`SimulatedGimbal`: a gimbal component that implements the MAVLink gimbal protocol v2.
 
 https://mavlink.io/en/services/gimbal_v2.html
 """
@@ -20,10 +20,9 @@ from aerokit.mavlink.enums import (
 )
 from aerokit.mavlink.enums import GimbalManagerFlags as Flags
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import Command, CommandHandler, whole
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
 from aerokit.sim.components.component import Builder, SimulatedComponent, pose_of
-from aerokit.sim.local_frame import GlobalPoint
-from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.motion import GlobalPoint, euler_from_quaternion, quaternion_from_euler
 from aerokit.sim.vehicle import sender_of
 
 _Can = GimbalDeviceCapFlags
@@ -37,26 +36,13 @@ _CAPABILITIES = (
 _FIRMWARE = 1 << 24
 
 
-def gimbal_builders(gimbal: SimulatedGimbal) -> dict[int, Builder]:
-    """Message id → what to send."""
-    return {
-        m.GimbalDeviceInformation.ID: lambda _: [_device_information(gimbal)],
-        m.GimbalDeviceAttitudeStatus.ID: lambda _: [_attitude_status(gimbal)],
-        m.GimbalManagerInformation.ID: lambda _: [_manager_information(gimbal)],
-        m.GimbalManagerStatus.ID: lambda _: [gimbal_manager_status(gimbal)],
-    }
-
-
 def gimbal_manager_status(gimbal: SimulatedGimbal) -> m.GimbalManagerStatus:
-    """GIMBAL_MANAGER_STATUS: who is in control."""
     device = gimbal.component_id
-    return m.GimbalManagerStatus(
-        gimbal.time_boot_ms, _flags(gimbal), device, *gimbal.primary, *gimbal.secondary
-    )
+    return m.GimbalManagerStatus(gimbal.time_boot_ms, _flags(gimbal), device, *gimbal.primary, *gimbal.secondary)
 
 
 def _flags(gimbal: SimulatedGimbal) -> int:
-    """Roll and pitch are always from the horizon."""
+    """Roll and pitch are always relative to the horizon."""
     flags = gimbal.flags & (Flags.RETRACT | Flags.NEUTRAL) | Flags.ROLL_LOCK | Flags.PITCH_LOCK
     if gimbal.is_yaw_locked:
         return flags | Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME
@@ -109,38 +95,16 @@ def _manager_information(gimbal: SimulatedGimbal) -> m.GimbalManagerInformation:
     return m.GimbalManagerInformation(gimbal.time_boot_ms, capabilities, gimbal.component_id, *limits)
 
 
-_UNCHANGED, _ME, _RELEASE = -1, -2, -3
-_DOWN_WHEN_RETRACTED = (0.0, 0.0, 0.0)
+_UNCHANGED, _SENDER, _RELEASE = -1, -2, -3
+_RETRACTED_ANGLES = (0.0, 0.0, 0.0)
 _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 Owner = tuple[int, int]
 Angles = tuple[float, float, float]
 
 
-def gimbal_commands(gimbal: SimulatedGimbal) -> dict[int, CommandHandler]:
-    """MAV_CMD → handler."""
-    orders = _Orders(gimbal)
-    return {
-        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: orders.configure,
-        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: orders.pitch_and_yaw,
-        MavCmd.DO_SET_ROI_LOCATION: orders.look_at,
-        MavCmd.DO_SET_ROI_SYSID: orders.follow,
-        MavCmd.DO_SET_ROI_NONE: orders.look_ahead,
-    }
-
-
-def hear_gimbal_orders(gimbal: SimulatedGimbal) -> None:
-    """Messages in the place of commands; nobody answers them."""
-    orders = _Orders(gimbal)
-    gimbal.on(m.GimbalManagerSetAttitude, orders.on_attitude)
-    gimbal.on(m.GimbalManagerSetPitchyaw, orders.on_pitch_and_yaw)
-    gimbal.on(m.GimbalManagerSetManualControl, orders.on_manual_control)
-    gimbal.on(m.GimbalDeviceSetAttitude, orders.on_device_attitude)
-    gimbal.on(m.GlobalPositionInt, orders.on_place)
-
-
-class _Orders:
-    """Of one gimbal."""
+class _GimbalControl:
+    """Handles commands and messages of one gimbal."""
 
     def __init__(self, gimbal: SimulatedGimbal) -> None:
         self._gimbal = gimbal
@@ -148,8 +112,8 @@ class _Orders:
     def _is_mine(self, device_id: float) -> bool:
         return whole(device_id) in (0, self._gimbal.component_id)
 
-    def configure(self, command: Command) -> int:
-        """Params 1 and 2 are who is in control, 3 and 4 who besides: ids, -1 unchanged, -2 who asks, -3 let go."""
+    def configure(self, command: ReceivedCommand) -> int:
+        """Params 1 and 2: primary control, 3 and 4: secondary; an id, -1 unchanged, -2 the sender, -3 release."""
         gimbal, sender = self._gimbal, command.sender
         numbers = [command.param1, command.param2, command.param3, command.param4]
         if not self._is_mine(command.z) or not all(_RELEASE <= number <= 255 for number in numbers):
@@ -159,20 +123,20 @@ class _Orders:
         gimbal.set_control(primary, secondary)
         return MavResult.ACCEPTED
 
-    def pitch_and_yaw(self, command: Command) -> int:
-        """Degrees, and degrees per second; those that are not meant are NaN."""
-        if not self._is_mine(command.z) or not self._gimbal.obeys(command.sender):
+    def pitch_and_yaw(self, command: ReceivedCommand) -> int:
+        """Degrees and degrees per second; NaN leaves an axis unset."""
+        if not self._is_mine(command.z) or not self._gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
         )
-        done = self.obey(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
+        done = self.apply(whole(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
         return MavResult.ACCEPTED if done else MavResult.DENIED
 
-    def look_at(self, command: Command) -> int:
-        """Of a COMMAND_LONG the altitude is above the sea."""
+    def look_at(self, command: ReceivedCommand) -> int:
+        """The altitude of a COMMAND_LONG is above mean sea level."""
         gimbal = self._gimbal
-        if not self._is_mine(command.param1) or not gimbal.obeys(command.sender):
+        if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
@@ -182,31 +146,31 @@ class _Orders:
         gimbal.look_at(GlobalPoint(*command.place(), altitude))
         return MavResult.ACCEPTED
 
-    def follow(self, command: Command) -> int:
-        """Param 1 is whom."""
+    def follow(self, command: ReceivedCommand) -> int:
+        """Param 1 is the system id to follow."""
         gimbal = self._gimbal
-        if not self._is_mine(command.param2) or not gimbal.obeys(command.sender):
+        if not self._is_mine(command.param2) or not gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         gimbal.follow(whole(command.param1))
         return MavResult.ACCEPTED
 
-    def on_place(self, told: m.GlobalPositionInt, _: Channel) -> None:
-        """Of the vehicle that it looks at."""
-        self._gimbal.note_place(sender_of(told)[0], GlobalPoint(told.lat, told.lon, told.alt * 1e-3))
+    def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
+        """Position of a vehicle that may be followed."""
+        self._gimbal.update_followed(sender_of(message)[0], GlobalPoint(message.lat, message.lon, message.alt * 1e-3))
 
-    def look_ahead(self, command: Command) -> int:
+    def look_ahead(self, command: ReceivedCommand) -> int:
         gimbal = self._gimbal
-        if not self._is_mine(command.param1) or not gimbal.obeys(command.sender):
+        if not self._is_mine(command.param1) or not gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         gimbal.look_at(None)
         return MavResult.ACCEPTED
 
-    def obey(self, flags: int, angles: Angles, rates: Angles) -> bool:
-        """Angles count more than rates; False when neither are given."""
+    def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
+        """Apply angles, or else rates; return False if neither is given."""
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):
-            gimbal.point(_DOWN_WHEN_RETRACTED, flags, locked=False)
+            gimbal.point(_RETRACTED_ANGLES, flags, locked=False)
         elif not any(map(math.isnan, angles)):
             gimbal.point(angles, flags, locked=locked)
         elif not any(map(math.isnan, rates)):
@@ -215,36 +179,36 @@ class _Orders:
             return False
         return True
 
-    def on_attitude(self, order: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        if self._is_mine(order.gimbal_device_id) and self._gimbal.obeys(sender_of(order)):
-            self._attitude(order)
+    def on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        if self._is_mine(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+            self._apply_attitude(message)
 
-    def on_device_attitude(self, order: m.GimbalDeviceSetAttitude, _: Channel) -> None:
-        """Of another manager, such as an autopilot: only while nobody else is in control."""
-        if self._gimbal.primary in ((0, 0), sender_of(order)):
-            self._attitude(order)
+    def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
+        """Control by another manager, such as an autopilot: applied only while no one else is in control."""
+        if self._gimbal.primary in ((0, 0), sender_of(message)):
+            self._apply_attitude(message)
 
-    def _attitude(self, order: m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude) -> None:
-        has_angles = not any(map(math.isnan, order.q))
-        angles = euler_from_quaternion(*order.q) if has_angles else (math.nan,) * 3
-        rates = (order.angular_velocity_x, order.angular_velocity_y, order.angular_velocity_z)
-        self.obey(order.flags, (angles[0], angles[1], angles[2]), rates)
+    def _apply_attitude(self, message: m.GimbalManagerSetAttitude | m.GimbalDeviceSetAttitude) -> None:
+        has_angles = not any(map(math.isnan, message.q))
+        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
+        self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
 
-    def on_pitch_and_yaw(self, order: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        if self._is_mine(order.gimbal_device_id) and self._gimbal.obeys(sender_of(order)):
-            self.obey(order.flags, (0.0, order.pitch, order.yaw), (0.0, order.pitch_rate, order.yaw_rate))
+    def on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        if self._is_mine(message.gimbal_device_id) and self._gimbal.is_in_control(sender_of(message)):
+            self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
-    def on_manual_control(self, order: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        """Rates are shares, -1 to 1, of how fast it turns."""
+    def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
+        """Rates are shares of the slew rate, -1 to 1."""
         gimbal = self._gimbal
-        if self._is_mine(order.gimbal_device_id) and gimbal.obeys(sender_of(order)):
-            rates = (0.0, order.pitch_rate * gimbal.slew_rad_s, order.yaw_rate * gimbal.slew_rad_s)
-            self.obey(order.flags, (0.0, order.pitch, order.yaw), rates)
+        if self._is_mine(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
+            rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
+            self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
 
 
 def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
-    """Whoever is in control after one pair of params."""
-    if _ME in wanted:
+    """Return the owner that one pair of params specifies."""
+    if _SENDER in wanted:
         return sender
     if _RELEASE in wanted:
         return (0, 0) if before == sender else before
@@ -253,22 +217,22 @@ def _owner(before: Owner, wanted: tuple[int, int], sender: Owner) -> Owner:
     return wanted
 
 
-_STATUS_S = 1.0
+_STATUS_INTERVAL_S = 1.0
 _STILL: Angles = (0.0, 0.0, 0.0)
 
 
 class SimulatedGimbal(SimulatedComponent):
-    """A gimbal device that is its own manager; it turns with limited speed and points at places by itself.
+    """A gimbal device with a manager of its own; it turns at a limited rate and can point at positions.
 
-    Orders are taken from who is in control, and nobody is at first: MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE claims it.
-    Other people's orders are DENIED, their messages ignored.
+    It accepts commands from the component in control, at first none: claim it with
+    MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Commands of others are DENIED, their messages ignored.
 
-    - ``component_id``: 154, 171 to 175 are MAVLink's gimbals; ``system_id``: None is the vehicle's own
-    - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: lowest and highest angle; roll and pitch are from the horizon
-    - ``slew_deg_s``: how fast it turns
-    - ``attitude_rate_hz``: of GIMBAL_DEVICE_ATTITUDE_STATUS, without being asked
+    - ``component_id``: MAVLink's gimbals are 154 and 171 to 175; ``system_id``: None uses the vehicle's
+    - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle; roll and pitch relative to the horizon
+    - ``slew_deg_s``: turn rate
+    - ``attitude_rate_hz``: rate of GIMBAL_DEVICE_ATTITUDE_STATUS
 
-    Not simulated: the vehicle's lean, which a real one evens out, motors that fail, a second manager.
+    Not simulated: the attitude of the vehicle, which a real gimbal compensates, motor failures, a second manager.
     """
 
     TYPE: ClassVar[int] = MavType.GIMBAL
@@ -288,21 +252,21 @@ class SimulatedGimbal(SimulatedComponent):
         self.limits: tuple[tuple[float, float], ...] = tuple(
             (math.radians(low), math.radians(high)) for low, high in (roll_deg, pitch_deg, yaw_deg)
         )
-        """Lowest and highest roll, pitch, yaw in radians."""
+        """Minimum and maximum of roll, pitch and yaw in radians."""
         self.slew_rad_s: float = math.radians(slew_deg_s)
         self._attitude_rate_hz = attitude_rate_hz
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self.primary: tuple[int, int] = (0, 0)
         self.secondary: tuple[int, int] = (0, 0)
-        """System and component ids of who is in control; zeros are nobody."""
+        """System and component ids in control; zeros if none."""
         self.flags: int = 0
-        """GIMBAL_MANAGER_FLAGS of the latest order."""
+        """GIMBAL_MANAGER_FLAGS of the latest command."""
         self.region: GlobalPoint | None = None
-        """The place that it looks at."""
+        """Position it points at."""
         self.followed: int = 0
-        """The system id of the vehicle that it looks at, wherever that is; 0: none."""
+        """System id of the vehicle it follows; 0 if none."""
         self._from: Angles = _STILL
         self._since = 0.0
         self._target: Angles = _STILL
@@ -310,29 +274,46 @@ class SimulatedGimbal(SimulatedComponent):
         self._is_locked = False
 
     def start(self) -> None:
-        """The power comes on: nobody is in control, and it looks ahead."""
-        self._forget()
+        """Called at power-on: no one is in control, and it looks ahead."""
+        self._reset()
         self._since = self.now
-        self.stream(m.GimbalManagerStatus.ID, _STATUS_S)
+        self.stream(m.GimbalManagerStatus.ID, _STATUS_INTERVAL_S)
         if self._attitude_rate_hz > 0:
             self.stream(m.GimbalDeviceAttitudeStatus.ID, 1.0 / self._attitude_rate_hz)
 
     def commands(self) -> dict[int, CommandHandler]:
-        return gimbal_commands(self)
+        control = _GimbalControl(self)
+        return {
+            MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: control.configure,
+            MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: control.pitch_and_yaw,
+            MavCmd.DO_SET_ROI_LOCATION: control.look_at,
+            MavCmd.DO_SET_ROI_SYSID: control.follow,
+            MavCmd.DO_SET_ROI_NONE: control.look_ahead,
+        }
 
     def builders(self) -> dict[int, Builder]:
-        return gimbal_builders(self)
+        return {
+            m.GimbalDeviceInformation.ID: lambda _: [_device_information(self)],
+            m.GimbalDeviceAttitudeStatus.ID: lambda _: [_attitude_status(self)],
+            m.GimbalManagerInformation.ID: lambda _: [_manager_information(self)],
+            m.GimbalManagerStatus.ID: lambda _: [gimbal_manager_status(self)],
+        }
 
     def listen(self) -> None:
-        hear_gimbal_orders(self)
+        control = _GimbalControl(self)
+        self.on(m.GimbalManagerSetAttitude, control.on_attitude)
+        self.on(m.GimbalManagerSetPitchyaw, control.on_pitch_and_yaw)
+        self.on(m.GimbalManagerSetManualControl, control.on_manual_control)
+        self.on(m.GimbalDeviceSetAttitude, control.on_device_attitude)
+        self.on(m.GlobalPositionInt, control.on_global_position)
 
     @property
     def is_yaw_locked(self) -> bool:
-        """Whether its yaw keeps its direction while the vehicle turns."""
+        """True if its yaw stays fixed relative to north."""
         return self._is_locked or self.region is not None
 
     def angles(self) -> Angles:
-        """Roll, pitch and yaw in radians; roll and pitch from the horizon, yaw from the vehicle's nose."""
+        """Return roll and pitch (from the horizon) and yaw (from the vehicle's nose) in radians."""
         moved = [
             _towards(start, target, self.slew_rad_s * (self.now - self._since))
             for start, target in zip(self._from, self._wanted(), strict=True)
@@ -340,32 +321,32 @@ class SimulatedGimbal(SimulatedComponent):
         return (moved[0], moved[1], moved[2])
 
     def angles_from_north(self) -> Angles:
-        """The same with the yaw from north."""
+        """Return roll, pitch and yaw from north in radians."""
         roll, pitch, yaw = self.angles()
         return (roll, pitch, math.remainder(yaw + self.heading(), math.tau))
 
     def heading(self) -> float:
-        """The vehicle's, in radians; 0 when nobody knows."""
+        """Return the heading of the vehicle in radians; 0 if unknown."""
         pose = pose_of(self.vehicle)
         return 0.0 if pose is None else pose.yaw
 
     def _wanted(self) -> Angles:
-        target = self._target if self.region is None else self._look(self.region)
+        target = self._target if self.region is None else self._angles_to(self.region)
         seconds = self.now - self._since
         roll, pitch, yaw = (angle + rate * seconds for angle, rate in zip(target, self._rates, strict=True))
         if self.is_yaw_locked:
             yaw = math.remainder(yaw - self.heading(), math.tau)
         return (self._limited(0, roll), self._limited(1, pitch), self._limited(2, yaw))
 
-    def _look(self, region: GlobalPoint) -> Angles:
-        """Yaw from north; of a vehicle that is nowhere it stays as it is."""
+    def _angles_to(self, region: GlobalPoint) -> Angles:
+        """Return the angles to a position, yaw from north; the target if the vehicle has no position."""
         pose = pose_of(self.vehicle)
         if pose is None:
             return self._target
         frame = self.vehicle.frame  # type: ignore[attr-defined]
         north, east = frame.to_local(region.latitude_e7, region.longitude_e7)
-        here = frame.to_local(pose.place.latitude_e7, pose.place.longitude_e7)
-        north, east = north - here[0], east - here[1]
+        current = frame.to_local(pose.place.latitude_e7, pose.place.longitude_e7)
+        north, east = north - current[0], east - current[1]
         pitch = math.atan2(region.altitude_m - pose.place.altitude_m, math.hypot(north, east))
         return (0.0, pitch, math.atan2(east, north))
 
@@ -374,31 +355,31 @@ class SimulatedGimbal(SimulatedComponent):
         return max(low, min(high, angle))
 
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
-        """Turn to angles in radians; ``locked``: yaw is from north and stays so, else from the nose."""
+        """Turn to angles in radians; ``locked``: yaw is relative to north, else to the nose."""
         self._begin(flags)
         self._target, self._is_locked = angles, locked
 
     def turn(self, rates: Angles, flags: int, *, locked: bool) -> None:
-        """Keep turning, in radians per second, no faster than it can."""
-        here = self.angles_from_north() if locked else self.angles()
+        """Turn at these rates in radians per second, limited to its slew rate."""
+        current = self.angles_from_north() if locked else self.angles()
         self._begin(flags)
-        fastest = self.slew_rad_s
-        roll, pitch, yaw = (max(-fastest, min(fastest, rate)) for rate in rates)
-        self._target, self._rates, self._is_locked = here, (roll, pitch, yaw), locked
+        limit = self.slew_rad_s
+        roll, pitch, yaw = (max(-limit, min(limit, rate)) for rate in rates)
+        self._target, self._rates, self._is_locked = current, (roll, pitch, yaw), locked
 
     def look_at(self, place: GlobalPoint | None) -> None:
-        """Keep pointing at a place; None: ahead again."""
+        """Point at a position; None returns to ahead."""
         self._begin(0)
         self.region = place
 
     def follow(self, system_id: int) -> None:
-        """Keep pointing at another vehicle, from when it tells where it is; until then it stays as it is."""
-        here = self.angles_from_north()
-        self.point(here, Flags.YAW_LOCK, locked=True)
+        """Point at another vehicle once its position is received; keeps the direction until then."""
+        current = self.angles_from_north()
+        self.point(current, Flags.YAW_LOCK, locked=True)
         self.followed = system_id
 
-    def note_place(self, system_id: int, place: GlobalPoint) -> None:
-        """Another vehicle tells where it is."""
+    def update_followed(self, system_id: int, place: GlobalPoint) -> None:
+        """Update the position of the followed vehicle."""
         if system_id == self.followed:
             self._from, self._since = self.angles(), self.now
             self.region = place
@@ -413,16 +394,16 @@ class SimulatedGimbal(SimulatedComponent):
         self._is_locked = False
 
     def set_control(self, primary: tuple[int, int], secondary: tuple[int, int]) -> None:
-        """Give it to somebody; a change is told at once."""
+        """Set primary and secondary control; a change is announced at once."""
         if (primary, secondary) != (self.primary, self.secondary):
             self.primary = primary
             self.secondary = secondary
             self.send(gimbal_manager_status(self))
 
-    def obeys(self, sender: tuple[int, int]) -> bool:
-        """Whether somebody is in control."""
+    def is_in_control(self, sender: tuple[int, int]) -> bool:
+        """Return True if this sender is in control."""
         return sender in (self.primary, self.secondary) and sender != (0, 0)
 
 
-def _towards(start: float, target: float, most: float) -> float:
-    return start + max(-most, min(most, target - start))
+def _towards(start: float, target: float, max_change: float) -> float:
+    return start + max(-max_change, min(max_change, target - start))

@@ -1,4 +1,4 @@
-"""When a simulated PX4 lets itself be armed and disarmed, what it says about it, and calibrations that forbid it."""
+"""Arming, disarming and calibration of a simulated PX4."""
 
 from __future__ import annotations
 
@@ -9,40 +9,30 @@ from functools import partial
 
 from aerokit.mavlink.enums import MavCmd, MavComponent, MavResult, MavSeverity
 from aerokit.mavlink.messages import CommandLong
-from aerokit.sim.commands import Command
+from aerokit.sim.commands import ReceivedCommand
+from aerokit.sim.px4 import modes
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.modes import (
-    ALTITUDE,
-    KNOWN,
-    LAND,
-    POSITION,
-    POSITION_SLOW,
-    PRECISION_LAND,
-    RTL,
-    STICK_MODES,
-    TAKEOFF,
-)
 
-_BY_ITSELF: dict[str, tuple[Sequence[int], float]] = {
+# Sensor → percentages that are reported, and seconds between them.
+_AUTOMATIC_CALIBRATIONS: dict[str, tuple[Sequence[int], float]] = {
     "gyro": (range(0, 101, 10), 0.3),
     "baro": ((), 0.5),
     "level": ((0, 20, 40, 60, 80, 100, 100), 0.5),
 }
-"""Sensor → percentages that are told, and seconds between them."""
 
-_SIDES = (
+_SIDE_TEXTS = (
     "pending: back front left right up down",
     "hold vehicle still on a pending side",
     "detected rest position, hold still...",
     "down orientation detected",
     "down orientation detected",
 )
-_ON_A_SIDE = {"mag": "Rotate vehicle", "accel": "Hold still, measuring down side"}
-_SIDE_STEP_S = 0.8
+_SIDE_INSTRUCTIONS = {"mag": "Rotate vehicle", "accel": "Hold still, measuring down side"}
+_SIDE_INTERVAL_S = 0.8
 
 
-class Calibration:
-    """One at a time, on the ground."""
+class Px4Calibration:
+    """Sensor calibration on the ground, one at a time."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -51,23 +41,23 @@ class Calibration:
 
     @property
     def is_running(self) -> bool:
-        """Whether a sensor is being calibrated; HEARTBEAT says so, and nobody can arm."""
+        """True during a calibration; HEARTBEAT reports it and arming is denied."""
         return bool(self._sensor)
 
-    def command(self, command: Command) -> int:
-        """What a client asks for; the MAV_RESULT."""
+    def command(self, command: ReceivedCommand) -> int:
+        """Handle PREFLIGHT_CALIBRATION; return the MAV_RESULT."""
         sensor = _sensor_of(command)
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
             self._cancel()
             return MavResult.ACCEPTED if sensor == "" else MavResult.TEMPORARILY_REJECTED
-        if sensor in _BY_ITSELF:
+        if sensor in _AUTOMATIC_CALIBRATIONS:
             self._start(sensor)
-            self._measure(*_BY_ITSELF[sensor])
-        elif sensor in _ON_A_SIDE:
+            self._measure(*_AUTOMATIC_CALIBRATIONS[sensor])
+        elif sensor in _SIDE_INSTRUCTIONS:
             self._start(sensor)
-            self._say_later([*_SIDES, _ON_A_SIDE[sensor]], _SIDE_STEP_S)
+            self._send_later([*_SIDE_TEXTS, _SIDE_INSTRUCTIONS[sensor]], _SIDE_INTERVAL_S)
         elif sensor == "airspeed":
             self._start(sensor)
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] Ensure sensor is not measuring wind")
@@ -79,15 +69,15 @@ class Calibration:
         self._px4.info(f"[cal] calibration started: 2 {sensor}")
 
     def _measure(self, percents: Sequence[int], step_s: float) -> None:
-        self._say_later([f"progress <{percent}>" for percent in percents], step_s)
+        self._send_later([f"progress <{percent}>" for percent in percents], step_s)
         number = self._number
         self._px4.call_later((len(percents) + 1) * step_s, lambda: self._end(number))
 
-    def _say_later(self, texts: Sequence[str], step_s: float) -> None:
+    def _send_later(self, texts: Sequence[str], step_s: float) -> None:
         for place, text in enumerate(texts):
-            self._px4.call_later(place * step_s, partial(self._say, text, self._number))
+            self._px4.call_later(place * step_s, partial(self._send, text, self._number))
 
-    def _say(self, text: str, number: int) -> None:
+    def _send(self, text: str, number: int) -> None:
         if self.is_running and number == self._number:
             self._px4.info(f"[cal] {text}")
 
@@ -101,8 +91,8 @@ class Calibration:
         self._sensor = ""
 
 
-def _sensor_of(command: Command) -> str:
-    wanted = {
+def _sensor_of(command: ReceivedCommand) -> str:
+    requests = {
         "gyro": command.param1 == 1,
         "mag": command.param2 == 1,
         "baro": command.param3 == 1,
@@ -110,32 +100,31 @@ def _sensor_of(command: Command) -> str:
         "level": command.x == 2,
         "airspeed": command.y == 1,
     }
-    return next((sensor for sensor, asked in wanted.items() if asked), "")
+    return next((sensor for sensor, is_requested in requests.items() if is_requested), "")
 
 
 _LOW_THROTTLE, _CENTRE_THROTTLE = -0.8, 0.2
-_CLIMB_MODES = frozenset({ALTITUDE, POSITION, POSITION_SLOW})
-_LEFT_AFTER_DISARMING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
+_CLIMB_MODES = frozenset({modes.ALTITUDE, modes.POSITION, modes.POSITION_SLOW})
+_MODES_ENDED_BY_DISARMING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_LAND, modes.RTL})
 
 
-class Arming:
-    """Checks, texts, and the log that begins with every arming."""
+class Px4Arming:
+    """Arming checks, their texts, and the log that each arming starts."""
 
-    def __init__(self, px4: Px4Host, calibration: Calibration) -> None:
+    def __init__(self, px4: Px4Host, calibration: Px4Calibration) -> None:
         self._px4, self._calibration = px4, calibration
-        self.since: float = -math.inf
-        """When it was armed the last time."""
+        self.since: float = -math.inf  # Time of the last arming.
         self.is_terminated: bool = False
-        """Whether DO_FLIGHTTERMINATION has stopped the motors; only a restart ends that."""
+        """True after DO_FLIGHTTERMINATION stopped the motors, until a restart."""
         self._is_logging = False
 
     def reasons(self) -> list[str]:
-        """Why it cannot be armed, as the texts that tell it."""
+        """Return the texts of the failed checks."""
         px4 = self._px4
         reasons = list(px4.faults.prearm_failures)
         if not px4.is_ready:
             reasons.append("heading estimate invalid")
-        elif not px4.has_position and KNOWN[px4.mode].needs_position:
+        elif not px4.has_position and modes.MODES[px4.mode].needs_position:
             reasons.append("No valid position estimate")
         if self.is_terminated:
             reasons.append("Flight termination active")
@@ -147,14 +136,14 @@ class Arming:
 
     @property
     def is_possible(self) -> bool:
-        """What HEARTBEAT (STANDBY) and SYS_STATUS (the pre-arm bit) tell: all checks passed, the mode's too."""
+        """True if all checks pass, as HEARTBEAT (STANDBY) and SYS_STATUS (pre-arm bit) report."""
         return self._px4.is_ready and self._mode_allows and not self.reasons()
 
     @property
     def _mode_allows(self) -> bool:
-        """RETURN, LAND, ORBIT cannot be armed in, nor a mode that lacks sticks, set-points or a mission."""
+        """False in RETURN, LAND and ORBIT, and in modes that lack sticks, set-points or a mission."""
         mode = self._px4.mode
-        return KNOWN[mode].can_arm and self._px4.can_run(mode)
+        return modes.MODES[mode].can_arm and self._px4.can_run(mode)
 
     def arm(self, by: str = "external command") -> bool:
         """Arm if the checks allow it."""
@@ -162,7 +151,7 @@ class Arming:
         if px4.is_armed:
             return True
         if not px4.is_ready and not px4.faults.prearm_failures:
-            return False  # without a text, as seen
+            return False  # PX4 sends no text here.
         if self._calibration.is_running:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: calibrating")
             return False
@@ -175,20 +164,20 @@ class Arming:
             return False
         self.since = px4.now
         px4.info(f"Armed by {by}")
-        px4.armed()
+        px4.on_armed()
         self._start_log()
         return True
 
     @property
     def _throttle_is_safe(self) -> bool:
         px4 = self._px4
-        if px4.mode not in STICK_MODES:
+        if px4.mode not in modes.STICK_MODES:
             return True
         throttle = px4.sticks.throttle
         return throttle <= _CENTRE_THROTTLE if px4.mode in _CLIMB_MODES else throttle < _LOW_THROTTLE
 
     def disarm(self, by: str, *, force: bool = False) -> bool:
-        """Stop the motors; in the air only by force."""
+        """Stop the motors; in flight only with ``force``."""
         px4 = self._px4
         if not px4.is_armed:
             return True
@@ -197,13 +186,13 @@ class Arming:
             return False
         px4.info(f"Disarmed by {by}")
         self._is_logging = False
-        px4.disarmed()
-        if px4.mode in _LEFT_AFTER_DISARMING:
+        px4.on_disarmed()
+        if px4.mode in _MODES_ENDED_BY_DISARMING:
             px4.switch_to(px4.mode_after_landing)
         return True
 
     def terminate(self) -> None:
-        """Stop the motors for good, wherever it is, and call for the parachute."""
+        """Stop the motors until a restart, and trigger the parachute."""
         px4 = self._px4
         self.is_terminated = True
         px4.is_in_failsafe = True
@@ -212,7 +201,7 @@ class Arming:
         px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, 2.0, *(0.0,) * 6))
 
     def start_first_log(self) -> None:
-        """A log begins at boot already; the first flight is written into it."""
+        """Start the log of the boot; the first flight is written into it."""
         self._start_log()
 
     def _start_log(self) -> None:

@@ -1,7 +1,7 @@
-"""How the parts of a simulated PX4 are put together: boot, state, modes, flying."""
+"""`Px4Vehicle`: boot, state, modes and flight of a simulated PX4."""
 
 # pyright: reportIncompatibleVariableOverride=false
-# The host declares what parts need of each other; here each is what it really is.
+# The host declares interfaces; the classes here have the concrete types.
 
 from __future__ import annotations
 
@@ -13,59 +13,53 @@ from typing import ClassVar
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.mavlink.signing import SigningKey
-from aerokit.sim.battery import Battery
+from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
-from aerokit.sim.file_tree import FileTree
-from aerokit.sim.local_frame import HOME, GlobalPoint, LocalFrame
+from aerokit.sim.ftp import FileTree
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Wind
-from aerokit.sim.parameters import Parameters
-from aerokit.sim.px4.arming import Arming, Calibration
-from aerokit.sim.px4.camera_trigger import CameraTrigger
-from aerokit.sim.px4.failsafes import Failsafes
-from aerokit.sim.px4.flight import Flight
-from aerokit.sim.px4.ftp import Px4Ftp
-from aerokit.sim.px4.gimbal import Gimbal
-from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.link_rates import LinkRates
-from aerokit.sim.px4.manual import Sticks
-from aerokit.sim.px4.mission import Mission
-from aerokit.sim.px4.mission_server import MissionServer
-from aerokit.sim.px4.modes import (
-    HOLD,
-    KNOWN,
-    LAND,
-    MISSION,
-    OFFBOARD,
-    POSITION,
-    PRECISION_LAND,
-    RTL,
-    TAKEOFF,
-    TERMINATION,
-    Px4Mode,
+from aerokit.sim.motion import (
+    GRAVITY_M_S2,
+    HOME,
+    GlobalPoint,
+    LocalFrame,
+    Motion,
+    MotionLimits,
+    SimulatedWind,
 )
-from aerokit.sim.px4.offboard import Offboard
-from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Storage, px4_parameters
-from aerokit.sim.px4.texts import Events, TextLinks, on_the_wire
-from aerokit.sim.vehicle import Component, sender_of
+from aerokit.sim.parameters import SimParameters
+from aerokit.sim.px4 import modes
+from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
+from aerokit.sim.px4.failsafes import Px4Failsafes
+from aerokit.sim.px4.flight import Px4Flight
+from aerokit.sim.px4.ftp import Px4Ftp
+from aerokit.sim.px4.host import Px4Host
+from aerokit.sim.px4.links import Px4Events, Px4StreamRates, Px4TextLinks, on_the_wire
+from aerokit.sim.px4.manual import Px4Sticks
+from aerokit.sim.px4.mission import Px4Mission
+from aerokit.sim.px4.mission_server import Px4MissionServer
+from aerokit.sim.px4.modes import Px4Mode
+from aerokit.sim.px4.offboard import Px4Offboard
+from aerokit.sim.px4.payload import Px4CameraTrigger, Px4Gimbal
+from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_parameters
+from aerokit.sim.vehicle import AttachableComponent, sender_of
 
-_FIRST_HEARTBEAT_SHARE = 0.15
+_HEARTBEAT_BOOT_SHARE = 0.15
 _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5
 _AMPERES_AT_FULL = 40.0
-_NOT_AFTER_LANDING = frozenset({TAKEOFF, LAND, PRECISION_LAND, RTL})
+_MODES_ENDED_BY_LANDING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_LAND, modes.RTL})
 
 
 class Px4Vehicle(Px4Host):
-    """All of a PX4 but its commands and what it tells; see `SimulatedPx4` for the arguments."""
+    """A PX4 without its commands and telemetry; see `SimulatedPx4` for the arguments."""
 
     CAPABILITIES: ClassVar[int] = 0xE8FF
     VEHICLE_TYPE: ClassVar[int] = MavType.QUADROTOR
     PARAMETER_TABLE: ClassVar[str] = "quadrotor"
 
-    events: Events
+    events: Px4Events
 
     def __init__(
         self,
@@ -82,15 +76,15 @@ class Px4Vehicle(Px4Host):
         logs: Sequence[SimulatedLog] = DEFAULT_LOGS,
         link_bytes_per_s: float | None = None,
         battery_percent: float = 100.0,
-        wind: Wind | None = None,
+        wind: SimulatedWind | None = None,
         fast_rate_hz: float = 50.0,
         link_modes: Sequence[str] = ("normal",),
         unsupported_commands: Collection[int] = (),
-        components: Iterable[Component] = (),
+        components: Iterable[AttachableComponent] = (),
         unix_time_at_boot: float = 1_790_000_000.0,
         signing_key: SigningKey | None = None,
     ) -> None:
-        self.parameters: Parameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
+        self.parameters: SimParameters = px4_parameters(parameter_count, self.PARAMETER_TABLE)
         self.parameters["MAV_SYS_ID"] = system_id
         self.parameters.change(parameters or {})
         super().__init__(
@@ -103,99 +97,96 @@ class Px4Vehicle(Px4Host):
             signing_key=signing_key,
         )
         self.frame: LocalFrame = LocalFrame(GlobalPoint(round(home[0] * 1e7), round(home[1] * 1e7), home[2]))
-        self.battery: Battery = Battery(5000.0, cells=4, percent=battery_percent)
+        self.battery: SimulatedBattery = SimulatedBattery(5000.0, cells=4, percent=battery_percent)
         self.motion: Motion = self._make_motion(wind)
         self.motion.yaw = math.remainder(math.radians(heading_deg), 2 * math.pi)
         self._boot_time_s = boot_time_s
-        self.rates: LinkRates = LinkRates(link_modes, self.can_build, fast_rate_hz)
-        self.events = Events(self)
+        self.rates: Px4StreamRates = Px4StreamRates(link_modes, self.can_build, fast_rate_hz)
+        self.events = Px4Events(self)
         self._next_text_id = 0
         self._pings = 0
         self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        self.missions: MissionServer = MissionServer(self)
+        self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points; they survive a reboot."""
-        self.camera_trigger: CameraTrigger = CameraTrigger(self)
-        """There while the parameter TRIG_MODE is not 0."""
+        self.camera_trigger: Px4CameraTrigger = Px4CameraTrigger(self)
+        """Enabled while the parameter TRIG_MODE is not 0."""
         self._reset()
         self._listen()
-        self.storage: Storage = Storage(
+        self.storage: Px4Storage = Px4Storage(
             self, logs, parameter_file=parameter_file, link_bytes_per_s=link_bytes_per_s
         )
-        """Files, logs, and the servers of them and of the parameters."""
+        """Files, logs and parameters with their servers."""
         self.files: FileTree = self.storage.files
 
     def make_commands(self) -> dict[int, CommandHandler]:
-        """MAV_CMD → handler."""
+        """Return handlers by MAV_CMD."""
         raise NotImplementedError
 
     def can_build(self, message_id: int) -> bool:
-        """Whether it has such a message."""
+        """Return True if there is a builder of this message."""
         raise NotImplementedError
 
-    def _make_motion(self, wind: Wind | None) -> Motion:
-        limits = MotionLimits(
-            acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45)
-        )
+    def _make_motion(self, wind: SimulatedWind | None) -> Motion:
+        limits = MotionLimits(acceleration_m_s2=3.0, vertical_acceleration_m_s2=3.0, lean_rad=math.radians(45))
         return Motion(self.rng, limits, wind)
 
-    def _make_flight(self) -> Flight:
-        return Flight(self)
+    def _make_flight(self) -> Px4Flight:
+        return Px4Flight(self)
 
-    def _make_mission(self) -> Mission:
-        return Mission(self)
+    def _make_mission(self) -> Px4Mission:
+        return Px4Mission(self)
 
     def _reset(self) -> None:
         self.is_ready: bool = False
         self.is_armed: bool = False
         self.is_landed: bool = True
-        self.mode: Px4Mode = HOLD
-        self.intended_mode: Px4Mode = HOLD
+        self.mode: Px4Mode = modes.HOLD
+        self.intended_mode: Px4Mode = modes.HOLD
         self.is_in_failsafe: bool = False
-        self.calibration: Calibration = Calibration(self)
-        self.arming: Arming = Arming(self, self.calibration)
+        self.calibration: Px4Calibration = Px4Calibration(self)
+        self.arming: Px4Arming = Px4Arming(self, self.calibration)
         self.throttle: float = 0.0
         self.home_is_set_by_hand = False
-        self.mode_after_landing: Px4Mode = HOLD
+        self.mode_after_landing: Px4Mode = modes.HOLD
         self._touched_at = math.nan
         self._landed_at = math.nan
         self._has_flown = False
-        self.flight: Flight = self._make_flight()
-        self.mission: Mission = self._make_mission()
-        self.failsafes: Failsafes = Failsafes(self)
-        self.text_links: TextLinks = TextLinks(self)
+        self.flight: Px4Flight = self._make_flight()
+        self.mission: Px4Mission = self._make_mission()
+        self.failsafes: Px4Failsafes = Px4Failsafes(self)
+        self.text_links: Px4TextLinks = Px4TextLinks(self)
         self.missions.reset()
 
     def make_signing(self, key: SigningKey | None, timestamp: int) -> Px4Signing:
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        self.offboard: Offboard = Offboard(self)
-        self.sticks: Sticks = Sticks(self)
-        self.gimbal: Gimbal = Gimbal(self)
-        """On its AUX outputs, if MNT_MODE_IN fits one."""
+        self.offboard: Px4Offboard = Px4Offboard(self)
+        self.sticks: Px4Sticks = Px4Sticks(self)
+        self.gimbal: Px4Gimbal = Px4Gimbal(self)
+        """Gimbal on the AUX outputs, enabled by MNT_MODE_IN."""
         self.commands: CommandServer = self.serve_commands(self.make_commands())
         self.on(m.Ping, self._on_ping)
-        self.listen_to_clocks()
+        self.serve_timesync()
         self.missions.listen()
         self.failsafes.listen()
 
     @property
     def ftp(self) -> Px4Ftp:
-        """The server of the files."""
         return self.storage.ftp
 
     @property
     def airspeed_m_s(self) -> float:
-        """What an airspeed sensor says; NaN without one."""
+        """Measured airspeed; NaN without a sensor."""
         return math.nan
 
     @property
     def has_position(self) -> bool:
-        """Whether the estimator has a global position."""
+        """True if the estimator has a global position."""
         return self.uptime >= 0.5 * self._boot_time_s and not self.faults.gps_lost
 
     def next_ping(self) -> int:
-        """Sequence number of the next PING."""
+        """Return the sequence number of the next PING."""
         self._pings += 1
         return self._pings - 1
 
@@ -207,27 +198,26 @@ class Px4Vehicle(Px4Host):
         self.mission.start()
         self.failsafes.listen()
         self.failsafes.start()
-        self.call_later(self._boot_time_s, self._become_ready)
+        self.call_later(self._boot_time_s, self._set_ready)
 
     def _warn_while_booting(self) -> None:
         self.arming.report_reasons()
         self.arming.start_first_log()
 
-    def _become_ready(self) -> None:
+    def _set_ready(self) -> None:
         self.is_ready = True
         self.home = self.motion.place
 
     def start_channel(self, channel: Channel) -> None:
-        """Everything is streamed without being asked."""
-        first = max(self.now, self.booted_at + _FIRST_HEARTBEAT_SHARE * self._boot_time_s)
+        """Start the default streams."""
+        first = max(self.now, self.booted_at + _HEARTBEAT_BOOT_SHARE * self._boot_time_s)
         self.rates.start(channel, self.channels.index(channel), first)
-        known = max(self.now, self.booted_at + self._boot_time_s)
+        ready_at = max(self.now, self.booted_at + self._boot_time_s)
         self.call_at(
-            known, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel)
-        )  # once, and when it changes
+            ready_at, lambda: self.send_built(m.GpsGlobalOrigin.ID, channel)
+        )  # Sent once, and when it changes.
 
     def restart(self) -> None:
-        """Reboot now."""
         self.motion.down = self.motion.ground_down
         self.motion.settle()
         self._reset()
@@ -235,85 +225,85 @@ class Px4Vehicle(Px4Host):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Every text has an id, most end in a tab; it leaves after what is being answered."""
-        self.call_later(0.0, partial(self.events.tell, text))
+        """Every text has an id, and most end in a tab; a text is sent after the answer in progress."""
+        self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         number, self._next_text_id = self._next_text_id, (self._next_text_id + 1) & 0xFFFF
         self.call_later(0.0, lambda: self.send_chunks(severity, text, number))
 
     def send_parts(self, chunks: list[m.Statustext]) -> None:
-        self.text_links.tell(chunks)
+        self.text_links.send(chunks)
 
-    def armed(self) -> None:
+    def on_armed(self) -> None:
         self.is_armed, self._has_flown, self._landed_at = True, False, math.nan
         if not self.home_is_set_by_hand:
             self.home = self.motion.place
-        self.failsafes.armed()
-        if self.mode == MISSION:
+        self.failsafes.on_armed()
+        if self.mode == modes.MISSION:
             self.mission.enter()
-        elif self.mode == TAKEOFF:
+        elif self.mode == modes.TAKEOFF:
             self.flight.announce_take_off()
         self.set_ticking(True)
 
-    def disarmed(self) -> None:
+    def on_disarmed(self) -> None:
         self.is_armed = False
         self.throttle = 0.0
         self.is_in_failsafe = False
 
     def terminate(self) -> None:
-        """Stop the motors for good."""
+        """Stop the motors until a restart."""
         self.arming.terminate()
-        self.switch_to(TERMINATION)
+        self.switch_to(modes.TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """What a user asks for: anything while disarmed, only what can run while armed; LAND always."""
-        if self.is_armed and mode != LAND and not self.can_run(mode):
+        """Handle a mode request: any mode while disarmed; while armed only modes that can run, and LAND always."""
+        if self.is_armed and mode != modes.LAND and not self.can_run(mode):
             return False
-        if mode not in _NOT_AFTER_LANDING:
+        if mode not in _MODES_ENDED_BY_LANDING:
             self.mode_after_landing = mode
         self.is_in_failsafe = False
         self.intended_mode = mode
-        self.failsafes.take_over()
-        if mode == self.mode == MISSION:
+        self.failsafes.override()
+        if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:
             self.flight.stay_here()
         else:
             self.switch_to(mode)
-        if mode == TAKEOFF:
+        if mode == modes.TAKEOFF:
             self.flight.plan_take_off()
         return True
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Whether the mode has what it needs: sticks, a mission, set-points, a position."""
-        traits = KNOWN.get(mode)
-        if traits is None or self.arming.is_terminated or (mode == MISSION and not self.mission.is_valid):
+        """Return True if the mode has what it needs: sticks, a mission, set-points, a position."""
+        traits = modes.MODES.get(mode)
+        if traits is None or self.arming.is_terminated or (mode == modes.MISSION and not self.mission.is_valid):
             return False
         if (traits.needs_sticks and not self.sticks.are_fresh) or (
-            mode == OFFBOARD and not self.offboard.is_fresh
+            mode == modes.OFFBOARD and not self.offboard.is_fresh
         ):
             return False
         return self.has_position or not traits.needs_position
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode, whoever wants it; only the next heartbeat tells."""
+        """Change the mode; the next heartbeat reports it."""
         self.mode = mode
         self.flight.enter(mode)
-        if mode == RTL and self.is_armed:  # tells its own parts
+        if mode == modes.RTL and self.is_armed:  # PX4 informs its own components.
             self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
 
     def leave_ground(self) -> None:
         self.is_landed, self._has_flown, self._touched_at = False, True, math.nan
         self.info("Takeoff detected")
 
-    def sticks_moved(self, size: float) -> None:
-        """Somebody takes the sticks (COM_RC_STICK_OV per cent) in a mode that flies by itself (COM_RC_OVERRIDE)."""
-        if self.is_armed and not self.is_landed and self.failsafes.may_be_taken_over(size):
+    def on_sticks_moved(self, size: float) -> None:
+        """Switch to POSITION if the sticks moved by COM_RC_STICK_OV per cent in a mode that COM_RC_OVERRIDE covers."""
+        if self.is_armed and not self.is_landed and self.failsafes.can_be_overridden(size):
             self.info("Pilot took over using sticks")
-            self.change_mode(POSITION)
+            self.change_mode(modes.POSITION)
 
     def tick(self, dt: float) -> None:
-        """Mode, motion, land detector, battery, failsafe."""
+        """Update mode, motion, land detector, battery and motors."""
         if self.is_armed:
             self.offboard.watch()
             self.flight.update()
@@ -321,14 +311,14 @@ class Px4Vehicle(Px4Host):
             self.motion.step(dt, powered=self.has_power)
         if not self.is_landed:
             self._detect_landing()
-        self._disarm_by_itself()
+        self._auto_disarm()
         self._run_motors(dt)
         if not self.is_armed and self.is_landed:
             self.set_ticking(False)
 
     @property
     def has_power(self) -> bool:
-        """Whether the motors turn."""
+        """True while the motors run."""
         return self.is_armed and not self.faults.motor_failed and not self.arming.is_terminated
 
     def _moves(self) -> bool:
@@ -356,9 +346,9 @@ class Px4Vehicle(Px4Host):
             self._landed_at = self.now
             self.motion.settle()
             self.info("Landing detected")
-            self.mission.landed()
+            self.mission.on_landed()
 
-    def _disarm_by_itself(self) -> None:
+    def _auto_disarm(self) -> None:
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown and self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
@@ -367,6 +357,6 @@ class Px4Vehicle(Px4Host):
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        """Only one to everybody is a question."""
+        """Only a broadcast PING is a request."""
         if ping.target_system == ping.target_component == 0:
             self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

@@ -1,66 +1,34 @@
-"""The commands (MAV_CMD) that a simulated PX4 knows, with the real one's answers."""
+"""Commands (MAV_CMD) of a simulated PX4, answered as the firmware does."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag, MavResult, MavSeverity
-from aerokit.sim.commands import Command, CommandHandler, Progress, whole
+from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, whole
+from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
-from aerokit.sim.px4.gimbal_commands import gimbal_commands
-from aerokit.sim.px4.modes import (
-    AUTO,
-    HOLD,
-    KNOWN,
-    LAND,
-    MISSION,
-    ORBIT,
-    POSITION,
-    PRECISION_LAND,
-    RTL,
-    SELECTABLE,
-    STANDARD_MODES,
-    TAKEOFF,
-    Px4Mode,
-)
+from aerokit.sim.px4.modes import Px4Mode
+from aerokit.sim.px4.payload import gimbal_commands
 from aerokit.sim.px4.telemetry import available_modes
 
 _C = MavCmd
+# Accepted without a visible effect.
 _ACCEPTED = (
-    _C.NAV_ROI,
-    _C.NAV_VTOL_TAKEOFF,
-    _C.DO_SET_ACTUATOR,
-    _C.DO_SET_ROI_LOCATION,
-    _C.DO_SET_ROI_WPNEXT_OFFSET,
-    _C.DO_SET_ROI_NONE,
-    _C.DO_SET_ROI,
-    _C.DO_SET_SAFETY_SWITCH_STATE,
-)
-"""Taken, with nothing to be seen of it."""
+    _C.NAV_ROI, _C.NAV_VTOL_TAKEOFF, _C.DO_SET_ACTUATOR, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_WPNEXT_OFFSET,
+    _C.DO_SET_ROI_NONE, _C.DO_SET_ROI, _C.DO_SET_SAFETY_SWITCH_STATE,
+)  # fmt: skip
 
-_SILENT = (
-    _C.NAV_DELAY,
-    _C.DO_DIGICAM_CONTROL,
-    _C.DO_MOUNT_CONFIGURE,
-    _C.DO_MOUNT_CONTROL,
-    _C.DO_SET_CAM_TRIGG_DIST,
-    _C.DO_SET_CAM_TRIGG_INTERVAL,
-    _C.PREFLIGHT_UAVCAN,
-    _C.REQUEST_CAMERA_INFORMATION,
-    _C.SET_CAMERA_MODE,
-    _C.SET_CAMERA_ZOOM,
-    _C.SET_CAMERA_FOCUS,
-    _C.DO_GIMBAL_MANAGER_PITCHYAW,
-    _C.DO_GIMBAL_MANAGER_CONFIGURE,
-    _C.DO_TRIGGER_CONTROL,
-    _C.DO_VTOL_TRANSITION,
-    _C.DO_WINCH,
-)
-"""Left to a part of the vehicle that does not run here: nobody answers."""
+# Left to modules that do not run in this configuration, so there is no answer.
+_UNANSWERED = (
+    _C.NAV_DELAY, _C.DO_DIGICAM_CONTROL, _C.DO_MOUNT_CONFIGURE, _C.DO_MOUNT_CONTROL, _C.DO_SET_CAM_TRIGG_DIST,
+    _C.DO_SET_CAM_TRIGG_INTERVAL, _C.PREFLIGHT_UAVCAN, _C.REQUEST_CAMERA_INFORMATION, _C.SET_CAMERA_MODE,
+    _C.SET_CAMERA_ZOOM, _C.SET_CAMERA_FOCUS, _C.DO_GIMBAL_MANAGER_PITCHYAW, _C.DO_GIMBAL_MANAGER_CONFIGURE,
+    _C.DO_TRIGGER_CONTROL, _C.DO_VTOL_TRANSITION, _C.DO_WINCH,
+)  # fmt: skip
 
-_GRIPS_FOR_S = 1.3
+_GRIP_DURATION_S = 1.3
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
 _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
@@ -68,41 +36,38 @@ _ACTUATORS, _FIRST_OUTPUT_FUNCTION = (range(1, 13), range(33, 41)), 1000
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
-    handlers |= dict.fromkeys(_SILENT, lambda _: None)
+    handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)
     handlers[_C.DO_LAND_START] = lambda _: MavResult.CANCELLED
-    handlers[_C.CONTROL_HIGH_LATENCY] = _with_text(px4)
-    handlers[_C.DO_GRIPPER] = lambda _: Progress((_UNKNOWN_PROGRESS,), _GRIPS_FOR_S)
+    handlers[_C.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
+    handlers[_C.DO_GRIPPER] = lambda _: CommandProgress((_UNKNOWN_PROGRESS,), _GRIP_DURATION_S)
     handlers[_C.ACTUATOR_TEST] = lambda command: _test_actuator(px4, command)
     handlers[_C.PREFLIGHT_STORAGE] = lambda command: _store(px4, command)
     return handlers
 
 
-def _with_text(px4: Px4Vehicle) -> Callable[[Command], int]:
-    def fail(_: Command) -> int:
-        px4.send_text(MavSeverity.CRITICAL, "Control high latency failed! Telemetry unavailable")
-        return MavResult.FAILED
-
-    return fail
+def _refuse_high_latency(px4: Px4Vehicle) -> int:
+    px4.send_text(MavSeverity.CRITICAL, "Control high latency failed! Telemetry unavailable")
+    return MavResult.FAILED
 
 
-def _test_actuator(px4: Px4Vehicle, command: Command) -> int | None:
-    """Nothing is seen of it; param 5 is a motor, a servo, or from 1000 on any function of an output."""
+def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
+    """No visible effect; param 5 is a motor, a servo, or from 1000 an output function."""
     if px4.is_armed:
         return MavResult.DENIED
     function = whole(command.x)
-    is_known = any(function in each for each in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
+    is_known = any(function in numbers for numbers in _ACTUATORS) or function >= _FIRST_OUTPUT_FUNCTION
     return MavResult.ACCEPTED if is_known else None
 
 
-def _store(px4: Px4Vehicle, command: Command) -> int | None:
-    """Nothing is seen of it; an action that it does not know is not answered."""
+def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
+    """No visible effect; unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     return MavResult.ACCEPTED if whole(command.param1) in _STORAGE_ACTIONS else None
 
 
-_FORCE = 21196.0
-_ALIASES: dict[Px4Mode, Px4Mode] = {(AUTO, 0): MISSION, ORBIT: POSITION}
+_FORCE_MAGIC = 21196.0
+_ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
@@ -112,7 +77,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         **message_requests(px4),
         **other_commands(px4),
         **px4.camera_trigger.commands(),
-        **gimbal_commands(px4),
+        **gimbal_commands(px4.gimbal),
         MavCmd.COMPONENT_ARM_DISARM: flight.arm_or_disarm,
         MavCmd.DO_SET_MODE: flight.set_mode,
         MavCmd.NAV_TAKEOFF: flight.take_off,
@@ -133,10 +98,10 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     }
 
 
-def refusal_by_place(command: Command, *, checks_frame: bool) -> int | None:
-    """The MAV_RESULT of a place that is none; None when the command may be looked at."""
+def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
+    """Return the MAV_RESULT of an invalid position or frame; None if the command is valid."""
     if command.is_long:
-        is_left_open = all(_INT32_MAX - 128 < each <= _INT32_MAX + 256 for each in (command.x, command.y))
+        is_left_open = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
         return MavResult.DENIED if is_left_open else None
     if command.x == command.y == _NAN_AS_INT:
         return MavResult.DENIED
@@ -145,13 +110,13 @@ def refusal_by_place(command: Command, *, checks_frame: bool) -> int | None:
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
-    """What DO_SET_MODE and SET_MODE do."""
+    """Handle DO_SET_MODE and SET_MODE."""
     if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
         px4.send_text(MavSeverity.CRITICAL, "Unsupported base mode")
         return MavResult.TEMPORARILY_REJECTED
     mode = _ALIASES.get(mode, mode)
-    if mode not in SELECTABLE:
-        what = "auto" if mode[0] == AUTO else "main"
+    if mode not in modes.SELECTABLE:
+        what = "auto" if mode[0] == modes.AUTO else "main"
         px4.send_text(MavSeverity.CRITICAL, f"Unsupported {what} mode")
         return MavResult.ACCEPTED if px4.version.startswith("1.16") else MavResult.TEMPORARILY_REJECTED
     return _change(px4, mode)
@@ -160,7 +125,7 @@ def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
 def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
     if px4.change_mode(mode):
         return MavResult.ACCEPTED
-    px4.send_text(MavSeverity.CRITICAL, f"Switching to {KNOWN[mode].name} is currently not available")
+    px4.send_text(MavSeverity.CRITICAL, f"Switching to {modes.MODES[mode].name} is currently not available")
     return MavResult.TEMPORARILY_REJECTED
 
 
@@ -168,11 +133,11 @@ class _Flight:
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
 
-    def arm_or_disarm(self, command: Command) -> int | None:
-        force = command.param2 == _FORCE
+    def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
+        force = command.param2 == _FORCE_MAGIC
         wanted = round(command.param1) if math.isfinite(command.param1) else None
         if wanted == 1:
-            done = self._px4.arming.arm()  # external commands are always checked, by force or not
+            done = self._px4.arming.arm()  # PX4 checks external arm commands even if they are forced.
         elif wanted == 0:
             done = self._px4.arming.disarm("external command", force=force)
         else:
@@ -180,13 +145,13 @@ class _Flight:
             return None
         return MavResult.ACCEPTED if done else MavResult.TEMPORARILY_REJECTED
 
-    def set_mode(self, command: Command) -> int:
-        """Two answers: the link's own, which is always ACCEPTED, and the real one."""
+    def set_mode(self, command: ReceivedCommand) -> int:
+        """Acknowledge twice: the link module always answers ACCEPTED, then the commander sends the result."""
         self._px4.commands.answer(command, MavResult.ACCEPTED)
         return set_mode(self._px4, whole(command.param1), (whole(command.param2), whole(command.param3)))
 
-    def set_standard_mode(self, command: Command) -> int:
-        mode = STANDARD_MODES.get(whole(command.param1))
+    def set_standard_mode(self, command: ReceivedCommand) -> int:
+        mode = modes.STANDARD_MODES.get(whole(command.param1))
         if mode is None:
             return MavResult.FAILED
         return MavResult.ACCEPTED if self._px4.change_mode(mode) else MavResult.TEMPORARILY_REJECTED
@@ -197,9 +162,9 @@ class _Flight:
             self._px4.info(text)
         return result
 
-    def take_off(self, command: Command) -> int:
-        """``param7`` is AMSL; without it MIS_TAKEOFF_ALT above home counts."""
-        result = self._change(TAKEOFF)
+    def take_off(self, command: ReceivedCommand) -> int:
+        """``param7`` is AMSL; NaN uses MIS_TAKEOFF_ALT above home."""
+        result = self._change(modes.TAKEOFF)
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             self._plan_take_off(self._px4.frame.origin.altitude_m - command.z)
         return result
@@ -211,33 +176,33 @@ class _Flight:
             down = px4.motion.down
         px4.flight.plan_take_off(down)
 
-    def land(self, _: Command) -> int:
-        return self._change(LAND, "Landing at current position")
+    def land(self, _: ReceivedCommand) -> int:
+        return self._change(modes.LAND, "Landing at current position")
 
-    def land_precisely(self, _: Command) -> int:
-        return self._change(PRECISION_LAND, "Precision landing")
+    def land_precisely(self, _: ReceivedCommand) -> int:
+        return self._change(modes.PRECISION_LAND, "Precision landing")
 
-    def return_to_launch(self, _: Command) -> int:
-        return self._change(RTL, "Returning to launch")
+    def return_to_launch(self, _: ReceivedCommand) -> int:
+        return self._change(modes.RTL, "Returning to launch")
 
-    def start_mission(self, command: Command) -> int:
-        """Changes the mode and arms."""
+    def start_mission(self, command: ReceivedCommand) -> int:
+        """Change the mode and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
             return MavResult.DENIED
         if not -1 <= command.param1 < px4.mission.count:
             return MavResult.DENIED
-        result = self._change(MISSION)
+        result = self._change(modes.MISSION)
         if result == MavResult.ACCEPTED and not px4.arming.arm("mission start"):
             return MavResult.TEMPORARILY_REJECTED
         return result
 
-    def reposition(self, command: Command) -> int:
-        """Latitude and longitude NaN (INT32_MAX) keep the place, altitude NaN the height; altitude is AMSL."""
+    def reposition(self, command: ReceivedCommand) -> int:
+        """NaN (INT32_MAX) latitude and longitude keep the position, a NaN altitude (AMSL) keeps the height."""
         if whole(command.param2) != 1:
             return MavResult.UNSUPPORTED
-        result = self._change(HOLD)
+        result = self._change(modes.HOLD)
         if result != MavResult.ACCEPTED:
             return result
         if self._px4.failsafes.fence.allows(self._destination(command)):
@@ -246,7 +211,7 @@ class _Flight:
             self._px4.send_text(MavSeverity.CRITICAL, "Reposition is outside geofence")
         return result
 
-    def _destination(self, command: Command) -> tuple[float, float, float]:
+    def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
         keeps_place = _INT32_MAX in (command.x, command.y) or not math.isfinite(command.x + command.y)
@@ -256,15 +221,15 @@ class _Flight:
             down = px4.frame.origin.altitude_m - command.z
         return (north, east, down)
 
-    def _go_to(self, command: Command) -> None:
+    def _go_to(self, command: ReceivedCommand) -> None:
         px4 = self._px4
         px4.flight.target = self._destination(command)
         px4.flight.heading = command.param4 if math.isfinite(command.param4) else None
         if command.param1 > 0:
             px4.flight.speed_m_s = command.param1
 
-    def orbit(self, command: Command) -> int:
-        """Around a place; params that are NaN keep what was."""
+    def orbit(self, command: ReceivedCommand) -> int:
+        """Circle a position; NaN params keep the previous values."""
         px4, orbit = self._px4, self._px4.flight.orbit
         north, east, down = self._destination(command)
         radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
@@ -272,29 +237,29 @@ class _Flight:
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
             return MavResult.ACCEPTED
-        return self._change(ORBIT)
+        return self._change(modes.ORBIT)
 
-    def change_altitude(self, command: Command) -> int:
+    def change_altitude(self, command: ReceivedCommand) -> int:
         """``param1`` is AMSL."""
-        result = self._change(HOLD)
+        result = self._change(modes.HOLD)
         if result == MavResult.ACCEPTED and math.isfinite(command.param1):
             flight = self._px4.flight
             flight.target = (*flight.target[:2], self._px4.frame.origin.altitude_m - command.param1)
         return result
 
-    def terminate(self, command: Command) -> int:
-        """Nothing but ``param1`` 1 is taken."""
+    def terminate(self, command: ReceivedCommand) -> int:
+        """Only ``param1`` 1 is accepted."""
         if command.param1 != 1.0 or not self._px4.is_armed:
             return MavResult.DENIED
         self._px4.terminate()
         return MavResult.ACCEPTED
 
-    def change_speed(self, command: Command) -> int:
+    def change_speed(self, command: ReceivedCommand) -> int:
         if command.param2 > 0:
             self._px4.flight.speed_m_s = min(command.param2, self._px4.flight.top_speed_m_s)
         return MavResult.ACCEPTED
 
-    def set_home(self, command: Command) -> int:
+    def set_home(self, command: ReceivedCommand) -> int:
         px4, motion = self._px4, self._px4.motion
         if command.param1 > 0.5:
             px4.home = motion.place
@@ -306,11 +271,11 @@ class _Flight:
         px4.home_is_set_by_hand = True
         return MavResult.ACCEPTED
 
-    def run_prearm_checks(self, _: Command) -> int:
+    def run_prearm_checks(self, _: ReceivedCommand) -> int:
         self._px4.arming.report_reasons()
         return MavResult.ACCEPTED
 
-    def reboot(self, command: Command) -> int:
+    def reboot(self, command: ReceivedCommand) -> int:
         if command.param1 == 0.0:
             return MavResult.ACCEPTED
         if self._px4.is_armed or command.param1 != 1.0:
@@ -320,7 +285,7 @@ class _Flight:
 
 
 _NOT_ON_REQUEST = frozenset({m.MissionCurrent.ID, m.CurrentEventSequence.ID})
-_NOTHING_BUT_AN_ANSWER = frozenset({m.Heartbeat.ID})
+_ACKNOWLEDGED_ONLY = frozenset({m.Heartbeat.ID})
 
 
 def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
@@ -330,54 +295,54 @@ def message_requests(px4: Px4Vehicle) -> dict[int, CommandHandler]:
         MavCmd.SET_MESSAGE_INTERVAL: requests.set_interval,
         MavCmd.GET_MESSAGE_INTERVAL: requests.get_interval,
     }
-    for command, message_id in _ELDER.items():
-        handlers[command] = lambda each, message_id=message_id: requests.send_now(message_id, each)  # type: ignore[misc]
+    for command, message_id in _LEGACY_REQUESTS.items():
+        handlers[command] = lambda request, message_id=message_id: requests.send_now(message_id, request)  # type: ignore[misc]
     return handlers
 
 
-_ELDER = {
+# Commands that request a single message.
+_LEGACY_REQUESTS = {
     MavCmd.REQUEST_AUTOPILOT_CAPABILITIES: m.AutopilotVersion.ID,
     MavCmd.REQUEST_PROTOCOL_VERSION: m.ProtocolVersion.ID,
     MavCmd.REQUEST_STORAGE_INFORMATION: m.StorageInformation.ID,
     MavCmd.REQUEST_FLIGHT_INFORMATION: m.FlightInformation.ID,
     MavCmd.GET_HOME_POSITION: m.HomePosition.ID,
 }
-"""Commands that ask for one message each."""
 
 
 class _Requests:
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
 
-    def send_now(self, message_id: int, command: Command) -> int:
-        """The message goes out before its acknowledgement; DENIED when there is none."""
+    def send_now(self, message_id: int, command: ReceivedCommand) -> int:
+        """Send a message before its acknowledgement; DENIED if there is none."""
         message = None if message_id in _NOT_ON_REQUEST else self._px4.build(message_id)
-        self._px4.rates.requested(command.channel, message_id)
+        self._px4.rates.on_requested(command.channel, message_id)
         if message is None:
             return MavResult.DENIED
-        if message_id not in _NOTHING_BUT_AN_ANSWER:
+        if message_id not in _ACKNOWLEDGED_ONLY:
             self._px4.send(message, command.channel)
         return MavResult.ACCEPTED
 
-    def request_message(self, command: Command) -> int:
+    def request_message(self, command: ReceivedCommand) -> int:
         message_id = _number(command.param1)
         if message_id == m.MessageInterval.ID:
             return self._send_interval(_number(command.param2), command)
         if message_id != m.AvailableModes.ID:
             return self.send_now(message_id, command)
-        modes, index = available_modes(self._px4), _number(command.param2)
-        for message in modes if index == 0 else modes[index - 1 : index]:
+        messages, index = available_modes(self._px4), _number(command.param2)
+        for message in messages if index == 0 else messages[index - 1 : index]:
             self._px4.send(message, command.channel)
-        return MavResult.ACCEPTED if 0 <= index <= len(modes) else MavResult.DENIED
+        return MavResult.ACCEPTED if 0 <= index <= len(messages) else MavResult.DENIED
 
-    def set_interval(self, command: Command) -> int:
+    def set_interval(self, command: ReceivedCommand) -> int:
         message_id = _number(command.param1)
         return self._px4.rates.set_interval_us(command.channel, message_id, command.param2, self._px4.now)
 
-    def get_interval(self, command: Command) -> int:
+    def get_interval(self, command: ReceivedCommand) -> int:
         return self._send_interval(_number(command.param1), command)
 
-    def _send_interval(self, message_id: int, command: Command) -> int:
+    def _send_interval(self, message_id: int, command: ReceivedCommand) -> int:
         interval_us = self._px4.rates.interval_us(command.channel, message_id)
         if 0 <= message_id < 1 << 16:
             self._px4.send(m.MessageInterval(message_id, interval_us), command.channel)

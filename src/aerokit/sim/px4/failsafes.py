@@ -1,9 +1,9 @@
-"""The failsafes of a simulated PX4: battery, ground station, manual control, geofence.
+"""Failsafes of a simulated PX4: battery, ground station, manual control, geofence.
 
-https://docs.px4.io/main/en/config/safety.html. The worst of what fails decides. Before it returns or lands it holds
-for COM_FAIL_ACT_T seconds; whoever chooses a mode meanwhile, or later, takes over, until something else fails.
-Simulated: warnings, HOLD, RETURN, LAND, disarming and flight termination.
-Not simulated: the events in which PX4 tells the cause, deferring, parachutes, prediction of breaches (GF_PREDICT).
+https://docs.px4.io/main/en/config/safety.html. The most severe action applies. Before returning or landing the
+vehicle holds for COM_FAIL_ACT_T seconds. A mode change by the user overrides the action until another failure
+occurs. Simulated: warnings, HOLD, RETURN, LAND, disarming and flight termination. Not simulated: events with the
+cause, deferring, parachutes, predicted breaches (GF_PREDICT).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavBatteryChargeState, MavCmd, MavMissionType, MavSeverity, MavType
 from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
-from aerokit.sim.local_frame import Ned
+from aerokit.sim.motion import Ned
 from aerokit.sim.px4.host import Px4Host
+from aerokit.sim.px4.links import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 from aerokit.sim.px4.modes import HOLD, LAND, MISSION, OFFBOARD, ORBIT, RTL, Px4Mode
-from aerokit.sim.px4.texts import NO_STATION, OUTSIDE, TOO_FAR, TOO_HIGH
 
 _C = MavCmd
 _POLYGONS = {_C.NAV_FENCE_POLYGON_VERTEX_INCLUSION: True, _C.NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False}
@@ -27,15 +27,15 @@ _CIRCLES = {_C.NAV_FENCE_CIRCLE_INCLUSION: True, _C.NAV_FENCE_CIRCLE_EXCLUSION: 
 _NO_ACTION, _WARNING = 0, 1
 
 
-class Fence:
-    """What PX4 checks of a place while GF_ACTION is not 0. One inclusion is enough to be inside."""
+class Px4Fence:
+    """Geofence, checked while GF_ACTION is not 0. Being inside one inclusion is enough."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._is_valid = True
 
-    def uploaded(self) -> None:
-        """Another list of areas: one that home is not in is told, and not looked at."""
+    def on_uploaded(self) -> None:
+        """Use a new list of areas; one that excludes home is reported and ignored."""
         home = self._px4.home
         self._is_valid = self._areas_allow(home[0], home[1])
         if not self._is_valid:
@@ -43,19 +43,19 @@ class Fence:
 
     @property
     def breaches(self) -> list[str]:
-        """What is violated now, as the texts that tell it; nothing while GF_ACTION is 0."""
+        """Texts of the current breaches; empty while GF_ACTION is 0."""
         motion = self._px4.motion
         if round(self._px4.parameters["GF_ACTION"]) == _NO_ACTION:
             return []
         return self.breaches_at(motion.place)
 
     def allows(self, place: Ned) -> bool:
-        """Whether the vehicle may be sent there: with no action, or a warning only, anywhere."""
+        """Return True if the vehicle may be sent to this point; always with no action or a warning only."""
         action = round(self._px4.parameters["GF_ACTION"])
         return action in (_NO_ACTION, _WARNING) or not self.breaches_at(place)
 
     def breaches_at(self, place: Ned) -> list[str]:
-        """What would be violated at a place (metres north, east, down)."""
+        """Return the texts of breaches at a point (metres north, east, down)."""
         px4, (north, east, down) = self._px4, place
         farthest, highest = px4.parameters["GF_MAX_HOR_DIST"], px4.parameters["GF_MAX_VER_DIST"]
         found = []
@@ -80,13 +80,13 @@ class Fence:
         return not inclusions or any(inclusions)
 
     def _areas(self, north: float, east: float) -> Iterator[tuple[bool, bool]]:
-        """Of each area whether it includes, and whether the place is in it."""
+        """Return for each area whether it is an inclusion, and whether the point is inside."""
         items, index = self._items(), 0
         while index < len(items):
             item = items[index]
             if item.command in _POLYGONS:
                 count = max(1, int(item.param1))
-                corners = [self._place(each) for each in items[index : index + count]]
+                corners = [self._place(item) for item in items[index : index + count]]
                 yield _POLYGONS[MavCmd(item.command)], _is_in_polygon(corners, north, east)
                 index += count
                 continue
@@ -117,7 +117,7 @@ _INTERVAL_S = 0.2
 
 
 class FailsafeAction(IntEnum):
-    """What a failsafe does, from the mildest to the severest."""
+    """Failsafe actions by severity."""
 
     NONE = 0
     WARN = 1
@@ -139,24 +139,22 @@ _BATTERY_TEXTS = {
 }
 
 
-class Failsafes:
-    """What watches over the flight. `check` runs five times a second while the vehicle is on."""
+class Px4Failsafes:
+    """Checks for failures five times a second and acts on them."""
 
     battery_state: MavBatteryChargeState
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self.fence: Fence = Fence(px4)
-        self.action: FailsafeAction = _A.NONE
-        """What is being done now."""
+        self.fence: Px4Fence = Px4Fence(px4)
+        self.action: FailsafeAction = _A.NONE  # Current action.
         self.battery_state = MavBatteryChargeState.OK
-        """MAV_BATTERY_CHARGE_STATE; while armed it only gets worse."""
-        self.has_station: bool = False
-        """Whether a ground station is heard; False before the first."""
+        """MAV_BATTERY_CHARGE_STATE; it never improves while armed."""
+        self.has_station: bool = False  # True while heartbeats of a ground station are received.
         self._station_at = -math.inf
-        self._had_sticks = False
+        self._had_manual_control = False
         self._battery_at_arming = MavBatteryChargeState.OK
-        self._battery_told = MavBatteryChargeState.OK
+        self._reported_battery_level = MavBatteryChargeState.OK
         self._breaches: list[str] = []
         self._active: dict[str, FailsafeAction] = {}
         self._failing: frozenset[str] = frozenset()
@@ -171,20 +169,20 @@ class Failsafes:
 
     @property
     def acts(self) -> bool:
-        """Whether it does more than warn."""
+        """True if the current action is more than a warning."""
         return self.action > _A.WARN
 
     def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
         if beat.type != MavType.GCS:
             return
-        self._px4.text_links.hear_station(channel)
+        self._px4.text_links.on_station_heartbeat(channel)
         if not self.has_station and math.isfinite(self._station_at):
             self._px4.info("GCS connection regained")
         self.has_station, self._station_at = True, self._px4.now
 
     def _watch_station(self) -> None:
-        patience = self._px4.parameters["COM_DL_LOSS_T"]
-        if self.has_station and self._px4.now - self._station_at > patience:
+        timeout = self._px4.parameters["COM_DL_LOSS_T"]
+        if self.has_station and self._px4.now - self._station_at > timeout:
             self.has_station = False
             self._px4.info("Connection to ground station lost")
             if round(self._px4.parameters["NAV_DLL_ACT"]):
@@ -193,9 +191,9 @@ class Failsafes:
     def _watch_battery(self) -> None:
         state = self._battery_level()
         self.battery_state = max(state, self.battery_state) if self._px4.is_armed else state
-        if self.battery_state > self._battery_told and self._px4.is_armed:
+        if self.battery_state > self._reported_battery_level and self._px4.is_armed:
             self._px4.send_text(*_BATTERY_TEXTS[self.battery_state])
-        self._battery_told = self.battery_state
+        self._reported_battery_level = self.battery_state
 
     def _battery_level(self) -> MavBatteryChargeState:
         limits, share = self._px4.parameters, self._px4.battery.percent / 100.0
@@ -206,7 +204,7 @@ class Failsafes:
         return MavBatteryChargeState.LOW if share < limits["BAT_LOW_THR"] else MavBatteryChargeState.OK
 
     def _battery_action(self) -> FailsafeAction:
-        """COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns and lands in an emergency."""
+        """COM_LOW_BAT_ACT: 0 warns, 2 lands, 3 returns, and lands in an emergency."""
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return _A.NONE
@@ -216,7 +214,7 @@ class Failsafes:
         return _A.LAND if lands else _A.RETURN
 
     def arming_reasons(self) -> list[str]:
-        """The texts of what keeps it from being armed."""
+        """Return the texts of the reasons that prevent arming."""
         reasons = list(self.fence.breaches)
         level = self._battery_level()
         if level >= MavBatteryChargeState.CRITICAL:
@@ -225,17 +223,17 @@ class Failsafes:
             reasons.append(NO_STATION)
         return reasons
 
-    def armed(self) -> None:
-        """The vehicle was armed: what is missing now is not missed later."""
-        self._had_sticks = self._px4.sticks.are_fresh
-        self._battery_at_arming = self._battery_told = self.battery_state = self._battery_level()
-        self._forget()
+    def on_armed(self) -> None:
+        """Ignore what is already missing at arming."""
+        self._had_manual_control = self._px4.sticks.are_fresh
+        self._battery_at_arming = self._reported_battery_level = self.battery_state = self._battery_level()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self.action, self._is_taken_over, self._holds_until = _A.NONE, False, -math.inf
         self._active, self._breaches, self._failing = {}, [], frozenset()
 
-    def _failures(self) -> dict[str, FailsafeAction]:
+    def _active_failures(self) -> dict[str, FailsafeAction]:
         found = {
             "battery": self._battery_action(),
             "station": self._station_action(),
@@ -250,11 +248,11 @@ class Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), _A.NONE)
 
     def _sticks_action(self) -> FailsafeAction:
-        """Lost is only what was there since arming."""
+        """Only sticks that were available since arming can be lost."""
         sticks = self._px4.sticks
-        self._had_sticks = self._had_sticks or sticks.are_fresh
+        self._had_manual_control = self._had_manual_control or sticks.are_fresh
         if (
-            not self._had_sticks
+            not self._had_manual_control
             or sticks.are_fresh
             or not sticks.are_wanted
             or self._is_excepted("COM_RCL_EXCEPT")
@@ -262,14 +260,14 @@ class Failsafes:
             return _A.NONE
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), _A.NONE)
 
-    def may_be_taken_over(self, moved: float) -> bool:
-        """Whether sticks that were moved so far (2 is from end to end) end the present mode."""
+    def can_be_overridden(self, moved: float) -> bool:
+        """Return True if sticks moved this far (2 is end to end) end the current mode."""
         values, mode = self._px4.parameters, self._px4.mode
         bit = 1 if mode[0] == 4 or mode == ORBIT else 2 if mode == OFFBOARD else 0
         return bool(round(values["COM_RC_OVERRIDE"]) & bit) and moved * 100 >= values["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
-        """Whether the mode's bit is set: 1 mission, 2 hold and the other automatic modes, 4 offboard."""
+        """Return True if the mode's bit is set: 1 mission, 2 hold and other automatic modes, 4 offboard."""
         mode = self._px4.intended_mode
         bit = {MISSION: 1, OFFBOARD: 4}.get(mode, 2 if mode[0] == 4 else 0)
         return bool(round(self._px4.parameters[parameter]) & bit)
@@ -283,19 +281,19 @@ class Failsafes:
         return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), _A.WARN) if breaches else _A.NONE
 
     def check(self) -> None:
-        """Look at everything, and do what is to be done; a terminated flight is beyond that."""
+        """Update the state and act; does nothing after a flight termination."""
         if self._px4.arming.is_terminated:
             return
         self._watch_station()
         self._watch_battery()
         if not self._px4.is_armed:
-            self._forget()
+            self._reset()
             return
-        self._update(self._failures())
-        self._do(self._chosen())
+        self._update(self._active_failures())
+        self._execute(self._choose())
 
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
-        """A new failure starts the delay and ends a takeover; what acts stays until a mode is chosen."""
+        """A new failure starts the delay and ends an override; an action stays until the mode is changed."""
         for cause, action in failing.items():
             if cause not in self._active and action >= _A.HOLD:
                 self._is_taken_over = False
@@ -305,7 +303,7 @@ class Failsafes:
         kept = {cause: action for cause, action in self._active.items() if action >= _A.HOLD}
         self._active, self._failing = {**kept, **failing}, frozenset(failing)
 
-    def _chosen(self) -> FailsafeAction:
+    def _choose(self) -> FailsafeAction:
         worst = max(self._active.values(), default=_A.NONE)
         intended = self._px4.intended_mode
         if self._is_taken_over and worst < _A.DISARM:
@@ -316,13 +314,13 @@ class Failsafes:
             return _A.HOLD
         return worst
 
-    def _do(self, action: FailsafeAction) -> None:
+    def _execute(self, action: FailsafeAction) -> None:
         if action == self.action:
             return
         px4, previous, self.action = self._px4, self.action, action
         px4.is_in_failsafe = action > _A.WARN
         if max(previous, _A.WARN) < action < _A.TERMINATE:
-            self._tell(action)
+            self._report(action)
         if action == _A.DISARM:
             px4.arming.disarm("failsafe", force=True)
         elif action == _A.TERMINATE:
@@ -332,14 +330,14 @@ class Failsafes:
         elif previous > _A.WARN:
             px4.switch_to(px4.intended_mode)
 
-    def _tell(self, action: FailsafeAction) -> None:
+    def _report(self, action: FailsafeAction) -> None:
         left = self._holds_until - self._px4.now
         waits = action == _A.HOLD and max(self._active.values()) > _A.HOLD
         text = f"Failsafe activated: entering Hold for {left:.0f} seconds" if waits else "Failsafe activated"
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
-    def take_over(self) -> None:
-        """Somebody has chosen a mode."""
+    def override(self) -> None:
+        """The user changed the mode: drop failures that have ended, and reduce the action to a warning."""
         self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
         if self.action > _A.WARN:
             self._is_taken_over = bool(self._active)

@@ -1,4 +1,4 @@
-"""How a simulated PX4 flies in each of its modes."""
+"""Navigator of a simulated PX4: flies each mode."""
 
 from __future__ import annotations
 
@@ -7,30 +7,18 @@ import math
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionType
 from aerokit.missions import MissionItem
-from aerokit.sim.local_frame import Ned
-from aerokit.sim.motion import approach_speed
+from aerokit.sim.motion import Ned, approach_speed
+from aerokit.sim.px4 import modes
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.manual import ManualFlight
-from aerokit.sim.px4.modes import (
-    HOLD,
-    LAND,
-    MISSION,
-    OFFBOARD,
-    ORBIT,
-    PRECISION_LAND,
-    RTL,
-    STICK_MODES,
-    TAKEOFF,
-    TERMINATION,
-    Px4Mode,
-)
+from aerokit.sim.px4.manual import Px4ManualFlight
+from aerokit.sim.px4.modes import Px4Mode
 
 _RADII_M = (1.0, 100.0)
 _BACK_TO_CIRCLE_PER_S = 0.5
 
 
-class Orbit:
-    """The circle: its middle, its height, how wide and how fast; a negative radius is anticlockwise."""
+class Px4Orbit:
+    """A circle; a negative radius is counter-clockwise."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -40,7 +28,7 @@ class Orbit:
         self.speed_m_s: float = 1.0
 
     def plan(self, radius_m: float, speed_m_s: float, place: tuple[float, float], down: float) -> bool:
-        """Take a new circle; False, and the old one stays, when its radius is out of limits."""
+        """Set a new circle; return False, without a change, if its radius is out of range."""
         if not _RADII_M[0] <= abs(radius_m) <= _RADII_M[1]:
             return False
         self.radius_m = radius_m
@@ -50,15 +38,13 @@ class Orbit:
         return True
 
     def update(self) -> None:
-        """Tell the motion what to do until the next tick."""
+        """Set the target of the motion for the next tick."""
         motion = self._px4.motion
         north, east = motion.north - self.middle[0], motion.east - self.middle[1]
         angle, distance = math.atan2(east, north), math.hypot(north, east)
         turning = math.copysign(1.0, self.radius_m)
         along = angle + turning * math.pi / 2
-        outwards = max(
-            -self.speed_m_s, min(self.speed_m_s, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance))
-        )
+        outwards = max(-self.speed_m_s, min(self.speed_m_s, _BACK_TO_CIRCLE_PER_S * (abs(self.radius_m) - distance)))
         motion.seek_velocity(
             self.speed_m_s * math.cos(along) + outwards * math.cos(angle),
             self.speed_m_s * math.sin(along) + outwards * math.sin(angle),
@@ -67,7 +53,7 @@ class Orbit:
         motion.face(angle + math.pi)
 
     def status(self) -> m.OrbitExecutionStatus:
-        """ORBIT_EXECUTION_STATUS, sent while it goes on."""
+        """Return ORBIT_EXECUTION_STATUS."""
         px4 = self._px4
         place = px4.frame.to_global(*self.middle, self.down)
         return m.OrbitExecutionStatus(
@@ -80,7 +66,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """North, east, and the level that heights above the destination are counted from."""
+    """Return north, east, and the level from which heights above the destination are counted."""
     kind = round(px4.parameters["RTL_TYPE"])
     points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if kind not in (*_NEAREST, _RALLY_FIRST) or not points:
@@ -101,45 +87,42 @@ _ARRIVED_M = 0.5
 _YAW_FROM_M_S = 0.5
 
 
-class Flight:
-    """The navigator: a target, speeds, and the phase of a mode that has several."""
+class Px4Flight:
+    """Navigator: target, speeds, and phase of modes that have several."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
-        self.target: Ned = (0.0, 0.0, 0.0)
-        """Where HOLD stays, TAKEOFF and RTL go: north, east, down in the world's frame."""
-        self.destination: Ned = (0.0, 0.0, 0.0)
-        """Where RTL lands: home, or a rally point."""
+        self.target: Ned = (0.0, 0.0, 0.0)  # Target of HOLD, TAKEOFF and RTL in the local frame.
+        self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL: home or a rally point.
         self.heading: float | None = None
         self.speed_m_s: float = 0.0
-        self.lifts_off: bool = False
-        """Whether the mode wants to leave the ground."""
-        self.by_hand: ManualFlight = ManualFlight(vehicle)
-        self.orbit: Orbit = Orbit(vehicle)
+        self.lifts_off: bool = False  # True if the mode is to leave the ground.
+        self.by_hand: Px4ManualFlight = Px4ManualFlight(vehicle)
+        self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""
         self._ramp_from = 0.0
         self._is_default_height = False
 
     @property
     def cruise_speed_m_s(self) -> float:
-        """How fast a mode begins."""
+        """Initial speed of a mode."""
         return self._vehicle.parameters["MPC_XY_CRUISE"]
 
     @property
     def top_speed_m_s(self) -> float:
-        """How fast it may be told to fly."""
+        """Maximum speed that can be commanded."""
         return self._vehicle.parameters["MPC_XY_VEL_MAX"]
 
     def enter(self, mode: Px4Mode) -> None:
-        """A mode begins."""
+        """Start a mode."""
         self.speed_m_s = self.cruise_speed_m_s
         self.heading = None
         self._phase = "climb"
         self.stay_here()
         self.by_hand.enter()
-        if mode == RTL and self._vehicle.is_armed:
+        if mode == modes.RTL and self._vehicle.is_armed:
             self._plan_return()
-        elif mode == MISSION:
+        elif mode == modes.MISSION:
             self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
@@ -147,33 +130,33 @@ class Flight:
         self.target = motion.place
 
     def update(self) -> None:
-        """Tell the motion what to do until the next tick."""
+        """Set the target of the motion for the next tick."""
         vehicle = self._vehicle
         mode = vehicle.mode
         self.lifts_off = (
-            mode == TAKEOFF
+            mode == modes.TAKEOFF
             or self.by_hand.wants_up
-            or (mode == OFFBOARD and vehicle.offboard.wants_up)
-            or (mode == MISSION and vehicle.mission.wants_up)
+            or (mode == modes.OFFBOARD and vehicle.offboard.wants_up)
+            or (mode == modes.MISSION and vehicle.mission.wants_up)
         )
         if vehicle.is_landed:
             self._lift_off()
             return
-        if mode == TAKEOFF:
+        if mode == modes.TAKEOFF:
             self._take_off()
-        elif mode in (LAND, PRECISION_LAND):
+        elif mode in (modes.LAND, modes.PRECISION_LAND):
             self.descend()
-        elif mode == RTL:
+        elif mode == modes.RTL:
             self._return()
-        elif mode == OFFBOARD:
+        elif mode == modes.OFFBOARD:
             vehicle.offboard.fly()
-        elif mode == MISSION:
+        elif mode == modes.MISSION:
             vehicle.mission.update()
-        elif mode in STICK_MODES:
+        elif mode in modes.STICK_MODES:
             self.by_hand.update()
-        elif mode == ORBIT:
+        elif mode == modes.ORBIT:
             self.orbit.update()
-        elif mode == TERMINATION:
+        elif mode == modes.TERMINATION:
             pass
         else:
             self.go()
@@ -191,11 +174,13 @@ class Flight:
         vehicle.motion.seek_position(*self.target, speed=self.speed_m_s, climb=climb, descent=1.0)
         if abs(vehicle.motion.down - self.target[2]) < _ARRIVED_M:
             target = self.target
-            vehicle.switch_to(HOLD)
+            vehicle.switch_to(modes.HOLD)
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
-        """Go straight up to ``down``; without it to MIS_TAKEOFF_ALT above home, or no higher than it is already."""
+        """Climb vertically to ``down``; by default to MIS_TAKEOFF_ALT above home, or the current height if that is
+        higher.
+        """
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:
@@ -205,7 +190,7 @@ class Flight:
             vehicle.call_later(0.0, self.announce_take_off)
 
     def announce_take_off(self) -> None:
-        """The take-off begins with the arming, or in the air at once."""
+        """Send the text of the take-off, at arming or in flight."""
         if self._is_default_height:
             altitude = self._vehicle.parameters["MIS_TAKEOFF_ALT"]
             self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")
@@ -224,7 +209,9 @@ class Flight:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def descend(self) -> None:
-        """MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2, in between in between."""
+        """Descend at MPC_Z_V_AUTO_DN above MPC_LAND_ALT1 and MPC_LAND_SPEED below MPC_LAND_ALT2, interpolated in
+        between.
+        """
         vehicle, limits = self._vehicle, self._vehicle.parameters
         fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
         high, low = limits["MPC_LAND_ALT1"], limits["MPC_LAND_ALT2"]
@@ -232,21 +219,18 @@ class Flight:
         vehicle.motion.seek_velocity(0.0, 0.0, slow + (fast - slow) * share)
 
     def _plan_return(self) -> None:
-        """Up to RTL_RETURN_ALT above where it will land, or RTL_DESCEND_ALT if that is near."""
+        """Return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT if it is near."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.north, vehicle.motion.east, vehicle.motion.down
         above = self.destination[2] - down
         height = max(vehicle.parameters["RTL_RETURN_ALT"], above)
-        if (
-            math.hypot(north - self.destination[0], east - self.destination[1])
-            < vehicle.parameters["RTL_MIN_DIST"]
-        ):
+        if math.hypot(north - self.destination[0], east - self.destination[1]) < vehicle.parameters["RTL_MIN_DIST"]:
             height = max(vehicle.parameters["RTL_DESCEND_ALT"], above)
         self.target = (north, east, min(down, self.destination[2] - height))
         amsl = vehicle.frame.origin.altitude_m - self.target[2]
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"
-        vehicle.call_later(0.0, lambda: vehicle.info(text))  # behind the text of the command that wants it
+        vehicle.call_later(0.0, lambda: vehicle.info(text))  # Sent after the text of the command that started it.
 
     def _return(self) -> None:
         vehicle, motion = self._vehicle, self._vehicle.motion
@@ -265,5 +249,5 @@ class Flight:
 
 
 def velocity_towards(offset: float, limit: float, acceleration: float) -> float:
-    """A signed speed along one axis towards something ``offset`` metres away."""
+    """Return a signed speed along one axis towards a point ``offset`` metres away."""
     return math.copysign(min(limit, approach_speed(abs(offset), 1.0, 0.7 * acceleration)), offset)

@@ -1,4 +1,4 @@
-"""MAVFTP as PX4 serves it: one session on each port, answers at once, bursts from the main loop."""
+"""MAVFTP of PX4: one session per port, immediate answers, bursts from the main loop."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.channel import Channel
-from aerokit.sim.file_tree import EEXIST, FileFault, FileTree, OpenFile
-from aerokit.sim.ftp import FileHost, FtpPacket, FtpServer, path_in, read_crc32
+from aerokit.sim.ftp import EEXIST, FileFault, FileHandle, FileTree, FtpPacket, FtpServer, path_in, read_crc32
+from aerokit.sim.vehicle import MessageHost
 
 _SESSION_TIMEOUT_S = 10.0
 _REPLY_KEPT = 4
@@ -22,40 +22,40 @@ Op = MavFtpOpcode
 
 @dataclass(eq=False)
 class _Port:
-    """What the server of one port knows."""
+    """Server state of one port."""
 
     channel: Channel
-    file: OpenFile | None = None
+    file: FileHandle | None = None
     path: str = ""
     size: int = 0
     used_at: float = 0.0
     errno: int = 0
-    """Of the latest failure; it is never forgotten, and EEXIST colours every later refusal."""
+    """Error of the latest failure. PX4 never clears it, and EEXIST changes every later refusal."""
     reply: FtpPacket | None = None
     burst: FtpPacket | None = field(default=None, repr=False)
-    """The next block's sequence and offset."""
+    """Sequence number and offset of the next block."""
     burst_sent: int = 0
     """Bytes of the burst so far."""
 
 
 class Px4Ftp(FtpServer):
-    """A session is number 0, whatever the client says when it opens; it is closed after 10 s without a request.
+    """Sessions always have number 0; a session is closed after 10 s without a request.
 
-    A burst ignores the size that is asked for and sends ``burst`` blocks every ``burst_interval_s`` seconds. It
-    is complete after 35 kB, and to be asked for again, or ends with a refusal "end of file". Small replies are
-    repeated for the same sequence number.
+    A burst ignores the requested size and sends ``burst`` blocks every ``burst_interval_s`` seconds. It is complete
+    after 35 kB, and must be requested again, or ends with the error "end of file". Small replies are repeated for a
+    repeated sequence number.
     """
 
     burst = 24
 
-    def __init__(self, vehicle: FileHost, files: FileTree, *, burst_interval_s: float = 0.005) -> None:
+    def __init__(self, vehicle: MessageHost, files: FileTree, *, burst_interval_s: float = 0.005) -> None:
         super().__init__(vehicle, files)
         self.burst_interval_s = burst_interval_s
         self._ports: dict[Channel, _Port] = {}
 
     @property
     def open_sessions(self) -> int:
-        """How many ports have a file open."""
+        """Number of ports with an open file."""
         return sum(port.file is not None for port in self._ports.values())
 
     def restart(self) -> None:
@@ -74,9 +74,7 @@ class Px4Ftp(FtpServer):
     def _answer(self, port: _Port, request: FtpPacket) -> None:
         handler = _HANDLERS.get(request.opcode)
         try:
-            answer = (
-                request.refuse(MavFtpErr.UNKNOWNCOMMAND) if handler is None else handler(self, port, request)
-            )
+            answer = request.refuse(MavFtpErr.UNKNOWNCOMMAND) if handler is None else handler(self, port, request)
         except FileFault as fault:
             port.errno = fault.errno
             answer = request.refuse_errno(fault.errno)
@@ -134,7 +132,7 @@ class Px4Ftp(FtpServer):
             return 0
 
     def _watch(self, port: _Port) -> None:
-        """Close the session once nobody has asked for anything for so long."""
+        """Close the session when it times out."""
         file = port.file
 
         def look() -> None:
@@ -180,7 +178,7 @@ class Px4Ftp(FtpServer):
             return
         self._vehicle.call_later(self.burst_interval_s, lambda: self._send_blocks(port))
 
-    def _send_block(self, port: _Port, file: OpenFile, burst: FtpPacket, *, may_end: bool) -> None:
+    def _send_block(self, port: _Port, file: FileHandle, burst: FtpPacket, *, may_end: bool) -> None:
         answer = burst.acknowledge(offset=burst.offset, session=0).replace(sequence=burst.sequence)
         refusal = burst.refuse(MavFtpErr.EOF).replace(sequence=burst.sequence, offset=burst.offset, session=0)
         try:
@@ -237,7 +235,7 @@ class Px4Ftp(FtpServer):
         try:
             return self._change(request, lambda path: self.files.truncate(path, request.offset))
         except FileFault:
-            return request.refuse_errno(port.errno)  # that of an earlier failure
+            return request.refuse_errno(port.errno)  # The error of an earlier failure, as in the firmware.
 
     def _rename(self, port: _Port, request: FtpPacket) -> FtpPacket:
         first, _, rest = request.data[: request.size].partition(b"\0")
@@ -256,7 +254,7 @@ class Px4Ftp(FtpServer):
         try:
             checksum = read_crc32(self.files, path, _CRC_BLOCK)
         except FileFault:
-            return request.refuse_errno(port.errno)  # that of an earlier failure
+            return request.refuse_errno(port.errno)  # The error of an earlier failure, as in the firmware.
         return request.acknowledge(checksum.to_bytes(4, "little"), offset=request.offset)
 
 

@@ -1,7 +1,7 @@
-"""What the parts of a simulated PX4 use of the vehicle that they belong to.
+"""Interfaces between the modules of a simulated PX4.
 
-`Px4Host` lies below all parts: none of them imports the vehicle, which is made of them. Of each other they see the
-protocols here.
+`Px4Host` declares the vehicle and the protocols declare its modules, so that none of them
+imports `Px4Vehicle`, which imports them all.
 """
 
 from __future__ import annotations
@@ -10,18 +10,14 @@ from collections.abc import Sequence
 from typing import ClassVar, Protocol
 
 from aerokit.missions import MissionItem
-from aerokit.sim.autopilot import SimulatedAutopilot
-from aerokit.sim.battery import Battery
+from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
-from aerokit.sim.local_frame import LocalFrame, Ned
-from aerokit.sim.motion import Motion
-from aerokit.sim.parameters import Parameters
+from aerokit.sim.motion import LocalFrame, Motion, Ned
+from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4.modes import Px4Mode
 
 
-class SticksPart(Protocol):
-    """The pilot's sticks."""
-
+class Px4SticksInterface(Protocol):
     roll: float
     pitch: float
     yaw: float
@@ -34,9 +30,7 @@ class SticksPart(Protocol):
     def are_wanted(self) -> bool: ...
 
 
-class ArmingPart(Protocol):
-    """Arming and disarming."""
-
+class Px4ArmingInterface(Protocol):
     since: float
     is_terminated: bool
 
@@ -45,19 +39,15 @@ class ArmingPart(Protocol):
     def terminate(self) -> None: ...
 
 
-class FencePart(Protocol):
-    """Where it may be."""
-
-    def uploaded(self) -> None: ...
+class Px4FenceInterface(Protocol):
+    def on_uploaded(self) -> None: ...
 
     def allows(self, place: Ned) -> bool: ...
 
 
-class FailsafesPart(Protocol):
-    """What watches over the flight."""
-
+class Px4FailsafesInterface(Protocol):
     @property
-    def fence(self) -> FencePart: ...
+    def fence(self) -> Px4FenceInterface: ...
 
     @property
     def acts(self) -> bool: ...
@@ -65,15 +55,11 @@ class FailsafesPart(Protocol):
     def arming_reasons(self) -> list[str]: ...
 
 
-class TextLinksPart(Protocol):
-    """Which links get texts."""
-
-    def hear_station(self, channel: Channel) -> None: ...
+class Px4TextLinksInterface(Protocol):
+    def on_station_heartbeat(self, channel: Channel) -> None: ...
 
 
-class FlightPart(Protocol):
-    """The navigator."""
-
+class Px4FlightInterface(Protocol):
     target: Ned
     heading: float | None
     speed_m_s: float
@@ -88,9 +74,7 @@ class FlightPart(Protocol):
     def descend(self) -> None: ...
 
 
-class MissionPart(Protocol):
-    """The mission mode."""
-
+class Px4MissionInterface(Protocol):
     current: int
 
     @property
@@ -100,16 +84,14 @@ class MissionPart(Protocol):
 
     def update(self) -> None: ...
 
-    def replaced(self, current: int) -> None: ...
+    def on_replaced(self, current: int) -> None: ...
 
     def forget_reached(self) -> None: ...
 
     def set_current(self, seq: int) -> None: ...
 
 
-class MissionsPart(Protocol):
-    """What is stored of mission, fence and rally points."""
-
+class Px4MissionsInterface(Protocol):
     @property
     def commands(self) -> Sequence[MissionItem]: ...
 
@@ -119,12 +101,10 @@ class MissionsPart(Protocol):
 
     def count(self, mission_type: int) -> int: ...
 
-    def item_changed(self, seq: int) -> None: ...
+    def on_item_changed(self, seq: int) -> None: ...
 
 
-class OffboardPart(Protocol):
-    """Set-points of a program."""
-
+class Px4OffboardInterface(Protocol):
     @property
     def wants_up(self) -> bool: ...
 
@@ -132,14 +112,14 @@ class OffboardPart(Protocol):
 
 
 class Px4Host(SimulatedAutopilot):
-    """What every PX4 has, as far as its parts need it; `Px4Vehicle` puts them together."""
+    """State and operations of a PX4 that its modules use; `Px4Vehicle` implements them."""
 
     VEHICLE_TYPE: ClassVar[int]
 
-    parameters: Parameters
-    """By name; they survive a reboot."""
+    parameters: SimParameters
+    """Parameters; they survive a reboot."""
     frame: LocalFrame
-    battery: Battery
+    battery: SimulatedBattery
     motion: Motion
     home: Ned
     mode: Px4Mode
@@ -149,14 +129,14 @@ class Px4Host(SimulatedAutopilot):
     is_armed: bool
     is_landed: bool
     is_in_failsafe: bool
-    sticks: SticksPart
-    arming: ArmingPart
-    failsafes: FailsafesPart
-    text_links: TextLinksPart
-    flight: FlightPart
-    mission: MissionPart
-    missions: MissionsPart
-    offboard: OffboardPart
+    sticks: Px4SticksInterface
+    arming: Px4ArmingInterface
+    failsafes: Px4FailsafesInterface
+    text_links: Px4TextLinksInterface
+    flight: Px4FlightInterface
+    mission: Px4MissionInterface
+    missions: Px4MissionsInterface
+    offboard: Px4OffboardInterface
 
     @property
     def altitude_m(self) -> float:
@@ -165,33 +145,33 @@ class Px4Host(SimulatedAutopilot):
 
     @property
     def has_position(self) -> bool:
-        """Whether the estimator has a global position."""
+        """True if the estimator has a global position."""
         raise NotImplementedError
 
     def can_run(self, mode: Px4Mode) -> bool:
-        """Whether the mode has what it needs: sticks, a mission, set-points, a position."""
+        """Return True if the mode has what it needs: sticks, a mission, set-points, a position."""
         raise NotImplementedError
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """What a user asks for: anything while disarmed, only what can run while armed; LAND always."""
+        """Handle a mode request; return False if it is refused."""
         raise NotImplementedError
 
     def switch_to(self, mode: Px4Mode) -> None:
-        """Change the mode, whoever wants it; only the next heartbeat tells."""
+        """Change the mode; the next heartbeat reports it."""
         raise NotImplementedError
 
     def leave_ground(self) -> None:
-        """The land detector sees a take-off."""
+        """Called when the vehicle takes off."""
         raise NotImplementedError
 
-    def armed(self) -> None:
-        """It was armed just now."""
+    def on_armed(self) -> None:
+        """Called after arming."""
         raise NotImplementedError
 
-    def disarmed(self) -> None:
-        """It was disarmed just now."""
+    def on_disarmed(self) -> None:
+        """Called after disarming."""
         raise NotImplementedError
 
-    def sticks_moved(self, size: float) -> None:
-        """Somebody takes the sticks (COM_RC_STICK_OV per cent) in a mode that flies by itself (COM_RC_OVERRIDE)."""
+    def on_sticks_moved(self, size: float) -> None:
+        """Called with the distance that the sticks moved."""
         raise NotImplementedError

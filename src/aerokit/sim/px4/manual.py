@@ -1,4 +1,4 @@
-"""The pilot's sticks (MANUAL_CONTROL), and how a simulated PX4 flies by them."""
+"""Manual control of a simulated PX4: sticks (MANUAL_CONTROL) and the modes flown by them."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import math
 
 from aerokit.mavlink import messages as m
 from aerokit.sim.channel import Channel
+from aerokit.sim.commands import rotated
 from aerokit.sim.motion import GRAVITY_M_S2
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW, STICK_MODES
-from aerokit.sim.setpoints import rotated
 
 _NO_MANUAL_CONTROL = 4
 _UNUSED = 65535
 _CHANNELS = 18
-_MAPS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THROTTLE")
+_CHANNEL_PARAMETERS = ("RC_MAP_ROLL", "RC_MAP_PITCH", "RC_MAP_YAW", "RC_MAP_THROTTLE")
 
 
-class Sticks:
-    """The latest position of the sticks, -1 to 1 each: right, forward, clockwise and up are positive."""
+class Px4Sticks:
+    """Latest stick positions from -1 to 1; right, forward, clockwise and up are positive."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -26,25 +26,24 @@ class Sticks:
         self.pitch: float = 0.0
         self.yaw: float = 0.0
         self.throttle: float = -1.0
-        self.channels: tuple[int, ...] = ()
-        """What RC_CHANNELS_OVERRIDE said last, in µs."""
+        self.channels: tuple[int, ...] = ()  # Pulses of the last RC_CHANNELS_OVERRIDE in µs.
         self._at = self._channels_at = -math.inf
         px4.on(m.ManualControl, self._on_manual_control)
         px4.on(m.RcChannelsOverride, self._on_override)
 
     @property
     def are_fresh(self) -> bool:
-        """Whether they are wanted and keep coming; COM_RC_LOSS_T is the patience."""
+        """True if manual control is enabled and was received within COM_RC_LOSS_T seconds."""
         return self.are_wanted and self._px4.now - self._at <= self._px4.parameters["COM_RC_LOSS_T"]
 
     @property
     def are_wanted(self) -> bool:
-        """False with COM_RC_IN_MODE 4."""
+        """False if COM_RC_IN_MODE is 4."""
         return round(self._px4.parameters["COM_RC_IN_MODE"]) != _NO_MANUAL_CONTROL
 
     @property
     def has_channels(self) -> bool:
-        """Whether RC_CHANNELS_OVERRIDE keeps coming."""
+        """True if RC_CHANNELS_OVERRIDE was received within COM_RC_LOSS_T seconds."""
         return self._px4.now - self._channels_at <= self._px4.parameters["COM_RC_LOSS_T"]
 
     def _on_manual_control(self, control: m.ManualControl, _: Channel) -> None:
@@ -58,7 +57,7 @@ class Sticks:
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
         values = [getattr(override, f"chan{number}_raw") for number in range(1, _CHANNELS + 1)]
         self.channels, self._channels_at = tuple(values), self._px4.now
-        numbers = [round(self._px4.parameters[name]) for name in _MAPS]
+        numbers = [round(self._px4.parameters[name]) for name in _CHANNEL_PARAMETERS]
         if all(0 < number <= _CHANNELS for number in numbers):
             roll, pitch, yaw, throttle = (_share(values[number - 1]) for number in numbers)
             self._move(roll, pitch, yaw, throttle)
@@ -72,18 +71,18 @@ class Sticks:
         self._at = self._px4.now
         if were_fresh:
             moved = max(abs(new - old) for new, old in zip((roll, pitch, yaw, throttle), before, strict=True))
-            self._px4.sticks_moved(moved)
+            self._px4.on_sticks_moved(moved)
 
 
 def _share(pulse_us: int) -> float:
-    """-1 to 1 of the 1000 to 2000 µs that a channel is calibrated to; the centre for one that is not used."""
+    """Scale a pulse of 1000 to 2000 µs to -1 to 1; 0 for an unused channel."""
     if pulse_us in (0, _UNUSED):
         return 0.0
     return max(-1.0, min(1.0, (pulse_us - 1500) / 500))
 
 
 def curved(value: float, share: float, dead_zone: float = 0.0) -> float:
-    """A stick's value with MPC_HOLD_DZ around the centre, and ``share`` of a cube in it (MPC_XY_MAN_EXPO)."""
+    """Apply a dead zone (MPC_HOLD_DZ) and a cubic ``share`` (MPC_XY_MAN_EXPO) to a stick value."""
     size = abs(value)
     if size <= dead_zone:
         return 0.0
@@ -95,15 +94,15 @@ _EXPO, _DEAD_ZONE = 0.6, 0.1
 _SLOW_SHARE = 0.3
 _LIFTS_OFF_ABOVE = 0.05
 _AT_REST_M_S = 0.3
+# Time constant of the motion's velocity control.
 _THRUST_AHEAD_S = 0.3
-"""The time constant with which the motion follows a velocity."""
 
 _HOLDS_HEIGHT = frozenset({ALTITUDE, ALTITUDE_CRUISE, POSITION, POSITION_SLOW})
 _HOLDS_PLACE = frozenset({POSITION, POSITION_SLOW})
 
 
-class ManualFlight:
-    """Sticks to motion. `update` is called fifty times a second in a mode flown by hand."""
+class Px4ManualFlight:
+    """Converts sticks to motion; `update` runs at 50 Hz in manual modes."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -112,7 +111,7 @@ class ManualFlight:
         self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:
-        """A mode begins: nothing is held yet."""
+        """Reset the held position and height."""
         self._place = self._down = None
         self._px4.motion.limits.turn_rate_rad_s = self._turn_rate_rad_s
 
@@ -126,11 +125,11 @@ class ManualFlight:
         return self._thrust > 1.0
 
     def update(self) -> None:
-        """Tell the motion what to do until the next tick."""
+        """Set the target of the motion for the next tick."""
         px4, sticks = self._px4, self._px4.sticks
-        fastest = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
-        px4.motion.limits.turn_rate_rad_s = fastest
-        px4.motion.turn(fastest * curved(sticks.yaw, _EXPO, _DEAD_ZONE))
+        max_rate = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
+        px4.motion.limits.turn_rate_rad_s = max_rate
+        px4.motion.turn(max_rate * curved(sticks.yaw, _EXPO, _DEAD_ZONE))
         if px4.mode in _HOLDS_PLACE:
             self._fly_velocity()
             return
@@ -140,17 +139,17 @@ class ManualFlight:
 
     def _fly_velocity(self) -> None:
         px4, sticks, motion = self._px4, self._px4.sticks, self._px4.motion
-        fastest = px4.parameters["MPC_VEL_MANUAL"] * (_SLOW_SHARE if px4.mode == POSITION_SLOW else 1.0)
-        forward = fastest * curved(sticks.pitch, _EXPO, _DEAD_ZONE)
-        right = fastest * curved(sticks.roll, _EXPO, _DEAD_ZONE)
+        max_speed = px4.parameters["MPC_VEL_MANUAL"] * (_SLOW_SHARE if px4.mode == POSITION_SLOW else 1.0)
+        forward = max_speed * curved(sticks.pitch, _EXPO, _DEAD_ZONE)
+        right = max_speed * curved(sticks.roll, _EXPO, _DEAD_ZONE)
         down = self._height_velocity()
         if forward or right:
             self._place = None
             motion.seek_velocity(*rotated((forward, right, down), motion.yaw))
         else:
-            self._stay(down)
+            self._hold_position(down)
 
-    def _stay(self, down: float) -> None:
+    def _hold_position(self, down: float) -> None:
         motion = self._px4.motion
         if self._place is None:
             if motion.ground_speed_m_s > _AT_REST_M_S:
@@ -161,7 +160,7 @@ class ManualFlight:
         motion.seek_velocity(offset_north, offset_east, down)
 
     def _height_velocity(self) -> float:
-        """Down, in m/s: as the stick says, or what holds the height."""
+        """Return the vertical velocity (m/s down) of the stick, or the one that holds the height."""
         px4, motion = self._px4, self._px4.motion
         wanted = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
         if wanted > 0:
@@ -178,14 +177,14 @@ class ManualFlight:
 
     @property
     def _thrust(self) -> float:
-        """In parts of what hovers: the stick's centre hovers, MPC_MANTHR_MIN is its lower end."""
+        """Thrust relative to hovering: a centred stick hovers, MPC_MANTHR_MIN is the lower end."""
         values, throttle = self._px4.parameters, self._px4.sticks.throttle
-        hover, least = values["MPC_THR_HOVER"], values["MPC_MANTHR_MIN"]
-        thrust = hover + (throttle * (1.0 - hover) if throttle > 0 else throttle * (hover - least))
+        hover, min_thrust = values["MPC_THR_HOVER"], values["MPC_MANTHR_MIN"]
+        thrust = hover + (throttle * (1.0 - hover) if throttle > 0 else throttle * (hover - min_thrust))
         return thrust / hover
 
     def _velocity_of_thrust(self) -> float:
-        """What thrust makes of the vertical speed."""
+        """Return the vertical velocity that the thrust produces."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
         return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _THRUST_AHEAD_S

@@ -1,7 +1,7 @@
-"""AUTO.MISSION: where a PX4 is in its mission, and how it flies each item.
+"""Mission mode (AUTO.MISSION) of a simulated PX4.
 
 Simulated: take-off, waypoints with hold time, acceptance radius and heading, loitering, delays, landing, return,
-speed, jumps; the other commands in passing. Not simulated: regions of interest, circles.
+speed, jumps; other commands are skipped. Not simulated: regions of interest, circles.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _WITH_PLACE = (
     *_TAKE_OFFS,
     *_LANDINGS,
 )
+# Commands that can be uploaded, but make a mission invalid.
 _STORED_ONLY = (_C.CONDITION_DELAY, _C.CONDITION_DISTANCE, _C.NAV_FENCE_RETURN_POINT)
-"""Commands that can be sent to it and that no mission may have."""
 _VTOL = (_C.NAV_VTOL_TAKEOFF, _C.NAV_VTOL_LAND)
-_FAR_M = 10_000.0
+_MAX_FIRST_DISTANCE_M = 10_000.0
 
 
 def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Why such a mission cannot be flown; None when it can. Gliding is not checked."""
+    """Return why a mission cannot be flown, or None. Gliding is not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -52,8 +52,8 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """MIS_TKO_LAND_REQ: 1 demands a take-off, 2 a landing, 3 both, 4 both or none; an aeroplane has 2."""
-    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # not in the multicopter's table
+    """MIS_TKO_LAND_REQ: 1 requires a take-off, 2 a landing, 3 both, 4 both or none; the default of a plane is 2."""
+    if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # The multicopter's parameter table does not contain it.
         return None
     takes_off, lands = (any(item.command in kind for item in items) for kind in (_TAKE_OFFS, _LANDINGS))
     required = round(px4.parameters["MIS_TKO_LAND_REQ"])
@@ -90,7 +90,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
 
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
-    """The number, from 1 on, of the first item whose place the geofence forbids."""
+    """Return the number, from 1, of the first item outside the geofence."""
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
@@ -100,12 +100,12 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
 
 
 def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """What it says of a mission that it flies nevertheless: the first place is far away, 0, 0 for example."""
+    """Return the warning about a valid mission, such as a first waypoint that is far away."""
     for item in items:
         if item.command in _WITH_PLACE:
             north, east = px4.frame.to_local(round(item.x), round(item.y))
             away = math.hypot(north - px4.home[0], east - px4.home[1])
-            if away < _FAR_M:
+            if away < _MAX_FIRST_DISTANCE_M:
                 return None
             return f"First waypoint far away from home: {int(away)}m. Correct mission loaded?"
     return None
@@ -122,38 +122,34 @@ _PLACES = (
     *_LANDINGS,
 )
 _STAYING = (_C.NAV_WAYPOINT, _C.NAV_LOITER_TIME)
-_MOST_JUMPS = 100
+_MAX_JUMPS = 100
 _ACTIVE_MODES = (MISSION, TAKEOFF, LAND)
 
 
-class Mission:
-    """The navigator's mission mode. `update` is called while it is in charge."""
+class Px4Mission:
+    """Flies the mission; `update` runs while it is in charge."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self.current: int = 0
-        """The item that is flown, or will be."""
-        self.reached: int = -1
-        """The item that was reached last; -1 before the first."""
-        self.is_finished: bool = False
-        """Whether the last item was done."""
-        self.is_valid: bool = False
-        """Whether there is a mission, and one that can be flown."""
+        self.current: int = 0  # Index of the item that is flown, or will be.
+        self.reached: int = -1  # Index of the item that was reached last; -1 before the first.
+        self.is_finished: bool = False  # True after the last item.
+        self.is_valid: bool = False  # True if there is a mission that can be flown.
         self._phase = ""
         self._arrived_at = math.nan
         self._jumps: dict[int, int] = {}
         self._state = int(MissionState.NO_MISSION)
         self._repeats = 0
-        self._has_news = False
+        self._must_report = False
 
     def start(self) -> None:
-        """A boot: look at the mission, tell the last item reached once a second."""
+        """Called at boot: check the mission, and report the last item reached once a second."""
         self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None
         self._px4.every(1.0, self._repeat_reached)
 
     @property
     def count(self) -> int:
-        """How many items there are."""
+        """Number of items."""
         return len(self._px4.missions.commands)
 
     @property
@@ -162,12 +158,12 @@ class Mission:
 
     @property
     def mode(self) -> int:
-        """MISSION_CURRENT's ``mission_mode``: 1 while a mode is on that flies missions, 2 otherwise."""
+        """``mission_mode`` of MISSION_CURRENT: 1 in modes that fly missions, 2 otherwise."""
         return 1 if self._px4.mode in _ACTIVE_MODES else 2
 
     @property
     def state(self) -> int:
-        """MISSION_STATE; what fits no case stays as it was."""
+        """MISSION_STATE; other cases leave it unchanged."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -184,8 +180,8 @@ class Mission:
     def wants_up(self) -> bool:
         return self._item is not None and not self.is_finished and self._phase != "land"
 
-    def replaced(self, current: int) -> None:
-        """There is another mission; if one is being flown, begin with the new one."""
+    def on_replaced(self, current: int) -> None:
+        """Handle a new mission; a mission that is being flown is restarted."""
         self.current, self.is_finished = max(0, current), False
         self.forget_reached()
         self._jumps.clear()
@@ -199,7 +195,7 @@ class Mission:
             self._px4.change_mode(HOLD)
 
     def _check(self) -> None:
-        """A rejected mission stays in the vehicle, and is treated as none."""
+        """An invalid mission stays stored and is treated as none."""
         items = self._px4.missions.commands
         problem, doubt = rejection(self._px4, items), warning(self._px4, items)
         outside = outside_fence(self._px4, items)
@@ -212,7 +208,7 @@ class Mission:
             self._px4.send_text(MavSeverity.CRITICAL, doubt)
 
     def forget_reached(self) -> None:
-        """Nothing of the mission was reached yet."""
+        """Reset the item that was reached last."""
         self.reached, self._repeats = -1, 0
 
     def set_current(self, seq: int) -> None:
@@ -224,7 +220,7 @@ class Mission:
             self._begin_item()
 
     def enter(self) -> None:
-        """The mode begins: a finished mission once more from its start."""
+        """Start the mode; a finished mission starts again."""
         if not self.is_valid:
             return
         if self.is_finished or self.current >= self.count:
@@ -236,8 +232,8 @@ class Mission:
         self._begin_item()
 
     def _begin_item(self) -> None:
-        """Make the item the target; what needs no flying is done at once, and the next one begun."""
-        for _ in range(_MOST_JUMPS + self.count):
+        """Make the item the target; commands without a position are executed and skipped."""
+        for _ in range(_MAX_JUMPS + self.count):
             item, self._arrived_at = self._item, math.nan
             if item is None:
                 self._finish()
@@ -261,19 +257,19 @@ class Mission:
             px4.call_later(0.0, self._return)
 
     def _return(self) -> None:
-        """The mission is over: after the landing it does not come back."""
+        """The mission has ended: it is not resumed after the landing."""
         self._px4.change_mode(HOLD)
         if self._px4.change_mode(RTL):
             self._px4.info("Returning to launch")
 
     def _jump(self, item: MissionItem) -> int:
-        """Where it goes on; each jump is made as often as it says, and told to who sent the mission."""
+        """Return the next index. Each jump is made as often as it specifies, and reported to the uploader."""
         done, index = self._jumps.get(self.current, 0), self.current
         if done >= item.param2:
             self._jumps.pop(index, None)
             return index + 1
         self._jumps[index] = done + 1
-        self._px4.missions.item_changed(index)
+        self._px4.missions.on_item_changed(index)
         return int(item.param1) if 0 <= item.param1 < self.count else index + 1
 
     def _aim(self, item: MissionItem) -> None:
@@ -292,7 +288,7 @@ class Mission:
             px4.flight.target = target
 
     def _climb(self, down: float | None) -> None:
-        """Straight up first, to the height of the take-off item or MIS_TAKEOFF_ALT above home."""
+        """Climb vertically first, to the altitude of the take-off item or MIS_TAKEOFF_ALT above home."""
         px4, motion = self._px4, self._px4.motion
         if down is None:
             down = px4.home[2] - px4.parameters["MIS_TAKEOFF_ALT"]
@@ -305,14 +301,14 @@ class Mission:
         return item.command == _C.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
-        """Where an item leads; 0, 0 is a place like others, and was seen to be flown to."""
+        """Return the position of an item. PX4 flies to 0, 0 as to any other position."""
         px4, motion = self._px4, self._px4.motion
         north, east = px4.frame.to_local(round(item.x), round(item.y))
         above = px4.home[2] if item.frame == MavFrame.GLOBAL_RELATIVE_ALT else px4.frame.origin.altitude_m
         return (north, east, above - item.z if math.isfinite(item.z) else motion.down)
 
     def update(self) -> None:
-        """One tick in the air: steer, and look whether the item is reached."""
+        """Run one tick in flight: steer, and check whether the item is reached."""
         item, flight = self._item, self._px4.flight
         if item is None or self.is_finished:
             flight.go()
@@ -321,7 +317,7 @@ class Mission:
             flight.descend()
             return
         flight.go()
-        if not self._is_there(item):
+        if not self._is_at_target(item):
             return
         if self._phase == "climb":
             self._phase = "go"
@@ -337,7 +333,7 @@ class Mission:
             if item.autocontinue and self._advance():
                 self._begin_item()
 
-    def _is_there(self, item: MissionItem) -> bool:
+    def _is_at_target(self, item: MissionItem) -> bool:
         if item.command == _C.NAV_DELAY:
             return True
         motion, (north, east, down) = self._px4.motion, self._px4.flight.target
@@ -353,15 +349,15 @@ class Mission:
         waits = item.command in _STAYING or item.command == _C.NAV_DELAY
         return self._px4.now - self._arrived_at >= (item.param1 if waits else 0.0)
 
-    def landed(self) -> None:
-        """The ground is reached: the end of a mission that landed."""
+    def on_landed(self) -> None:
+        """Handle the landing: it ends a mission that lands."""
         if self._px4.mode == MISSION and self._phase == "land" and not self.is_finished:
             self._reach()
             if self._advance():
                 self._begin_item()
 
     def _advance(self) -> bool:
-        """Whether there is a next item."""
+        """Select the next item; return False after the last one."""
         if self.current + 1 < self.count:
             self.current += 1
             return True
@@ -380,22 +376,22 @@ class Mission:
         px4.call_later(0.0, self._hold)
 
     def _hold(self) -> None:
-        """What the commander does when a mission has ended and nobody wanted anything else."""
+        """Hold after the mission, as the commander does unless another mode was chosen."""
         if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
             self._px4.change_mode(HOLD)
 
     def _reach(self) -> None:
-        """Told at once; of several at the same time only the last."""
+        """Report at once; of several items at the same time only the last."""
         if self.reached == self.current:
             return
         self.reached = self.current
         self._repeats = _REPEATS
-        if not self._has_news:
-            self._has_news = True
-            self._px4.call_later(0.0, self._tell_reached)
+        if not self._must_report:
+            self._must_report = True
+            self._px4.call_later(0.0, self._send_reached)
 
-    def _tell_reached(self) -> None:
-        self._has_news = False
+    def _send_reached(self) -> None:
+        self._must_report = False
         if self.reached >= 0:
             self._px4.send(MissionItemReached(self.reached))
 

@@ -1,4 +1,4 @@
-"""What PX4 keeps of a mission item: a structure of its own, so that parameters it has no use for come back as 0."""
+"""Mission items as PX4 stores them: params that its structure has no field for come back as 0."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _C, _F = MavCmd, MavFrame
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
 _ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
+# Commands in global frames → how params 1 to 4 are stored, see `_KEEPERS`.
 _PLACES = {int(MavCmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
-"""In a global frame: command → how params 1 to 4 are kept; see `_KEEPERS`."""
+# Commands in MAV_FRAME_MISSION; all seven numbers are stored.
 _WITHOUT_PLACE = frozenset(int(MavCmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
-"""In MAV_FRAME_MISSION; all seven numbers are kept."""
 
 _ROI_COMMANDS = (_C.NAV_ROI, _C.DO_SET_ROI)
 _ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
@@ -41,9 +41,9 @@ _RADIANS_PER_DEGREE, _DEGREES_PER_RADIAN = float32(_PI / 180.0), float32(180.0 /
 
 
 def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> MissionItem | int:
-    """The item as the vehicle keeps it (in frames 0, 2 and 3), or the MAV_MISSION_RESULT that refuses it.
+    """Return the item as stored (in frames 0, 2 and 3), or the MAV_MISSION_RESULT that refuses it.
 
-    ``is_int``: it came as MISSION_ITEM_INT; only there the vehicle knows the frames 5 and 6.
+    ``is_int``: it was sent as MISSION_ITEM_INT; PX4 accepts the frames 5 and 6 only there.
     """
     frame = _INT_FRAMES.get(item.frame, item.frame) if is_int else item.frame
     if frame in (_F.GLOBAL, _F.GLOBAL_RELATIVE_ALT):
@@ -63,13 +63,13 @@ def stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> Miss
     return kept
 
 
-def given_back(item: MissionItem, *, as_int: bool) -> MissionItem:
-    """The item as it is sent: a place gets the frame that fits the message."""
+def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
+    """Return the item as sent in a download: a position has the frame that fits the message."""
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
 def checksum(items: Sequence[MissionItem], before: int = 0) -> int:
-    """What PX4 makes an opaque id of: a CRC-32 over the items as they came."""
+    """Return the opaque id of items: a CRC-32 over the uploaded messages."""
     crc = before
     for item in items:
         head = struct.pack("<BHB4f", item.frame, item.command, item.autocontinue, *_params(item))
@@ -87,7 +87,7 @@ def _floats(item: MissionItem) -> bytes:
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
-    """A place, a size and an altitude, of which it is forgotten what it is above."""
+    """Position, size and altitude; the altitude frame is not stored."""
     if item.frame == _F.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
@@ -132,7 +132,7 @@ def _rounded(value: float) -> int:
 
 
 def _heading(degrees: float) -> float:
-    """0 to 360; it was kept in radians, and all that in 32-bit floats."""
+    """0 to 360; it is stored in radians, in single precision."""
     if not math.isfinite(degrees):
         return math.nan
     radians = float32(degrees * _RADIANS_PER_DEGREE)
@@ -142,6 +142,7 @@ def _heading(degrees: float) -> float:
     return float32(radians * _DEGREES_PER_RADIAN)
 
 
+# Conversions by storage type: unchanged, 16-bit integer, rounded integer, boolean, heading, not stored.
 _KEEPERS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
@@ -150,4 +151,3 @@ _KEEPERS: dict[str, Callable[[float], float]] = {
     "?": lambda value: 1.0 if value > 0 else 0.0,
     "y": _heading,
 }
-"""How a number is kept: as it is, as a 16-bit integer, rounded to one, as a yes or no, as a heading, or not at all."""

@@ -1,7 +1,7 @@
-"""PX4's side of the mission protocol: one transfer at a time on a link, step by step, given up after five seconds.
+"""Mission protocol of PX4: one transfer per link, with a time-out of five seconds.
 
-A new list is put together aside and takes the place of the old one when its last item has come. A download is a
-conversation, too: items can only be asked for one after the other. https://mavlink.io/en/services/mission.html
+An upload is buffered, and replaces the stored list when its last item is received. Items can only be downloaded in
+order. https://mavlink.io/en/services/mission.html
 """
 
 from __future__ import annotations
@@ -13,47 +13,44 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame, MavMissionResult, MavMissionType, MavSeverity
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
-from aerokit.missions.wire import to_wire
 from aerokit.sim.channel import Channel
-from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
+from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float, item_message_int
 from aerokit.sim.px4.host import Px4Host
-from aerokit.sim.px4.mission_items import checksum, given_back, stored
+from aerokit.sim.px4.mission_items import as_downloaded, checksum, stored
 from aerokit.sim.vehicle import sender_of
 
-_ASK_AGAIN_S, _GIVE_UP_S = 0.26, 5.0
+_RETRY_INTERVAL_S, _TRANSFER_TIMEOUT_S = 0.26, 5.0
 _R = MavMissionResult
-_NOBODY = (0, 0)
+_NO_PARTNER = (0, 0)
 
 
-class State(Enum):
-    """What goes on."""
-
+class TransferState(Enum):
     IDLE = "idle"
     SENDING = "sending a list"
     GETTING = "getting a list"
 
 
-class MissionLink:
-    """Texts and results are those of the firmware; each ``on_…`` hears one message."""
+class Px4MissionLink:
+    """State machine of one link, with the texts and results of the firmware; each ``on_…`` handles one message."""
 
-    def __init__(self, px4: Px4Host, server: MissionServer, channel: Channel) -> None:
+    def __init__(self, px4: Px4Host, server: Px4MissionServer, channel: Channel) -> None:
         self._px4, self._server, self._channel = px4, server, channel
-        self._state = State.IDLE
-        self._partner = _NOBODY
+        self._state = TransferState.IDLE
+        self._partner = _NO_PARTNER
         self._type = 0
         self._seq = self._count = 0
         self._items: list[MissionItem] = []
         self._id = 0
         self._current = -1
         self._sent_at = self._received_at = 0.0
-        self._speaks_int = not px4.version.startswith("1.16")
+        self._uses_int = not px4.version.startswith("1.16")
         self._watch_number = 0
 
     @property
     def is_idle(self) -> bool:
-        return self._state is State.IDLE
+        return self._state is TransferState.IDLE
 
-    def _complain(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def _acknowledge(self, to: tuple[int, int], result: int, opaque_id: int = 0) -> None:
@@ -64,14 +61,14 @@ class MissionLink:
         count = m.MissionCount(*self._partner, self._count, self._type, self._server.id(self._type))
         self._px4.send(count, self._channel)
 
-    def _ask(self) -> None:
+    def _request_item(self) -> None:
         self._sent_at = self._px4.now
-        kind = m.MissionRequestInt if self._speaks_int else m.MissionRequest
+        kind = m.MissionRequestInt if self._uses_int else m.MissionRequest
         self._px4.send(kind(*self._partner, self._seq, self._type), self._channel)
 
     def send_changed(self, seq: int) -> None:
-        """Send an item of the mission that the vehicle changed by itself."""
-        if self._state is State.IDLE and self._partner != _NOBODY:
+        """Send an item of the mission that the vehicle changed itself."""
+        if self._state is TransferState.IDLE and self._partner != _NO_PARTNER:
             self._type = 0
             self._send_item(seq)
 
@@ -80,85 +77,77 @@ class MissionLink:
         assert item is not None
         self._sent_at = self._px4.now
         current = int(self._px4.mission.current == seq)
-        given = given_back(item, as_int=self._speaks_int)
-        system, component = self._partner
-        if self._speaks_int:
-            message: Message = to_wire(
-                given,
-                seq,
-                target_system=system,
-                target_component=component,
-                mission_type=self._type,
-                current=bool(current),
-            )
+        given = as_downloaded(item, as_int=self._uses_int)
+        if self._uses_int:
+            message: Message = item_message_int(given, seq, self._partner, self._type, current=bool(current))
         else:
             scale = 1e-7 if item.frame != MavFrame.MISSION else 1.0
             place = (item.x * scale, item.y * scale)
             message = item_message_float(given, place, seq, self._partner, self._type, current)
         self._px4.send(message, self._channel)
 
-    def _begin(self, state: State, message: Message, mission_type: int, count: int) -> None:
+    def _begin(self, state: TransferState, message: Message, mission_type: int, count: int) -> None:
         self._state, self._partner, self._type = state, sender_of(message), mission_type
         self._seq, self._count = 0, count
         self._watch_number += 1
         self._watch(self._watch_number)
 
     def _end_upload(self) -> None:
-        self._state = State.IDLE
+        self._state = TransferState.IDLE
         self._server.uploading = None
 
     def _watch(self, number: int) -> None:
-        due = self._received_at + _GIVE_UP_S
-        if self._repeats:
-            due = min(due, max(self._px4.now, self._sent_at) + _ASK_AGAIN_S)
+        due = self._received_at + _TRANSFER_TIMEOUT_S
+        if self._is_retried:
+            due = min(due, max(self._px4.now, self._sent_at) + _RETRY_INTERVAL_S)
         self._px4.call_at(due, lambda: self._check(number))
 
     @property
-    def _repeats(self) -> bool:
-        return self._state is State.GETTING or self._seq == 0
+    def _is_retried(self) -> bool:
+        return self._state is TransferState.GETTING or self._seq == 0
 
     def _check(self, number: int) -> None:
-        if number != self._watch_number or self._state is State.IDLE:
+        if number != self._watch_number or self._state is TransferState.IDLE:
             return
         now = self._px4.now
-        if now >= self._received_at + _GIVE_UP_S:
-            self._complain("Mission sync timeout")
+        if now >= self._received_at + _TRANSFER_TIMEOUT_S:
+            self._warn("Mission sync timeout")
             self._end_upload()
             return
-        if self._repeats and now >= self._sent_at + _ASK_AGAIN_S:
-            if self._state is State.GETTING:
-                self._ask()
+        if self._is_retried and now >= self._sent_at + _RETRY_INTERVAL_S:
+            if self._state is TransferState.GETTING:
+                self._request_item()
             else:
                 self._send_count()
         self._watch(number)
 
     def on_request_list(self, request: m.MissionRequestList) -> None:
-        """Somebody wants a list: begin, or begin again.
+        """Start or restart a download.
 
-        When everything was sent, only the last acknowledgement is missing. The firmware takes an upload for that, too,
-        when as many items have come as it had before: the upload is over then, but blocks all others, until a
-        download is given up.
+        When all items were sent, only the final acknowledgement is missing. The firmware also takes an upload for
+        that if as many items have arrived as it had before: the upload ends then, but blocks all others until a
+        download times out.
         """
         if self._seq == self._server.count(self._type):
-            self._state = State.IDLE
+            self._state = TransferState.IDLE
         same = self._partner == sender_of(request) and self._type == request.mission_type
-        if not (self._state is State.IDLE or (self._state is State.SENDING and same)):
+        if not (self._state is TransferState.IDLE or (self._state is TransferState.SENDING and same)):
             self._px4.info("Mission download request ignored, already active")
             return
         self._received_at = self._px4.now
         count = self._server.count(request.mission_type)
-        self._begin(State.SENDING, request, request.mission_type, count)
+        self._begin(TransferState.SENDING, request, request.mission_type, count)
         self._send_count()
 
     def on_request(self, request: AnyRequest) -> None:
-        """The next item, or the one before once more; anything else ends the download."""
-        self._speaks_int = isinstance(request, m.MissionRequestInt)
+        """Send the next item, or repeat the previous one; any other index ends the download."""
+        self._uses_int = isinstance(request, m.MissionRequestInt)
         if sender_of(request) != self._partner:
-            self._complain("WPM: REJ. CMD: partner id mismatch")
+            self._warn("WPM: REJ. CMD: partner id mismatch")
             return
-        if self._state is State.GETTING:
-            self._complain("WPM: REJ. CMD: Busy")
-        if self._state is not State.SENDING or request.mission_type != self._type:
+        if self._state is TransferState.GETTING:
+            self._warn("WPM: REJ. CMD: Busy")
+        if self._state is not TransferState.SENDING or request.mission_type != self._type:
             return
         self._received_at = self._px4.now
         if request.seq == self._seq and self._seq < self._count:
@@ -172,45 +161,45 @@ class MissionLink:
             self._refuse_request()
 
     def _refuse_request(self) -> None:
-        self._state = State.IDLE
+        self._state = TransferState.IDLE
         self._acknowledge(self._partner, _R.ERROR)
-        self._complain("WPM: REJ. CMD: Req. WP was unexpected")
+        self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def on_ack(self, ack: m.MissionAck) -> None:
-        """The end of a download; during an upload a cancellation, or a wish for the other form of item."""
+        """End a download. During an upload: cancel it, or switch between MISSION_REQUEST_INT and MISSION_REQUEST."""
         if sender_of(ack) != self._partner:
-            self._complain("REJ. WP CMD: partner id mismatch")
-        elif self._state is State.SENDING and ack.mission_type == self._type:
+            self._warn("REJ. WP CMD: partner id mismatch")
+        elif self._state is TransferState.SENDING and ack.mission_type == self._type:
             self._received_at = self._px4.now
-            self._state = State.IDLE
-        elif self._state is State.GETTING and ack.type == _R.UNSUPPORTED:
-            self._speaks_int = not self._speaks_int
-            self._ask()
-        elif self._state is State.GETTING and ack.type == _R.OPERATION_CANCELLED:
+            self._state = TransferState.IDLE
+        elif self._state is TransferState.GETTING and ack.type == _R.UNSUPPORTED:
+            self._uses_int = not self._uses_int
+            self._request_item()
+        elif self._state is TransferState.GETTING and ack.type == _R.OPERATION_CANCELLED:
             self._end_upload()
 
     def on_count(self, count: m.MissionCount) -> None:
-        """Somebody has a new list."""
+        """Start an upload."""
         sender = sender_of(count)
-        if self._state is State.SENDING:
-            self._complain("WPM: IGN MISSION_COUNT: Busy")
+        if self._state is TransferState.SENDING:
+            self._warn("WPM: IGN MISSION_COUNT: Busy")
             self._acknowledge(sender, _R.ERROR)
             return
         self._received_at = self._px4.now
-        if self._state is State.IDLE:
+        if self._state is TransferState.IDLE:
             if not self._accept(count):
                 return
         elif sender != self._partner:
             self._acknowledge(sender, _R.ERROR)
             return
         elif self._seq > 0:
-            self._complain("WPM: REJ. CMD: Busy")
+            self._warn("WPM: REJ. CMD: Busy")
             self._acknowledge(self._partner, _R.ERROR)
             return
-        self._ask()
+        self._request_item()
 
     def _accept(self, count: m.MissionCount) -> bool:
-        """Whether items are to be asked for."""
+        """Return True if items are to be requested."""
         sender, server = sender_of(count), self._server
         if server.uploading is not None:
             self._acknowledge(sender, _R.ERROR)
@@ -225,39 +214,37 @@ class MissionLink:
         else:
             self._items, self._id, self._current = [], 0, -1
             server.uploading = self
-            self._begin(State.GETTING, count, self._type, count.count)
+            self._begin(TransferState.GETTING, count, self._type, count.count)
             return True
         return False
 
     def on_item(self, message: AnyItem) -> None:
-        """An item of an upload; one that is not expected is passed over."""
+        """Handle an item of an upload; an unexpected one is ignored."""
         is_int = isinstance(message, m.MissionItemInt)
-        self._speaks_int = is_int
+        self._uses_int = is_int
         if sender_of(message) != self._partner:
-            self._complain("REJ. MIS ITEM: partner id mismatch")
+            self._warn("REJ. MIS ITEM: partner id mismatch")
         elif message.mission_type != self._type:
             self._acknowledge(self._partner, _R.ERROR)
-        elif self._state is State.GETTING:
+        elif self._state is TransferState.GETTING:
             self._received_at = self._px4.now
             if message.seq == self._seq:
-                self._take(message, is_int=is_int)
-        elif self._state is State.IDLE and self._seq == message.seq + 1:
-            self._acknowledge(self._partner, _R.ACCEPTED, self._id)  # our last one was lost
+                self._receive_item(message, is_int=is_int)
+        elif self._state is TransferState.IDLE and self._seq == message.seq + 1:
+            self._acknowledge(self._partner, _R.ACCEPTED, self._id)  # Our last acknowledgement was lost.
         else:
-            why = "No transfer" if self._state is State.IDLE else "Busy"
-            self._complain(f"IGN MISSION_ITEM: {why}")
+            why = "No transfer" if self._state is TransferState.IDLE else "Busy"
+            self._warn(f"IGN MISSION_ITEM: {why}")
             self._acknowledge(self._partner, _R.ERROR)
 
-    def _take(self, message: AnyItem, *, is_int: bool) -> None:
+    def _receive_item(self, message: AnyItem, *, is_int: bool) -> None:
         item = item_from(message)
         place = item if is_int else item.replace(x=float(item.x), y=float(item.y))
-        whole = (
-            item if is_int or item.frame == MavFrame.MISSION else item.replace(x=_e7(item.x), y=_e7(item.y))
-        )
+        whole = item if is_int or item.frame == MavFrame.MISSION else item.replace(x=_e7(item.x), y=_e7(item.y))
         kept = stored(whole, self._type, is_int=is_int)
         if isinstance(kept, int):
             if kept != _R.ERROR:
-                self._complain("IGN MISSION_ITEM: Invalid item")
+                self._warn("IGN MISSION_ITEM: Invalid item")
             self._acknowledge(self._partner, kept)
             self._end_upload()
             return
@@ -267,27 +254,26 @@ class MissionLink:
             self._current = message.seq
         self._seq += 1
         if self._seq < self._count:
-            self._ask()
+            self._request_item()
             return
         self._server.store(self._type, self._items, self._id, self._current)
         self._end_upload()
         self._acknowledge(self._partner, _R.ACCEPTED, self._id)
 
     def on_clear_all(self, request: m.MissionClearAll) -> None:
-        """Only while nothing else goes on; else there is no answer but a text."""
-        if self._state is not State.IDLE:
-            self._complain("WPM: IGN CLEAR CMD: Busy")
+        """Clear a list while idle; else only a text is sent."""
+        if self._state is not TransferState.IDLE:
+            self._warn("WPM: IGN CLEAR CMD: Busy")
             return
         self._type = request.mission_type
         self._server.clear(self._type)
         self._acknowledge(sender_of(request), _R.ACCEPTED)
 
     def on_set_current(self, request: m.MissionSetCurrent) -> None:
-        """The item to be flown next."""
-        if self._state is not State.IDLE:
-            self._complain("WPM: IGN WP CURR CMD: Busy")
+        if self._state is not TransferState.IDLE:
+            self._warn("WPM: IGN WP CURR CMD: Busy")
         elif request.seq >= len(self._server.commands):
-            self._complain("WPM: WP CURR CMD: Not in list")
+            self._warn("WPM: WP CURR CMD: Not in list")
         else:
             self._px4.mission.set_current(request.seq)
 
@@ -303,19 +289,17 @@ _CAPACITIES: dict[int, int] = {
 }
 
 
-class MissionServer:
-    """Mission, fence and rally points: kept here, and shared by all links."""
+class Px4MissionServer:
+    """Mission, fence and rally points, shared by all links."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._items: dict[int, list[MissionItem]] = {kind: [] for kind in _CAPACITIES}
         self._ids: dict[int, int] = dict.fromkeys(_CAPACITIES, 0)
-        self._links: dict[Channel, MissionLink] = {}
-        self.uploading: MissionLink | None = None
-        """The link on which a new list is coming."""
+        self._links: dict[Channel, Px4MissionLink] = {}
+        self.uploading: Px4MissionLink | None = None  # The link with an upload.
 
     def listen(self) -> None:
-        """Hear the protocol's messages."""
         on = self._px4.on
         on(m.MissionAck, lambda message, channel: self._link(channel).on_ack(message))
         on(m.MissionSetCurrent, lambda message, channel: self._link(channel).on_set_current(message))
@@ -327,10 +311,10 @@ class MissionServer:
         on(m.MissionItemInt, self._on_item)
         on(m.MissionClearAll, lambda message, channel: self._link(channel).on_clear_all(message))
 
-    def _link(self, channel: Channel) -> MissionLink:
+    def _link(self, channel: Channel) -> Px4MissionLink:
         link = self._links.get(channel)
         if link is None:
-            link = self._links[channel] = MissionLink(self._px4, self, channel)
+            link = self._links[channel] = Px4MissionLink(self._px4, self, channel)
         return link
 
     def _on_request(self, message: AnyRequest, channel: Channel) -> None:
@@ -340,23 +324,21 @@ class MissionServer:
         self._link(channel).on_item(message)
 
     def reset(self) -> None:
-        """A reboot: transfers are forgotten, items are not."""
+        """Handle a reboot: transfers are dropped, items stay."""
         self._links.clear()
         self.uploading = None
 
     @property
     def transfer_is_open(self) -> bool:
-        """Whether an upload or a download is going on, on any link."""
+        """True during an upload or download on any link."""
         return self.uploading is not None or any(not link.is_idle for link in self._links.values())
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """All items as they are given back; empty for an unknown type."""
-        return [given_back(item, as_int=True) for item in self._items.get(mission_type, ())]
+        """Return the items as downloaded; empty for an unknown type."""
+        return [as_downloaded(item, as_int=True) for item in self._items.get(mission_type, ())]
 
-    def replace(
-        self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True
-    ) -> int:
-        """Store a whole list at once; the MAV_MISSION_RESULT. PX4 itself has no way to do so."""
+    def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
+        """Store a whole list and return the MAV_MISSION_RESULT. PX4 itself cannot do this."""
         if mission_type not in _CAPACITIES or start or not clear:
             return MavMissionResult.ERROR
         kept = [stored(item, mission_type) for item in items]
@@ -368,11 +350,10 @@ class MissionServer:
         return MavMissionResult.ACCEPTED
 
     def capacity(self, mission_type: int) -> int:
-        """How many fit; 0 of an unknown type."""
+        """Return the capacity; 0 for an unknown type."""
         return _CAPACITIES.get(mission_type, 0)
 
     def count(self, mission_type: int) -> int:
-        """How many there are."""
         return len(self._items.get(mission_type, ()))
 
     def item(self, mission_type: int, seq: int) -> MissionItem | None:
@@ -380,31 +361,31 @@ class MissionServer:
         return items[seq] if 0 <= seq < len(items) else None
 
     def id(self, mission_type: int) -> int:
-        """The opaque id of a list; 0 while it is empty."""
+        """Return the opaque id of a list; 0 if it is empty."""
         return self._ids.get(mission_type, 0)
 
     @property
     def commands(self) -> Sequence[MissionItem]:
-        """The mission, for its execution."""
+        """The mission."""
         return self._items[MavMissionType.MISSION]
 
     def store(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        """A list has come; the same list again changes nothing."""
+        """Store a list; an identical list changes nothing."""
         if mission_type not in self._items or (items and opaque_id == self._ids[mission_type]):
             return
         self._items[mission_type], self._ids[mission_type] = items, opaque_id
         if mission_type == MavMissionType.MISSION:
-            self._px4.mission.replaced(current)
+            self._px4.mission.on_replaced(current)
         elif mission_type == MavMissionType.FENCE and items:
-            self._px4.failsafes.fence.uploaded()
+            self._px4.failsafes.fence.on_uploaded()
 
-    def item_changed(self, seq: int) -> None:
-        """Whoever spoke last on each link gets the item once more, unless a transfer goes on."""
+    def on_item_changed(self, seq: int) -> None:
+        """Send a changed item to the last partner on each link, except during a transfer."""
         for link in self._links.values():
             link.send_changed(seq)
 
     def clear(self, mission_type: int) -> None:
-        """Forget a list, or with MAV_MISSION_TYPE_ALL all of them."""
+        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL."""
         for kind in _CAPACITIES:
             if mission_type in (kind, MavMissionType.ALL):
                 self.store(kind, [], 0, 0)

@@ -1,4 +1,4 @@
-"""PX4's modes as (main, sub) pairs, what custom_mode makes of them, and what each of them needs."""
+"""Modes of PX4 as (main, sub) pairs, and their requirements."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import MavModeFlag
 Px4Mode = tuple[int, int]
 
 AUTO: Final = 4
-"""The main mode of all that fly by themselves."""
+"""Main mode of all automatic modes."""
 
 MANUAL: Final[Px4Mode] = (1, 0)
 ALTITUDE: Final[Px4Mode] = (2, 0)
@@ -39,49 +39,49 @@ _AUTO = int(_STABILIZED | MavModeFlag.GUIDED_ENABLED | MavModeFlag.AUTO_ENABLED)
 
 
 @dataclass(frozen=True)
-class ModeTraits:
-    """What a mode is called, what HEARTBEAT says in it, and what it needs."""
+class Px4ModeTraits:
+    """Name, base mode and requirements of a mode."""
 
     name: str
-    """As in "Switching to … is currently not available"."""
+    """Name in "Switching to … is currently not available"."""
     base_mode: int
-    """MAV_MODE_FLAGs while disarmed."""
+    """MAV_MODE_FLAG while disarmed."""
     needs_sticks: bool = False
     needs_position: bool = True
     can_arm: bool = True
-    """Whether it lets the vehicle be armed."""
+    """False if the vehicle cannot be armed in this mode."""
 
 
-KNOWN: Final[dict[Px4Mode, ModeTraits]] = {
-    MANUAL: ModeTraits("Manual", _BY_HAND, needs_sticks=True, needs_position=False),
-    ALTITUDE: ModeTraits("Altitude", _BY_HAND, needs_sticks=True, needs_position=False),
-    POSITION: ModeTraits("Position", _BY_HAND, needs_sticks=True),
-    ORBIT: ModeTraits("Orbit", _STABILIZED, can_arm=False),
-    POSITION_SLOW: ModeTraits("Position Slow", _BY_HAND, needs_sticks=True),
-    TAKEOFF: ModeTraits("Takeoff", _AUTO),
-    HOLD: ModeTraits("Hold", _AUTO),
-    MISSION: ModeTraits("Mission", _AUTO),
-    RTL: ModeTraits("Return", _AUTO, can_arm=False),
-    LAND: ModeTraits("Land", _AUTO, needs_position=False, can_arm=False),
-    FOLLOW_TARGET: ModeTraits("Follow Target", _STABILIZED, can_arm=False),
-    PRECISION_LAND: ModeTraits("Precision Landing", _AUTO, can_arm=False),
-    VTOL_TAKEOFF: ModeTraits("VTOL Takeoff", _AUTO, can_arm=False),
-    EXTERNAL_1: ModeTraits("External 1", _STABILIZED, can_arm=False),
-    ACRO: ModeTraits(
+MODES: Final[dict[Px4Mode, Px4ModeTraits]] = {
+    MANUAL: Px4ModeTraits("Manual", _BY_HAND, needs_sticks=True, needs_position=False),
+    ALTITUDE: Px4ModeTraits("Altitude", _BY_HAND, needs_sticks=True, needs_position=False),
+    POSITION: Px4ModeTraits("Position", _BY_HAND, needs_sticks=True),
+    ORBIT: Px4ModeTraits("Orbit", _STABILIZED, can_arm=False),
+    POSITION_SLOW: Px4ModeTraits("Position Slow", _BY_HAND, needs_sticks=True),
+    TAKEOFF: Px4ModeTraits("Takeoff", _AUTO),
+    HOLD: Px4ModeTraits("Hold", _AUTO),
+    MISSION: Px4ModeTraits("Mission", _AUTO),
+    RTL: Px4ModeTraits("Return", _AUTO, can_arm=False),
+    LAND: Px4ModeTraits("Land", _AUTO, needs_position=False, can_arm=False),
+    FOLLOW_TARGET: Px4ModeTraits("Follow Target", _STABILIZED, can_arm=False),
+    PRECISION_LAND: Px4ModeTraits("Precision Landing", _AUTO, can_arm=False),
+    VTOL_TAKEOFF: Px4ModeTraits("VTOL Takeoff", _AUTO, can_arm=False),
+    EXTERNAL_1: Px4ModeTraits("External 1", _STABILIZED, can_arm=False),
+    ACRO: Px4ModeTraits(
         "Acro", int(_CUSTOM | MavModeFlag.MANUAL_INPUT_ENABLED), needs_sticks=True, needs_position=False
     ),
-    OFFBOARD: ModeTraits("Offboard", _CUSTOM),
-    STABILIZED: ModeTraits("Stabilized", _BY_HAND, needs_sticks=True, needs_position=False),
-    ALTITUDE_CRUISE: ModeTraits("Altitude Cruise", _BY_HAND, needs_sticks=True, needs_position=False),
-    TERMINATION: ModeTraits("Termination", _CUSTOM, needs_position=False, can_arm=False),
+    OFFBOARD: Px4ModeTraits("Offboard", _CUSTOM),
+    STABILIZED: Px4ModeTraits("Stabilized", _BY_HAND, needs_sticks=True, needs_position=False),
+    ALTITUDE_CRUISE: Px4ModeTraits("Altitude Cruise", _BY_HAND, needs_sticks=True, needs_position=False),
+    TERMINATION: Px4ModeTraits("Termination", _CUSTOM, needs_position=False, can_arm=False),
 }
-"""The modes that are simulated."""
+"""The simulated modes."""
 
-SELECTABLE: Final = frozenset(KNOWN) - {ORBIT, TERMINATION, VTOL_TAKEOFF}
-"""What DO_SET_MODE and SET_MODE take; ORBIT begins with DO_ORBIT."""
+SELECTABLE: Final = frozenset(MODES) - {ORBIT, TERMINATION, VTOL_TAKEOFF}
+"""Modes accepted by DO_SET_MODE and SET_MODE; ORBIT is started by DO_ORBIT."""
 
-STICK_MODES: Final = frozenset(mode for mode, traits in KNOWN.items() if traits.needs_sticks)
-"""Flown by hand."""
+STICK_MODES: Final = frozenset(mode for mode, traits in MODES.items() if traits.needs_sticks)
+"""Manual modes."""
 
 STANDARD_MODES: Final[dict[int, Px4Mode]] = {
     1: POSITION,
@@ -100,5 +100,4 @@ def custom_mode(mode: Px4Mode) -> int:
 
 
 def mode_from_custom(value: int) -> Px4Mode:
-    """The pair in a custom_mode."""
     return (value >> 16 & 0xFF, value >> 24 & 0xFF)

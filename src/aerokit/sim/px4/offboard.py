@@ -1,4 +1,4 @@
-"""OFFBOARD: set-points that have to keep coming, each axis by position, velocity or acceleration.
+"""OFFBOARD mode of a simulated PX4: streamed set-points for position, velocity or acceleration of each axis.
 
 https://docs.px4.io/main/en/flight_modes/offboard.html
 """
@@ -10,21 +10,20 @@ import math
 from aerokit.mavlink.enums import AttitudeTargetTypemask, MavFrame, MavSeverity
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.channel import Channel
-from aerokit.sim.local_frame import Ned
-from aerokit.sim.motion import euler_from_quaternion
+from aerokit.sim.commands import PositionTarget, Setpoint, rotated
+from aerokit.sim.motion import Ned, euler_from_quaternion
 from aerokit.sim.px4.flight import velocity_towards
 from aerokit.sim.px4.host import Px4Host
 from aerokit.sim.px4.modes import OFFBOARD, POSITION, RTL
-from aerokit.sim.setpoints import PositionTarget, Setpoint, rotated
 
 _NAN3: Ned = (math.nan, math.nan, math.nan)
+# The ground is level, so that an altitude above terrain equals one above home.
 _GLOBAL_FRAMES = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
-"""Where the ground is level, an altitude above it is one above home."""
 _CLIMB_AT_FULL_THRUST_M_S = 5.0
 
 
-class Offboard:
-    """The latest set-point; it is heard in every mode and flown in OFFBOARD."""
+class Px4Offboard:
+    """The latest set-point; received in every mode, flown in OFFBOARD."""
 
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
@@ -39,12 +38,12 @@ class Offboard:
 
     @property
     def is_fresh(self) -> bool:
-        """Whether set-points keep coming; COM_OF_LOSS_T is the patience."""
+        """True if a set-point was received within COM_OF_LOSS_T seconds."""
         return self._vehicle.now - self.updated_at <= self._vehicle.parameters["COM_OF_LOSS_T"]
 
     @property
     def position(self) -> Ned:
-        """Where the set-point leads; NaN for what it does not say."""
+        """Target position; NaN for unset axes."""
         return self._position
 
     @property
@@ -57,40 +56,40 @@ class Offboard:
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
         frame = target.coordinate_frame
         if frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
-            self._complain(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
+            self._warn(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
             return
         body = frame == MavFrame.BODY_NED
         position = _NAN3 if body else (target.x, target.y, target.z)
-        if not self._take(target, position, body=body):
-            self._complain("SET_POSITION_TARGET_LOCAL_NED invalid")
+        if not self._store(target, position, body=body):
+            self._warn("SET_POSITION_TARGET_LOCAL_NED invalid")
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
         if target.coordinate_frame not in _GLOBAL_FRAMES:
             frame = target.coordinate_frame
-            self._complain(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
+            self._warn(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
             return
         frame_of_home = self._vehicle.frame
         north, east = frame_of_home.to_local(target.lat_int, target.lon_int)
         down = frame_of_home.origin.altitude_m - target.alt
         if target.coordinate_frame != MavFrame.GLOBAL_INT:
             down = self._vehicle.home[2] - target.alt
-        self._take(target, (north, east, down), body=False)
+        self._store(target, (north, east, down), body=False)
 
-    def _complain(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
-    def _take(self, target: PositionTarget, position: Ned, *, body: bool) -> bool:
-        """Whether it says anything; a set-point without a position, a velocity or an acceleration is none."""
-        asked = Setpoint.of(target)
-        position, velocity, acceleration = asked.axes(position)
+    def _store(self, target: PositionTarget, position: Ned, *, body: bool) -> bool:
+        """Store a set-point; return False if it has neither position, velocity nor acceleration."""
+        setpoint = Setpoint.of(target)
+        position, velocity, acceleration = setpoint.axes(position)
         if all(math.isnan(part) for part in (*position, *velocity, *acceleration)):
             return False
         if body:
             yaw = self._vehicle.motion.yaw
             velocity, acceleration = rotated(velocity, yaw), rotated(acceleration, yaw)
         self._position, self._velocity, self._acceleration = position, velocity, acceleration
-        self._yaw = math.nan if asked.yaw is None else asked.yaw
-        self._yaw_rate = math.nan if asked.yaw_rate is None else asked.yaw_rate
+        self._yaw = math.nan if setpoint.yaw is None else setpoint.yaw
+        self._yaw_rate = math.nan if setpoint.yaw_rate is None else setpoint.yaw_rate
         self._attitude, self.updated_at = None, self._vehicle.now
         return True
 
@@ -104,7 +103,7 @@ class Offboard:
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
-        """Without set-points it returns (1.16: waits for sticks in POSITION), at once; with new ones it goes on."""
+        """Return to launch when set-points stop (1.16: POSITION), and resume when they start again."""
         vehicle = self._vehicle
         if vehicle.intended_mode != OFFBOARD or vehicle.failsafes.acts:
             return
@@ -136,13 +135,13 @@ class Offboard:
     def _wanted_velocity(self) -> Ned:
         motion, limits = self._vehicle.motion, self._vehicle.parameters
         place = motion.place
-        fastest = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)
+        max_speeds = (limits["MPC_XY_VEL_MAX"],) * 2 + (limits["MPC_Z_V_AUTO_UP"],)
         accelerations = (motion.limits.acceleration_m_s2,) * 2 + (motion.limits.vertical_acceleration_m_s2,)
         wanted = []
         for axis in range(3):
             speed = 0.0 if math.isnan(self._velocity[axis]) else self._velocity[axis]
             if math.isfinite(self._position[axis]):
                 offset = self._position[axis] - place[axis]
-                speed += velocity_towards(offset, fastest[axis], accelerations[axis])
-            wanted.append(max(-fastest[axis], min(fastest[axis], speed)))
+                speed += velocity_towards(offset, max_speeds[axis], accelerations[axis])
+            wanted.append(max(-max_speeds[axis], min(max_speeds[axis], speed)))
         return (wanted[0], wanted[1], wanted[2])

@@ -1,4 +1,4 @@
-"""What a simulated PX4 keeps: files, logs, parameters, the key for signing; and how it gives them away."""
+"""Files, logs, parameters and signing key of a simulated PX4, with their servers."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from aerokit.mavlink.signing import SigningKey
 from aerokit.parameters.pack import HEADER, MAGIC, read_entry, read_header
 from aerokit.protocols.ftp import DATA_SIZE
 from aerokit.sim.autopilot import VehicleSigning
-from aerokit.sim.file_tree import EINVAL, FileFault, FileTree, OpenFile
+from aerokit.sim.ftp import EINVAL, FileFault, FileHandle, FileTree
 from aerokit.sim.logs import Px4LogServer, SimulatedLog
 from aerokit.sim.parameter_server import Px4ParameterServer
-from aerokit.sim.parameters import ParameterPackMount, Parameters
+from aerokit.sim.parameters import ParameterPackMount, SimParameters
 from aerokit.sim.px4.ftp import Px4Ftp
 from aerokit.sim.px4.host import Px4Host
 
-_USED = """
+# Parameters that the simulation reads, or whose presence clients check.
+_USED_PARAMETERS = """
 BAT1_CAPACITY BAT1_N_CELLS BAT1_SOURCE BAT_CRIT_THR BAT_EMERGEN_THR BAT_LOW_THR CAL_ACC0_ID
 CBRK_SUPPLY_CHK COM_ARM_WO_GPS COM_DISARM_LAND COM_DISARM_PRFLT COM_DL_LOSS_T COM_FAIL_ACT_T
 COM_DLL_EXCEPT COM_FLTMODE1 COM_LOW_BAT_ACT COM_OBL_RC_ACT COM_OF_LOSS_T COM_RCL_EXCEPT COM_RC_IN_MODE
@@ -35,35 +36,40 @@ MPC_Z_V_AUTO_UP MIS_TKO_LAND_REQ NAV_ACC_RAD NAV_DLL_ACT NAV_FW_ALT_RAD NAV_LOIT
 RC_MAP_PITCH RC_MAP_ROLL RC_MAP_THROTTLE RC_MAP_YAW RTL_CONE_ANG RTL_DESCEND_ALT RTL_LAND_DELAY
 RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SYS_AUTOSTART SYS_HAS_GPS
 """
-"""What the simulation reads, or what shows that there are such things."""
 
 
-def px4_parameters(count: int | None = None, table: str = "quadrotor") -> Parameters:
-    """All 910 of a quadrotor, or the 978 of an "airplane", or so many of them; those that are read are always there."""
+def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
+    """Return the 910 parameters of a "quadrotor", the 978 of an "airplane", or ``count`` of them including the used
+    ones.
+    """
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
-    return Parameters.from_text(data.decode(), used=_USED.split(), count=count)
+    return SimParameters.from_text(data.decode(), used=_USED_PARAMETERS.split(), count=count)
 
 
 class Px4ParameterMount(ParameterPackMount):
-    """As ArduPilot's, but: an open tells the exact size, neither a value nor its default lies across two blocks of
-    239 bytes, and what is uploaded takes effect parameter by parameter.
+    """``@PARAM`` files of PX4.
+
+    Unlike ArduPilot's, an open reports the exact size, neither a value nor its default crosses a block of 239 bytes,
+    and uploaded parameters are applied as they arrive.
     """
 
-    def __init__(self, parameters: Parameters, apply: Callable[[str, float], None]) -> None:
+    def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         super().__init__(parameters, apply, block=DATA_SIZE)
 
-    def open(self, path: str, *, writing: bool) -> OpenFile:
+    def open(self, path: str, *, writing: bool) -> FileHandle:
         reader = super().open(path, writing=False)
         return _Writer(self._parameters, self._apply) if writing else reader
 
 
-class _Writer(OpenFile):
-    """Bytes that came before are acknowledged again; a gap spoils the upload. The end is refused when it was not whole:
-    the parameters before stay changed.
+class _Writer(FileHandle):
+    """An upload that is applied as it arrives.
+
+    Repeated bytes are acknowledged again; a gap fails the upload. Closing an incomplete upload fails, but keeps the
+    parameters applied so far.
     """
 
-    def __init__(self, parameters: Parameters, apply: Callable[[str, float], None]) -> None:
+    def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
         self._parameters = parameters
         self._apply = apply
         self._pending = b""
@@ -71,52 +77,52 @@ class _Writer(OpenFile):
         self._header: tuple[int, int] | None = None
         self._count = 0
         self._last = b""
-        self._is_spoilt = False
+        self._is_rejected = False
 
     def read(self, offset: int, size: int) -> bytes:
         raise FileFault(EINVAL)
 
     def write(self, offset: int, data: bytes) -> None:
         new = data[max(0, self._written - offset) :]
-        self._is_spoilt = self._is_spoilt or offset > self._written
-        if self._is_spoilt:
+        self._is_rejected = self._is_rejected or offset > self._written
+        if self._is_rejected:
             raise FileFault(EINVAL)
         self._pending += new
         self._written += len(new)
-        self._take()
+        self._parse()
         if self._header is not None and self._written > self._header[1]:
-            self._spoil()
+            self._reject()
 
     def close(self) -> None:
-        if self._is_spoilt or self._pending or self._header != (self._count, self._written):
+        if self._is_rejected or self._pending or self._header != (self._count, self._written):
             raise FileFault(EINVAL)
 
-    def _spoil(self) -> NoReturn:
-        self._is_spoilt = True
+    def _reject(self) -> NoReturn:
+        self._is_rejected = True
         raise FileFault(EINVAL)
 
-    def _take(self) -> None:
-        """Apply all that has come as a whole."""
+    def _parse(self) -> None:
+        """Apply all complete entries."""
         if self._header is None:
             if len(self._pending) < HEADER.size:
                 return
             magic, count, size = read_header(self._pending)
             if magic != MAGIC or size < HEADER.size:
-                self._spoil()
+                self._reject()
             self._header, self._pending = (count, size), self._pending[HEADER.size :]
-        while self._take_one():
+        while self._parse_row():
             pass
 
-    def _take_one(self) -> bool:
+    def _parse_row(self) -> bool:
         pending = self._pending = self._pending.lstrip(b"\0")
         try:
             entry = read_entry(pending, 0, self._last) if pending else None
         except RemoteProtocolError:
-            self._spoil()
+            self._reject()
         if entry is None:
             return False
         if entry.default is not None:
-            self._spoil()
+            self._reject()
         name = entry.name.decode("ascii", "replace")
         if name in self._parameters:
             self._apply(name, entry.value)
@@ -128,14 +134,14 @@ LOG_FOLDER = "/fs/microsd/log"
 DEFAULT_LOGS = (SimulatedLog(186_432, 1_789_990_000), SimulatedLog(45_103, 1_789_995_000))
 
 _PARAM_VALUE_FRAME, _FTP_FRAME, _LOG_DATA_FRAME = 37, 266, 109
-_SHARE = 0.5
+_LINK_SHARE = 0.5
 
 
-class Storage:
-    """Files, logs and parameters, and the servers that give them away.
+class Px4Storage:
+    """Files, logs and parameters with their servers.
 
-    With ``parameter_file`` it serves ``@PARAM/param.pck``, as PX4 does since August 2026. ``link_bytes_per_s`` is
-    the data rate that the port is told to use; None: that of a network.
+    ``parameter_file`` serves ``@PARAM/param.pck``, as PX4 does since August 2026. ``link_bytes_per_s`` is the
+    configured data rate of the port; None is that of a network.
     """
 
     def __init__(
@@ -161,13 +167,13 @@ class Storage:
             append_to_file=lambda number, data: self.files.append(_log_path(number), data),
         )
         if link_bytes_per_s is not None:
-            self.parameters.list_rate_hz = _SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
-            self.ftp.burst_interval_s = _FTP_FRAME / (_SHARE * link_bytes_per_s)
-            self.logs.rate_hz = _SHARE * link_bytes_per_s / _LOG_DATA_FRAME
+            self.parameters.list_rate_hz = _LINK_SHARE * link_bytes_per_s / _PARAM_VALUE_FRAME
+            self.ftp.burst_interval_s = _FTP_FRAME / (_LINK_SHARE * link_bytes_per_s)
+            self.logs.rate_hz = _LINK_SHARE * link_bytes_per_s / _LOG_DATA_FRAME
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Transfers end, sessions are gone; files remain."""
+        """Drop transfers and sessions; files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -185,7 +191,7 @@ class Storage:
             self.files.remove_folder(f"{LOG_FOLDER}/{day}")
 
     def _apply(self, name: str, value: float) -> None:
-        """One parameter of an uploaded file."""
+        """Apply a parameter of an uploaded file."""
         if name not in self._px4.faults.read_only_parameters:
             self._px4.parameters[name] = self.parameters.clamped(name, value)
 
@@ -198,9 +204,9 @@ _UNSIGNED = frozenset((Heartbeat.ID, AdsbVehicle.ID, Collision.ID))
 
 
 class Px4Signing(VehicleSigning):
-    """It tells when a key is taken, and lets heartbeats in without a signature; 1.16 knows no signing.
+    """Announces a new key, and accepts unsigned heartbeats; 1.16 does not support signing.
 
-    The time stamp is stored when a key is taken, and not again.
+    The time stamp is stored only when a key is set.
     """
 
     def __init__(self, vehicle: Px4Host, key: SigningKey | None, timestamp: int) -> None:
@@ -221,7 +227,7 @@ class Px4Signing(VehicleSigning):
             return False
         return True
 
-    def changed(self) -> None:
+    def on_key_changed(self) -> None:
         self._px4.info("MAVLink signing disabled" if self.key is None else "MAVLink signing key accepted")
 
 

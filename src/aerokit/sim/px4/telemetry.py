@@ -1,4 +1,4 @@
-"""What a simulated PX4 streams, and how often: the default set of its ground-station link in simulation."""
+"""Streamed messages of a simulated PX4."""
 
 from __future__ import annotations
 
@@ -20,61 +20,22 @@ from aerokit.mavlink.enums import (
 from aerokit.mavlink.message import Message
 from aerokit.sim.missions import INVALID_INDEX
 from aerokit.sim.motion import quaternion_from_euler
+from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
-from aerokit.sim.px4.modes import (
-    ACRO,
-    ALTITUDE,
-    ALTITUDE_CRUISE,
-    AUTO,
-    EXTERNAL_1,
-    FOLLOW_TARGET,
-    HOLD,
-    KNOWN,
-    LAND,
-    MANUAL,
-    MISSION,
-    OFFBOARD,
-    ORBIT,
-    POSITION,
-    POSITION_SLOW,
-    PRECISION_LAND,
-    RTL,
-    STABILIZED,
-    STANDARD_MODES,
-    TAKEOFF,
-    TERMINATION,
-    VTOL_TAKEOFF,
-    custom_mode,
-)
 from aerokit.sim.px4.telemetry_details import IDENTITY_BUILDERS, SENSOR_BUILDERS
 
 _PRESENT, _ENABLED = 0x0300402F, 0x0301402F
 _HEALTHY, _BOOTING = 0x1320C83F, 0x0320883F
 _GPS_BIT, _RC_BIT = int(MavSysStatusSensor.GPS), int(MavSysStatusSensor.RC_RECEIVER)
 _PREARM_BIT = int(MavSysStatusSensor.MAV_SYS_STATUS_PREARM_CHECK)
-_STANDARD = {mode: number for number, mode in STANDARD_MODES.items()}
-"""Mode → MAV_STANDARD_MODE."""
-_LISTED = (
-    MANUAL,
-    ALTITUDE,
-    POSITION,
-    MISSION,
-    HOLD,
-    RTL,
-    POSITION_SLOW,
-    ALTITUDE_CRUISE,
-    ACRO,
-    TERMINATION,
-    OFFBOARD,
-    STABILIZED,
-    TAKEOFF,
-    LAND,
-    FOLLOW_TARGET,
-    PRECISION_LAND,
-    ORBIT,
-    VTOL_TAKEOFF,
-)
-"""In the order of AVAILABLE_MODES; eight modes that a companion may bring follow."""
+# Mode → MAV_STANDARD_MODE.
+_STANDARD = {mode: number for number, mode in modes.STANDARD_MODES.items()}
+# Modes in the order of AVAILABLE_MODES; eight external modes follow.
+_AVAILABLE_MODES = (
+    modes.MANUAL, modes.ALTITUDE, modes.POSITION, modes.MISSION, modes.HOLD, modes.RTL, modes.POSITION_SLOW,
+    modes.ALTITUDE_CRUISE, modes.ACRO, modes.TERMINATION, modes.OFFBOARD, modes.STABILIZED, modes.TAKEOFF,
+    modes.LAND, modes.FOLLOW_TARGET, modes.PRECISION_LAND, modes.ORBIT, modes.VTOL_TAKEOFF,
+)  # fmt: skip
 _EXTERNAL_MODES = 8
 _F = EstimatorStatusFlags
 _ALL_BUT_STILL = (
@@ -85,11 +46,11 @@ _POSITION_FLAGS = _F.VELOCITY_HORIZ | _F.POS_HORIZ_REL | _F.POS_HORIZ_ABS | _F.P
 
 
 def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
-    mode = TERMINATION if px4.arming.is_terminated else px4.mode
-    base = KNOWN[mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
-    if mode == OFFBOARD and px4.offboard.is_fresh:
+    mode = modes.TERMINATION if px4.arming.is_terminated else px4.mode
+    base = modes.MODES[mode].base_mode | (MavModeFlag.SAFETY_ARMED if px4.is_armed else 0)
+    if mode == modes.OFFBOARD and px4.offboard.is_fresh:
         base |= MavModeFlag.STABILIZE_ENABLED
-    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, custom_mode(px4.mode), _state(px4), 3)
+    return m.Heartbeat(px4.VEHICLE_TYPE, MavAutopilot.PX4, base, modes.custom_mode(px4.mode), _state(px4), 3)
 
 
 def _state(px4: Px4Vehicle) -> MavState:
@@ -134,9 +95,9 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
     state = MavLandedState.IN_AIR
     if px4.is_landed:
         state = MavLandedState.ON_GROUND
-    elif px4.mode == TAKEOFF:
+    elif px4.mode == modes.TAKEOFF:
         state = MavLandedState.TAKEOFF
-    elif px4.mode == LAND:
+    elif px4.mode == modes.LAND:
         state = MavLandedState.LANDING
     return m.ExtendedSysState(0, state)
 
@@ -160,71 +121,82 @@ def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
 
 
 def _attitude(px4: Px4Vehicle) -> m.Attitude:
-    o = px4.motion
-    return m.Attitude(px4.time_boot_ms, o.roll, o.pitch, o.yaw, o.roll_rate, o.pitch_rate, o.yaw_rate)
+    motion = px4.motion
+    return m.Attitude(
+        px4.time_boot_ms,
+        motion.roll,
+        motion.pitch,
+        motion.yaw,
+        motion.roll_rate,
+        motion.pitch_rate,
+        motion.yaw_rate,
+    )
 
 
 def _attitude_quaternion(px4: Px4Vehicle) -> m.AttitudeQuaternion:
-    o = px4.motion
-    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
-    return m.AttitudeQuaternion(px4.time_boot_ms, *q, o.roll_rate, o.pitch_rate, o.yaw_rate)
+    motion = px4.motion
+    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    return m.AttitudeQuaternion(px4.time_boot_ms, *q, motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
 
 
 def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
-    o = px4.motion
-    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
-    return m.AttitudeTarget(px4.time_boot_ms, 0, q, 0.0, 0.0, o.yaw_rate, px4.throttle)
+    motion = px4.motion
+    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    return m.AttitudeTarget(px4.time_boot_ms, 0, q, 0.0, 0.0, motion.yaw_rate, px4.throttle)
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
-    """Absent without a position, not zero as with ArduPilot."""
+    """Omitted without a position, whereas ArduPilot sends zeros."""
     if not px4.has_position:
         return None
-    o = px4.motion
-    place = px4.frame.to_global(o.north, o.east, o.down)
+    motion = px4.motion
+    place = px4.frame.to_global(motion.north, motion.east, motion.down)
     return m.GlobalPositionInt(
         px4.time_boot_ms,
         place.latitude_e7,
         place.longitude_e7,
         round(place.altitude_m * 1000),
         round(px4.altitude_m * 1000),
-        round(o.velocity_north * 100),
-        round(o.velocity_east * 100),
-        round(o.velocity_down * 100),
-        round(math.degrees(o.yaw) % 360.0 * 100) % 36000,
+        round(motion.velocity_north * 100),
+        round(motion.velocity_east * 100),
+        round(motion.velocity_down * 100),
+        round(math.degrees(motion.yaw) % 360.0 * 100) % 36000,
     )
 
 
 def _local_position(px4: Px4Vehicle) -> m.LocalPositionNed:
-    o = px4.motion
-    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    return m.LocalPositionNed(px4.time_boot_ms, o.north, o.east, o.down, *velocity)
+    motion = px4.motion
+    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
+    return m.LocalPositionNed(px4.time_boot_ms, motion.north, motion.east, motion.down, *velocity)
 
 
 def _altitude(px4: Px4Vehicle) -> m.Altitude:
     amsl = px4.frame.origin.altitude_m - px4.motion.down
     above, ground = px4.altitude_m, px4.motion.ground_down
-    return m.Altitude(
-        px4.time_boot_us, amsl, amsl, -px4.motion.down, above, -ground, ground - px4.motion.down
-    )
+    return m.Altitude(px4.time_boot_us, amsl, amsl, -px4.motion.down, above, -ground, ground - px4.motion.down)
 
 
 def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
-    o = px4.motion
-    heading = int(math.degrees(o.yaw) % 360.0)
-    amsl = px4.frame.origin.altitude_m - o.down
+    motion = px4.motion
+    heading = int(math.degrees(motion.yaw) % 360.0)
+    amsl = px4.frame.origin.altitude_m - motion.down
     return m.VfrHud(
-        px4.airspeed_m_s, o.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -o.velocity_down
+        px4.airspeed_m_s,
+        motion.ground_speed_m_s,
+        heading,
+        round(px4.throttle * 100),
+        amsl,
+        -motion.velocity_down,
     )
 
 
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
-    o = px4.motion
+    motion = px4.motion
     if px4.faults.gps_lost:
         return m.GpsRawInt(0, GpsFixType.NO_FIX, 0, 0, 0, 9999, 9999, 65535, 65535, 0)
-    place = px4.frame.to_global(o.north, o.east, o.down)
+    place = px4.frame.to_global(motion.north, motion.east, motion.down)
     altitude = round(place.altitude_m * 1000)
-    course = round(math.degrees(math.atan2(o.velocity_east, o.velocity_north)) % 360.0 * 100) % 36000
+    course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0 * 100) % 36000
     return m.GpsRawInt(
         px4.time_boot_us,
         GpsFixType.TYPE_3D_FIX,
@@ -233,7 +205,7 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
         altitude,
         70,
         110,
-        round(o.ground_speed_m_s * 100),
+        round(motion.ground_speed_m_s * 100),
         course,
         10,
         altitude,
@@ -255,24 +227,25 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
 
 
 def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin:
-    """Where the local frame begins."""
+    """Return GPS_GLOBAL_ORIGIN, the origin of the local frame."""
     origin = px4.frame.origin
     altitude = round(origin.altitude_m * 1000)
     return m.GpsGlobalOrigin(origin.latitude_e7, origin.longitude_e7, altitude, px4.time_boot_us)
 
 
 def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
-    """Nothing but a push towards the ground while disarmed."""
-    yaw, o = px4.motion.yaw, px4.motion
+    """While disarmed, only a downward thrust."""
+    motion = px4.motion
+    yaw = motion.yaw
     if not px4.is_armed:
         nan = math.nan
         return m.PositionTargetLocalNed(
             px4.time_boot_ms, 1, 63, nan, nan, nan, nan, nan, nan, 0.0, 0.0, 100.0, yaw, 0.0
         )
-    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    acceleration = (o.acceleration_north, o.acceleration_east, o.acceleration_down)
+    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
+    acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
     return m.PositionTargetLocalNed(
-        px4.time_boot_ms, 1, 0, *px4.flight.target, *velocity, *acceleration, yaw, o.yaw_rate
+        px4.time_boot_ms, 1, 0, *px4.flight.target, *velocity, *acceleration, yaw, motion.yaw_rate
     )
 
 
@@ -297,7 +270,7 @@ def _system_time(px4: Px4Vehicle) -> m.SystemTime:
 
 
 def _current_mode(px4: Px4Vehicle) -> m.CurrentMode:
-    return m.CurrentMode(_STANDARD.get(px4.mode, 0), custom_mode(px4.mode), custom_mode(px4.intended_mode))
+    return m.CurrentMode(_STANDARD.get(px4.mode, 0), modes.custom_mode(px4.mode), modes.custom_mode(px4.intended_mode))
 
 
 def _ping(px4: Px4Vehicle) -> m.Ping:
@@ -305,24 +278,22 @@ def _ping(px4: Px4Vehicle) -> m.Ping:
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
-    """AVAILABLE_MODES: PX4 gives no name to a mode that the standard names (RETURN, LAND …)."""
-    listed, count = _LISTED, len(_LISTED) + _EXTERNAL_MODES
+    """Return AVAILABLE_MODES. PX4 names no mode that is a standard mode (RETURN, LAND …)."""
+    listed, count = _AVAILABLE_MODES, len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
     for index, mode in enumerate(listed, start=1):
         number = _STANDARD.get(mode, 0)
-        text = "" if number else KNOWN[mode].name
-        properties = 0 if mode in (ALTITUDE, POSITION) else 3 if mode == TERMINATION else 1
-        messages.append(m.AvailableModes(count, index, number, custom_mode(mode), properties, text))
+        text = "" if number else modes.MODES[mode].name
+        properties = 0 if mode in (modes.ALTITUDE, modes.POSITION) else 3 if mode == modes.TERMINATION else 1
+        messages.append(m.AvailableModes(count, index, number, modes.custom_mode(mode), properties, text))
     for place in range(_EXTERNAL_MODES):
-        mode, index = (AUTO, EXTERNAL_1[1] + place), len(listed) + 1 + place
-        messages.append(m.AvailableModes(count, index, 0, custom_mode(mode), 2, "(Mode not available)"))
+        mode, index = (modes.AUTO, modes.EXTERNAL_1[1] + place), len(listed) + 1 + place
+        messages.append(m.AvailableModes(count, index, 0, modes.custom_mode(mode), 2, "(Mode not available)"))
     return messages
 
 
-GIMBAL_MESSAGES = frozenset(
-    {m.GimbalDeviceAttitudeStatus.ID, m.GimbalManagerInformation.ID, m.GimbalManagerStatus.ID}
-)
-"""Sent by a vehicle that has one."""
+GIMBAL_MESSAGES = frozenset({m.GimbalDeviceAttitudeStatus.ID, m.GimbalManagerInformation.ID, m.GimbalManagerStatus.ID})
+"""Messages of the gimbal."""
 
 BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.Heartbeat.ID: _heartbeat,
@@ -354,4 +325,4 @@ BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.GimbalManagerInformation.ID: lambda px4: px4.gimbal.manager_information(),
     m.GimbalManagerStatus.ID: lambda px4: px4.gimbal.manager_status(),
 }
-"""Message id → what to send now, or None."""
+"""Message id → builder; a builder returns None if there is nothing to send."""

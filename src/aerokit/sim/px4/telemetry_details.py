@@ -1,4 +1,4 @@
-"""What a simulated PX4 tells of itself and its sensors beside the usual streams."""
+"""Identity and sensor messages of a simulated PX4."""
 
 from __future__ import annotations
 
@@ -30,9 +30,7 @@ def _protocol_version(_: Px4Vehicle) -> m.ProtocolVersion:
 
 def _storage_information(px4: Px4Vehicle) -> m.StorageInformation:
     free = _CAPACITY_MIB - _USED_MIB
-    return m.StorageInformation(
-        px4.time_boot_ms, 1, 1, StorageStatus.READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0
-    )
+    return m.StorageInformation(px4.time_boot_ms, 1, 1, StorageStatus.READY, _CAPACITY_MIB, _USED_MIB, free, 0.0, 0.0)
 
 
 def _flight_information(px4: Px4Vehicle) -> m.FlightInformation:
@@ -50,23 +48,23 @@ def _mag_cal_report(_: Px4Vehicle) -> m.MagCalReport:
 
 
 _REMOTE_ID_EPOCH = 1_546_300_800
-_ANYONE = bytes(20)
+_BROADCAST_ID = bytes(20)
 
 
 def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
     if not px4.has_position:
         return None
-    o = px4.motion
-    place = px4.frame.to_global(o.north, o.east, o.down)
-    course = round(math.degrees(math.atan2(o.velocity_east, o.velocity_north)) % 360.0) % 360 * 100
+    motion = px4.motion
+    place = px4.frame.to_global(motion.north, motion.east, motion.down)
+    course = round(math.degrees(math.atan2(motion.velocity_east, motion.velocity_north)) % 360.0) % 360 * 100
     return m.OpenDroneIdLocation(
         0,
         0,
-        _ANYONE,
+        _BROADCAST_ID,
         1 if px4.is_landed else 2,
         course,
-        round(o.ground_speed_m_s * 100),
-        round(-o.velocity_down * 100),
+        round(motion.ground_speed_m_s * 100),
+        round(-motion.velocity_down * 100),
         place.latitude_e7,
         place.longitude_e7,
         place.altitude_m,
@@ -90,7 +88,7 @@ def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
     return m.OpenDroneIdSystem(
         0,
         0,
-        _ANYONE,
+        _BROADCAST_ID,
         0,
         0,
         home.latitude_e7,
@@ -116,7 +114,7 @@ IDENTITY_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.ProtocolVersion.ID: _protocol_version,
     m.ComponentMetadata.ID: _component_metadata,
 }
-"""Message id → what to send now, or None."""
+"""Message id → builder; a builder returns None if there is nothing to send."""
 
 
 _SEA_LEVEL_HPA, _SEA_LEVEL_C, _LAPSE_C_PER_M = 1013.25, 15.0, 0.0065
@@ -148,15 +146,19 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 
 
 def _body(px4: Px4Vehicle) -> tuple[float, float, float]:
-    """What the accelerometer feels, in m/s² forward, right, down."""
-    o = px4.motion
-    north, east, down = o.acceleration_north, o.acceleration_east, o.acceleration_down - GRAVITY_M_S2
-    cos_yaw, sin_yaw = math.cos(o.yaw), math.sin(o.yaw)
+    """Return the measured acceleration in m/s² forward, right, down."""
+    motion = px4.motion
+    north, east, down = (
+        motion.acceleration_north,
+        motion.acceleration_east,
+        motion.acceleration_down - GRAVITY_M_S2,
+    )
+    cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
     forward, right = north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw
     return (
-        forward * math.cos(o.pitch) - down * math.sin(o.pitch),
-        right * math.cos(o.roll) + down * math.sin(o.roll),
-        down * math.cos(o.roll) * math.cos(o.pitch),
+        forward * math.cos(motion.pitch) - down * math.sin(motion.pitch),
+        right * math.cos(motion.roll) + down * math.sin(motion.roll),
+        down * math.cos(motion.roll) * math.cos(motion.pitch),
     )
 
 
@@ -166,8 +168,8 @@ def _field(px4: Px4Vehicle) -> tuple[float, float, float]:
 
 
 def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
-    o, height = px4.motion, _height(px4)
-    rates = (o.roll_rate, o.pitch_rate, o.yaw_rate)
+    motion, height = px4.motion, _height(px4)
+    rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     pressure = _pressure_hpa(px4)
     return m.HighresImu(
         px4.time_boot_us, *_body(px4), *rates, *_field(px4), pressure, 0.0, height, _SEA_LEVEL_C, _IMU_FIELDS
@@ -175,9 +177,9 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
-    o = px4.motion
+    motion = px4.motion
     force_x, force_y, force_z = (round(part / GRAVITY_M_S2 * 1000) for part in _body(px4))
-    rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (o.roll_rate, o.pitch_rate, o.yaw_rate))
+    rate_x, rate_y, rate_z = (round(rate * 1000) for rate in (motion.roll_rate, motion.pitch_rate, motion.yaw_rate))
     field_x, field_y, field_z = (round(part * 1000) for part in _field(px4))
     time = px4.time_boot_ms
     return m.ScaledImu(
@@ -186,17 +188,17 @@ def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
 
 
 def _odometry(px4: Px4Vehicle) -> m.Odometry:
-    o = px4.motion
-    q = quaternion_from_euler(o.roll, o.pitch, o.yaw)
-    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    rates = (o.roll_rate, o.pitch_rate, o.yaw_rate)
+    motion = px4.motion
+    q = quaternion_from_euler(motion.roll, motion.pitch, motion.yaw)
+    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
+    rates = (motion.roll_rate, motion.pitch_rate, motion.yaw_rate)
     return m.Odometry(
         px4.time_boot_us,
         1,
         1,
-        o.north,
-        o.east,
-        o.down,
+        motion.north,
+        motion.east,
+        motion.down,
         q,
         *velocity,
         *rates,
@@ -209,7 +211,7 @@ def _odometry(px4: Px4Vehicle) -> m.Odometry:
 
 
 def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
-    """Only while RC_CHANNELS_OVERRIDE comes: there is no receiver."""
+    """Only while RC_CHANNELS_OVERRIDE is received, because there is no receiver."""
     if not px4.sticks.has_channels:
         return None
     channels = px4.sticks.channels
@@ -234,26 +236,14 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
     """Only while armed."""
     if not px4.is_armed or not px4.has_position:
         return None
-    place, o = px4.frame.to_global(*px4.flight.target), px4.motion
-    velocity = (o.velocity_north, o.velocity_east, o.velocity_down)
-    return m.PositionTargetGlobalInt(
-        px4.time_boot_ms,
-        5,
-        0,
-        place.latitude_e7,
-        place.longitude_e7,
-        place.altitude_m,
-        *velocity,
-        0.0,
-        0.0,
-        0.0,
-        o.yaw,
-        o.yaw_rate,
-    )
+    place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
+    velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
+    rates = (motion.yaw, motion.yaw_rate)
+    return m.PositionTargetGlobalInt(px4.time_boot_ms, 5, 0, *place, *velocity, 0.0, 0.0, 0.0, *rates)
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
-    """Only the return is estimated: up or down to its height, back, down."""
+    """Only the return is estimated: change of height, flight home, descent."""
     if px4.is_landed:
         return m.TimeEstimateToTarget(-1, -1, -1, -1, -1)
     motion, flight = px4.motion, px4.flight
@@ -285,4 +275,4 @@ SENSOR_BUILDERS: dict[int, Callable[[Px4Vehicle], Message | None]] = {
     m.TimeEstimateToTarget.ID: _time_estimate,
     m.OrbitExecutionStatus.ID: _orbit_status,
 }
-"""Message id → what to send now, or None."""
+"""Message id → builder; a builder returns None if there is nothing to send."""

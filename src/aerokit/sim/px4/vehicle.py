@@ -1,40 +1,49 @@
-"""`SimulatedPx4`: a PX4 quadrotor, for the paths of a client that differ from ArduPilot's."""
+"""`SimulatedPx4` and `SimulatedPx4Plane`."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import ClassVar
+
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavType
 from aerokit.mavlink.message import Message
+from aerokit.missions import MissionItem
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import Command, CommandHandler
+from aerokit.sim.commands import CommandHandler, ReceivedCommand
+from aerokit.sim.motion import Motion, Ned, SimulatedWind
+from aerokit.sim.px4 import modes
 from aerokit.sim.px4.base import Px4Vehicle
 from aerokit.sim.px4.commands import px4_commands, refusal_by_place, set_mode
-from aerokit.sim.px4.modes import mode_from_custom
+from aerokit.sim.px4.flight import Px4Flight
+from aerokit.sim.px4.mission import Px4Mission
+from aerokit.sim.px4.modes import Px4Mode
 from aerokit.sim.px4.telemetry import BUILDERS, GIMBAL_MESSAGES
 from aerokit.sim.vehicle import sender_of
+from aerokit.sim.vehicle_motion import FixedWing, WingLimits
 
 
 class SimulatedPx4(Px4Vehicle):
-    """Speaks as PX4 v1.16/v1.17 does where a client can see it; flies as `Motion` does.
+    """A PX4 v1.16 or v1.17 multicopter as clients see it; it flies as `Motion` does.
 
     Simulated: arming and its denial, every mode with its double acknowledgement, take-off to an AMSL altitude, hold,
-    reposition, orbit, land, return to home or a rally point, sticks (MANUAL_CONTROL), offboard with its time-out and
-    failsafe, flight termination, calibration, streams without being asked and at the rates of the link's mode, every
-    message that the real one sends on request, heartbeats only once a second, chunked texts with a tab at the end, the
-    events of those texts, bytewise parameters with _HASH_CHECK, commands of its own to component 0, pings to
-    everybody, the failsafes of battery, ground station, manual control and geofence.
-    Not simulated: REQUEST_EVENT, returning by way of a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
-    follow-me, modes of a companion; the camera is a component of its own, and without it nobody answers. MNT_MODE_IN 4
-    fits a gimbal.
+    reposition, orbit, land, return to home or a rally point, sticks (MANUAL_CONTROL), offboard with time-out and
+    failsafe, flight termination, calibration, default streams at the rates of the link mode, every message that the
+    real one sends on request, heartbeats at 1 Hz, chunked texts that end in a tab, their events, bytewise parameters
+    with _HASH_CHECK, its own commands to component 0, broadcast pings, failsafes of battery, ground station, manual
+    control and geofence. Not simulated: REQUEST_EVENT, returning along a mission (RTL_TYPE 2), estimator failures
+    other than a lost GPS, follow-me, external modes. A camera is a separate component; without one its commands are
+    not answered. MNT_MODE_IN 4 enables a gimbal.
 
-    - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: where its nose points
+    - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
     - ``boot_time_s``: seconds until it can be armed
-    - ``version``: 1.16 accepts unknown modes and falls back to POSITION when offboard set-points stop, 1.17 refuses
-      them and returns, and refuses a COMMAND_INT in another frame than GLOBAL_INT
-    - ``fast_rate_hz``: rate of attitude, position and targets on links of mode "normal"
-    - ``link_modes``: of the first link, the second …: "normal", "onboard", "config" or "minimal", as MAV_0_MODE says
-    - ``parameters``: values other than the defaults; ``parameter_count``: fewer than all 910, for quick tests;
-      ``parameter_file``, ``link_bytes_per_s``: see `Storage`; ``logs``: what flights have left
+    - ``version``: 1.16 accepts unknown modes and switches to POSITION when offboard set-points stop; 1.17 refuses
+      them, returns, and refuses a COMMAND_INT in a frame other than GLOBAL_INT
+    - ``fast_rate_hz``: rate of attitude, position and targets on "normal" links
+    - ``link_modes``: MAV_n_MODE of the first link, the second …: "normal", "onboard", "config" or "minimal"
+    - ``parameters``: values that differ from the defaults; ``parameter_count``: fewer than all 910, for quick tests;
+      ``parameter_file``, ``link_bytes_per_s``: see `Px4Storage`; ``logs``: logs of earlier flights
     - ``signing_key``: see `Px4Signing`
     """
 
@@ -43,21 +52,306 @@ class SimulatedPx4(Px4Vehicle):
         return px4_commands(self)
 
     def can_build(self, message_id: int) -> bool:
-        """Those of a gimbal only with one."""
+        """Return True if there is a builder of this message; gimbal messages need a gimbal."""
         return message_id in BUILDERS and (message_id not in GIMBAL_MESSAGES or self.gimbal.is_fitted)
 
     def build(self, message_id: int) -> Message | None:
-        """What is to be streamed now."""
+        """Return the current message of this id; None if there is none."""
         builder = BUILDERS.get(message_id)
         return None if builder is None else builder(self)
 
-    def refusal_of_command(self, command: Command) -> int | None:
-        """Of frames; and of NaN sent as an integer, or "ignore" as a number (mavlink_receiver.cpp)."""
+    def refusal_of_command(self, command: ReceivedCommand) -> int | None:
+        """Refuse frames, a NaN sent as integer, and INT32_MAX sent as float (mavlink_receiver.cpp)."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
-        main, sub = mode_from_custom(request.custom_mode)
-        command = Command(
+        main, sub = modes.mode_from_custom(request.custom_mode)
+        command = ReceivedCommand(
             MavCmd.DO_SET_MODE, request.base_mode, main, sub, 0, 0, 0, 0, None, channel, sender_of(request)
         )
         self.commands.answer(command, set_mode(self, request.base_mode, (main, sub)))
+
+
+_FLARE_M = 3.0
+_AHEAD_S = 2.5
+_FLARE_SINK_M_S = 0.5
+_HEIGHT_REACHED_M = 10.0
+
+
+class Px4PlaneFlight(Px4Flight):
+    """Navigator of a plane. ``target`` is the centre of a circle, or the end of a straight line."""
+
+    def __init__(self, plane: SimulatedPx4Plane, motion: FixedWing) -> None:
+        super().__init__(plane)
+        self._motion = motion
+        self.radius_m: float = 0.0  # Radius of the circle; negative is counter-clockwise.
+        self.course: float = 0.0  # Course of the climb-out in radians.
+        self._plane = plane
+
+    @property
+    def cruise_speed_m_s(self) -> float:
+        return self._plane.parameters["FW_AIRSPD_TRIM"]
+
+    @property
+    def top_speed_m_s(self) -> float:
+        return self._plane.parameters["FW_AIRSPD_MAX"]
+
+    @property
+    def is_rolling(self) -> bool:
+        return self.lifts_off and self._plane.now - self._plane.arming.since >= self._plane.parameters["RWTO_RAMP_TIME"]
+
+    def enter(self, mode: Px4Mode) -> None:
+        self.radius_m = self._plane.parameters["NAV_LOITER_RAD"]
+        self.course = self._motion.yaw
+        super().enter(mode)
+
+    def update(self) -> None:
+        """Set the target of the motion for the next tick."""
+        plane = self._plane
+        mode, mission = plane.mode, plane.mission
+        self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)
+        if plane.is_landed and not self.is_rolling:
+            return
+        if plane.is_landed and not self._motion.is_on_ground:
+            plane.leave_ground()
+        if mode == modes.TAKEOFF:
+            self._take_off()
+        elif mode == modes.LAND:
+            self.circle_down()
+        elif mode == modes.RTL:
+            self._return()
+        elif mode == modes.MISSION:
+            mission.update()
+        elif mode == modes.OFFBOARD and math.isfinite(sum(plane.offboard.position)):
+            self.target = plane.offboard.position
+            self.circle()
+        elif mode in modes.STICK_MODES and plane.sticks.are_fresh:
+            self._follow_sticks()
+        else:
+            self.circle()
+
+    def _follow_sticks(self) -> None:
+        """Control bank, climb and airspeed by the sticks in every manual mode; forward is down."""
+        sticks, values = self._plane.sticks, self._plane.parameters
+        climb = -sticks.pitch * values["FW_T_CLMB_MAX" if sticks.pitch < 0 else "FW_T_SINK_MAX"]
+        slowest, fastest = values["FW_AIRSPD_MIN"], values["FW_AIRSPD_MAX"]
+        speed = slowest + (sticks.throttle + 1.0) / 2 * (fastest - slowest)
+        self._motion.bank_and_climb(speed, math.radians(values["FW_R_LIM"]) * sticks.roll, climb)
+        self.stay_here()
+
+    def go(self) -> None:
+        self.circle()
+
+    def circle(self) -> None:
+        self._motion.circle(*self.target, radius=self.radius_m, airspeed=self.speed_m_s)
+
+    def fly_straight(self) -> None:
+        self._motion.fly_to(*self.target, airspeed=self.speed_m_s)
+
+    def climb_out(self) -> None:
+        climb = self._plane.parameters["FW_T_CLMB_MAX"]
+        self._motion.head(self.course, self.speed_m_s, climb)
+
+    def _take_off(self) -> None:
+        """After the climb, circle the point where the altitude was reached."""
+        self.climb_out()
+        if self._motion.down > self.target[2]:
+            return
+        place = (self._motion.north, self._motion.east, self.target[2])
+        self._plane.switch_to_hold()
+        self.target = place
+
+    def circle_down(self) -> None:
+        sink = self._plane.parameters["FW_T_SINK_MIN"]
+        self.target = (*self.target[:2], self._motion.down + sink * _AHEAD_S)
+        self._touch_down(self.circle)
+
+    def descend(self) -> None:
+        """Follow the glide path (FW_LND_ANG) to the target on the ground."""
+        self._touch_down(self._glide)
+
+    def _touch_down(self, approach: Callable[[], None]) -> None:
+        motion = self._motion
+        height = motion.ground_down - motion.down
+        if motion.is_on_ground:
+            motion.roll_out()
+        elif height < _FLARE_M:
+            motion.head(motion.yaw, self._plane.parameters["FW_AIRSPD_MIN"], -_FLARE_SINK_M_S)
+        else:
+            approach()
+
+    def _glide(self) -> None:
+        motion = self._motion
+        away = math.hypot(self.target[0] - motion.north, self.target[1] - motion.east)
+        height = away * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
+        climb = min(0.0, motion.climb_to(motion.ground_down - height))
+        course = math.atan2(self.target[1] - motion.east, self.target[0] - motion.north)
+        motion.head(course, self._plane.parameters["FW_AIRSPD_MIN"] * 1.3, climb)
+
+    def _return(self) -> None:
+        """Climb, fly home, circle down to RTL_DESCEND_ALT; land unless RTL_LAND_DELAY is negative."""
+        motion, plane = self._motion, self._plane
+        if self._phase == "land":
+            self.circle_down()
+            return
+        self.circle()
+        if abs(motion.down - self.target[2]) > _HEIGHT_REACHED_M or not self._is_near():
+            return
+        if self._phase == "climb":
+            self._phase, self.target = "return", (*self.destination[:2], self.target[2])
+        elif self._phase == "return":
+            descend = plane.parameters["RTL_DESCEND_ALT"]
+            self.radius_m = plane.parameters["RTL_LOITER_RAD"]
+            self._phase = "loiter"
+            self.target: Ned = (*self.destination[:2], max(self.target[2], self.destination[2] - descend))
+        elif self._phase == "loiter":
+            self._phase = "done" if plane.parameters["RTL_LAND_DELAY"] < 0 else "land"
+            done = self._phase == "done"
+            plane.info("RTL: completed, loitering" if done else "RTL: land at destination")
+
+    def _is_near(self) -> bool:
+        away = math.hypot(self.target[0] - self._motion.north, self.target[1] - self._motion.east)
+        return away <= abs(self.radius_m) + self._plane.parameters["NAV_ACC_RAD"]
+
+
+_C = MavCmd
+_TAKE_OFFS = (_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF)
+_LANDINGS = (_C.NAV_LAND, _C.NAV_VTOL_LAND)
+_CIRCLES = (_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_LOITER_TO_ALT)
+_TURN_S = 2.0
+
+
+class Px4PlaneMission(Px4Mission):
+    """Mission mode of a plane."""
+
+    def __init__(self, plane: SimulatedPx4Plane) -> None:
+        super().__init__(plane)
+        self._plane = plane
+
+    def _climb(self, down: float | None) -> None:
+        super()._climb(down)
+        self._plane.flight.course = self._plane.motion.yaw
+
+    def _aim(self, item: MissionItem) -> None:
+        super()._aim(item)
+        flight = self._plane.flight
+        radius = {_C.NAV_LOITER_UNLIM: item.param3, _C.NAV_LOITER_TIME: item.param3}.get(
+            MavCmd(item.command), item.param2 if item.command == _C.NAV_LOITER_TO_ALT else 0.0
+        )
+        default = self._plane.parameters["NAV_LOITER_RAD"]
+        flight.radius_m = radius if radius and math.isfinite(radius) else default
+        if item.command in _LANDINGS:
+            self._phase = "land"
+
+    def update(self) -> None:
+        """Run one tick: steer, and check whether the item is reached."""
+        item, flight = self._item, self._plane.flight
+        if item is None or self.is_finished:
+            flight.circle()
+        elif self._phase == "land":
+            flight.descend()
+        elif self._phase == "climb":
+            flight.climb_out()
+            if self._plane.motion.down <= flight.target[2]:
+                self._leave_climb(item)
+        else:
+            self._go(item)
+
+    def _leave_climb(self, item: MissionItem) -> None:
+        if item.command in _TAKE_OFFS:
+            self._pass(item)
+        else:
+            self._phase = "go"
+            self._plane.flight.target = self._place(item)
+
+    def _go(self, item: MissionItem) -> None:
+        flight = self._plane.flight
+        if item.command in _CIRCLES or item.command == _C.NAV_DELAY:
+            flight.circle()
+        else:
+            flight.fly_straight()
+        if not self._is_at_target(item):
+            return
+        if math.isnan(self._arrived_at):
+            self._arrived_at = self._plane.now
+        if self._is_done(item):
+            self._pass(item)
+
+    def _pass(self, item: MissionItem) -> None:
+        self._reach()
+        if item.autocontinue and self._advance():
+            self._begin_item()
+
+    def _is_at_target(self, item: MissionItem) -> bool:
+        if item.command == _C.NAV_DELAY:
+            return True
+        plane, motion = self._plane, self._plane.motion
+        north, east, down = plane.flight.target
+        radius = max(plane.parameters["NAV_ACC_RAD"], item.param2 if item.command == _C.NAV_WAYPOINT else 0.0)
+        radius = max(radius, _TURN_S * motion.airspeed_m_s)
+        if item.command in _CIRCLES:
+            radius += abs(plane.flight.radius_m)
+        near = math.hypot(north - motion.north, east - motion.east) <= radius
+        return near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
+
+    def _hold(self) -> None:
+        """Hold after a mission that ended in flight, as the commander does."""
+        target = self._plane.flight.target
+        super()._hold()
+        if self._plane.mode == modes.HOLD:
+            self._plane.flight.target = target
+
+
+_AMPERES_AT_FULL = 20.0
+
+
+class SimulatedPx4Plane(SimulatedPx4):
+    """A PX4 plane (MAV_TYPE 1, airframe 10041); it flies as `FixedWing` does, see `SimulatedPx4` for the arguments.
+
+    It takes off from a runway along its heading, circles at NAV_LOITER_RAD where a multicopter hovers, returns to a
+    circle above home without landing (RTL_LAND_DELAY is -1), lands in circles (LAND) or on a straight glide path at
+    the end of a mission, and requires a landing in missions that start on the ground (MIS_TKO_LAND_REQ). Armed on
+    the ground it stays armed. It has 978 parameters and an airspeed sensor. Sticks control bank, climb and speed in
+    every manual mode. Not simulated, in addition to `SimulatedPx4`: hand launch, stalls, aborted landings, figures
+    of eight; OFFBOARD circles a position.
+    """
+
+    VEHICLE_TYPE: ClassVar[int] = MavType.FIXED_WING
+    PARAMETER_TABLE: ClassVar[str] = "airplane"
+
+    flight: Px4PlaneFlight  # pyright: ignore[reportIncompatibleVariableOverride]
+    motion: FixedWing  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @property
+    def airspeed_m_s(self) -> float:
+        return self.motion.airspeed_m_s
+
+    def _make_motion(self, wind: SimulatedWind | None) -> Motion:
+        values = self.parameters
+        wing = WingLimits(
+            airspeed_min_m_s=values["FW_AIRSPD_MIN"],
+            airspeed_max_m_s=values["FW_AIRSPD_MAX"],
+            climb_m_s=values["FW_T_CLMB_MAX"],
+            sink_m_s=values["FW_T_SINK_MAX"],
+        )
+        return FixedWing(self.rng, wing, wind)
+
+    def _make_flight(self) -> Px4Flight:
+        return Px4PlaneFlight(self, self.motion)
+
+    def _make_mission(self) -> Px4Mission:
+        return Px4PlaneMission(self)
+
+    def switch_to_hold(self) -> None:
+        """The take-off is complete."""
+        self.switch_to(modes.HOLD)
+
+    def _moves(self) -> bool:
+        return super()._moves() or self.flight.is_rolling
+
+    def _is_down(self) -> bool:
+        return self.motion.is_at_rest
+
+    def _run_motors(self, dt: float) -> None:
+        self.throttle: float = self.motion.throttle if self.is_armed else 0.0
+        self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)

@@ -1,4 +1,4 @@
-"""``zenoh:``: a program that talks with the vehicle behind a name of a zenoh network, as if by radio."""
+"""``zenoh:`` link: a client of the vehicle with a given name on a zenoh network."""
 
 from __future__ import annotations
 
@@ -14,42 +14,52 @@ from typing import Any
 import anyio
 
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.transport.link import HelmListener, Peer
-from aerokit.transport.zenoh.control_lease import Ears, refusals_in
-from aerokit.transport.zenoh.keys import WISHES, Beacon, Place, Told, Wish, check_name, read_sent_at
+from aerokit.transport.link import OrderRefusalListener, Peer
+from aerokit.transport.zenoh.control_lease import VehicleSideTracker, refusals_in
+from aerokit.transport.zenoh.keys import (
+    CONTROL_MODES,
+    Beacon,
+    ControlMode,
+    KeySpace,
+    RefusalNotice,
+    check_name,
+    read_sent_at,
+)
 from aerokit.transport.zenoh.session import (
-    MOST_BYTES,
-    Handover,
+    MAX_PAYLOAD_BYTES,
+    LoopQueue,
     NetworkLink,
     NetworkOptions,
     attachment_of,
+    call,
     open_session,
     payload_of,
 )
 
 OPEN_TIMEOUT_S = 5.0
-"""Seconds that `ZenohConnect.open` waits for the vehicle side by default."""
+"""Default time-out of `ZenohConnect.open`."""
 
 LOST_AFTER_S = 15.0
-"""A vehicle side that was not heard for so long is lost, whatever the network says of it."""
+"""Silence after which the vehicle side counts as lost, even if the network still reports it."""
 
-_LOOK_EVERY_S = 0.25
+_POLL_INTERVAL_S = 0.25
 
 
 class ZenohConnect(NetworkLink):
-    """``zenoh:`` is a client of one vehicle side (`ZenohListen`), which is found by its name.
+    """``zenoh:`` link: a client of one vehicle side (`ZenohListen`), found by its name.
 
-    The vehicle side's end is a lost link, and so is its silence once the network has noticed it, or for `LOST_AFTER_S`.
-    What is written while its beacons do not come is dropped: an order is never late (docs/network.md).
+    The link is lost when the vehicle side closes, when it is silent and the network reports it gone, or after
+    `LOST_AFTER_S` of silence. Data written while beacons are missing is dropped, so that no command arrives late
+    (docs/network.md).
 
     Args:
-        fleet: its name, up to 63 letters, digits, ``_``, ``.`` and ``-``.
-        name: of the vehicle side in the fleet.
-        options: how this program is connected to the network.
-        client: who this program is, unlike all others on the network; "": the name of this computer and a number.
-        wish: "free": it has the helm when it orders and nobody else has it; "take": it takes it once it is open;
-            "never": nothing but questions is let through.
-        open_timeout_s: seconds that opening waits for the vehicle side, above 0.
+        fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
+        name: name of the vehicle side in the fleet.
+        options: connection to the network.
+        client: name of this program, unique on the network; "": the name of this computer and a number.
+        control: "free": acquire control with the first command while it is free; "take": take control when the link
+            opens; "never": read only.
+        open_timeout_s: time-out for finding the vehicle side, above 0.
 
     Raises:
         InvalidArgument: an argument is wrong.
@@ -62,170 +72,162 @@ class ZenohConnect(NetworkLink):
         *,
         options: NetworkOptions | None = None,
         client: str = "",
-        wish: Wish = "free",
+        control: ControlMode = "free",
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
         super().__init__(f"zenoh://{check_name('fleet', fleet)}/{check_name('name', name)}")
-        if wish not in WISHES:
-            raise InvalidArgument(f"helm = {wish!r} is not allowed: {', '.join(WISHES)}")
+        if control not in CONTROL_MODES:
+            raise InvalidArgument(f"control = {control!r} is not allowed: {', '.join(CONTROL_MODES)}")
         self.client: str = check_name("client", client or _own_name())
-        """Who we are, to the others: the name that has the helm."""
-        self._place = Place(fleet, name)
+        """Name of this client on the network."""
+        self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        self._wants_helm = wish == "take"
-        self._ears = Ears(random.getrandbits(32), "never" if wish == "never" else "free")
-        self._alive: set[str] = set()  # keys of vehicle sides that the network knows
+        self._takes_control = control == "take"
+        self._tracker = VehicleSideTracker(random.getrandbits(32), "never" if control == "never" else "free")
+        self._alive: set[str] = set()  # keys of vehicle sides that the network reports
         self._publisher: Any = None
         self._first_beacon = asyncio.Event()
 
     @property
-    def helm(self) -> str | None:
-        """Who has the helm, as the vehicle side told last; None: nobody."""
-        return self._ears.helm
+    def lease_holder(self) -> str | None:
+        """Client that has control, as last reported by the vehicle side; None: free."""
+        return self._tracker.lease_holder
 
     @property
     def late_frames(self) -> int:
-        """Datagrams and beacons of the vehicle side that came more than 2 s late, and were not listened to."""
-        return self._ears.late
+        """Datagrams and beacons dropped because they arrived more than 2 s late."""
+        return self._tracker.late
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; drops what could not be proven to be from now."""
+        """See `Link.write`. Drops data while beacons are missing."""
         if self._publisher is not None:
-            self._put(bytes(data), self._wish_now())
+            self._put(bytes(data), self._mode_now())
 
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
         self._first_beacon.clear()
-        self._handover = Handover(_call)
+        self._queue = LoopQueue(call)
         with anyio.move_on_after(self._open_timeout_s):
-            self._session = await open_session(
-                self.address, self._options, partial(self._declare, self._handover)
-            )
+            self._session = await open_session(self.address, self._options, partial(self._declare, self._queue))
             self._released.clear()
             await self._first_beacon.wait()
-            self._look_later()
+            self._schedule_poll()
             return
         if self._session is None:
             raise LinkOpenError(f"cannot open {self.address}: no network within {self._open_timeout_s:g} s")
-        raise LinkOpenError(f"cannot open {self.address}: {self._who_is_there()}")
+        raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
-    def _declare(self, handover: Handover[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        """On a thread, as are the callbacks."""
-
-        def hear(take: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
-            def called(sample: Any) -> None:
+    def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
+        # Runs on a thread, as do the callbacks.
+        def callback(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
+            def on_sample(sample: Any) -> None:
                 is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
-                if len(payload) <= MOST_BYTES:
-                    handover.post(partial(take, payload, attachment_of(sample), is_put))
+                if len(payload) <= MAX_PAYLOAD_BYTES:
+                    queue.post(partial(process, payload, attachment_of(sample), is_put))
 
-            return called
+            return on_sample
 
-        def hear_alive(sample: Any) -> None:
+        def on_liveliness(sample: Any) -> None:
             is_put = sample.kind == zenoh.SampleKind.PUT
-            handover.post(partial(self._hear_alive, str(sample.key_expr), is_put))
+            queue.post(partial(self._on_liveliness, str(sample.key_expr), is_put))
 
-        place, client = self._place, self.client
-        frames, liveliness = hear(self._hear_frames), session.liveliness()
+        keys, client = self._keys, self.client
+        frames, liveliness = callback(self._on_frames), session.liveliness()
         self._declared = [
-            session.declare_subscriber(place.everybody, frames),
-            session.declare_subscriber(place.from_vehicle(client), frames),
-            session.declare_subscriber(place.told(client), hear(self._hear_told)),
-            session.declare_subscriber(place.beacon, hear(self._hear_beacon)),
-            # all of the fleet: for the text of the error when the name is not there
-            liveliness.declare_subscriber(Place(place.fleet, "*").alive(), hear_alive, history=True),
-            liveliness.declare_token(place.client(client)),
+            session.declare_subscriber(keys.to_all_clients, frames),
+            session.declare_subscriber(keys.from_vehicle(client), frames),
+            session.declare_subscriber(keys.notices(client), callback(self._on_notice)),
+            session.declare_subscriber(keys.beacon, callback(self._on_beacon)),
+            # The whole fleet, for the error text if the name does not exist.
+            liveliness.declare_subscriber(KeySpace(keys.fleet, "*").alive(), on_liveliness, history=True),
+            liveliness.declare_token(keys.client(client)),
         ]
         self._publisher = session.declare_publisher(
-            place.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP
+            keys.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP
         )
 
-    def _leave(self, session: Any) -> None:
+    def _on_release(self, session: Any) -> None:
         self._publisher = None
 
-    # ---------------------------------------------------------------------------------- what comes in
+    # ---------------------------------------------------------------------------------- receiving
 
-    def _hear_frames(self, data: bytes, attachment: bytes, _is_put: bool) -> None:
+    def _on_frames(self, data: bytes, attachment: bytes, _is_put: bool) -> None:
         sent = read_sent_at(attachment)
-        if sent is not None and self._ears.hears(*sent, self._now()):
+        if sent is not None and self._tracker.accepts(*sent, self._now()):
             self._deliver(data)
 
-    def _hear_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
+    def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
         if not is_put:
             sent = read_sent_at(attachment)
-            if sent is not None and sent[0] == self._ears.epoch:
-                self._ears.forget()
+            if sent is not None and sent[0] == self._tracker.epoch:
+                self._tracker.reset()
                 self._lose("the vehicle side was closed")
             return
         beacon = Beacon.decode(data)
-        if beacon is None or not self._ears.hear_beacon(beacon, self._now()):
+        if beacon is None or not self._tracker.receive_beacon(beacon, self._now()):
             return
         self._first_beacon.set()
-        if self._wants_helm:
-            self._wants_helm = beacon.helm != self.client
-            self._put(b"", self._wish_now())
+        if self._takes_control:
+            self._takes_control = beacon.lease_holder != self.client
+            self._put(b"", self._mode_now())
 
-    def _hear_told(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
-        told = Told.decode(data)
-        if told is None:
+    def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
+        notice = RefusalNotice.decode(data)
+        if notice is None:
             return
-        self._drop(told.count)
-        if isinstance(self._receiver, HelmListener):
-            self._receiver.order_refused(told.message, told.reason, told.helm, refusals_in(told.answer))
+        self._drop(notice.count)
+        if isinstance(self._receiver, OrderRefusalListener):
+            answers = refusals_in(notice.answer)
+            self._receiver.order_refused(notice.message, notice.reason, notice.lease_holder, answers)
 
-    def _hear_alive(self, key: str, is_alive: bool) -> None:
+    def _on_liveliness(self, key: str, is_alive: bool) -> None:
         (self._alive.add if is_alive else self._alive.discard)(key)
 
-    # ---------------------------------------------------------------------------------- what goes out
+    # ---------------------------------------------------------------------------------- sending
 
-    def _wish_now(self) -> Wish | None:
-        return "take" if self._wants_helm else None
+    def _mode_now(self) -> ControlMode | None:
+        return "take" if self._takes_control else None
 
-    def _put(self, data: bytes, wish: Wish | None) -> None:
-        stamp = self._ears.stamp(self._now(), wish)
+    def _put(self, data: bytes, mode: ControlMode | None) -> None:
+        stamp = self._tracker.stamp(self._now(), mode)
         if stamp is None:
             self._drop(1)
             return
         try:
             self._publisher.put(data, attachment=stamp.encode())
-        except Exception:  # zenoh's own: the session has ended
+        except Exception:  # of zenoh: the session has ended
             self._drop(1)
 
-    # ---------------------------------------------------------------------------------- is it there?
+    # ---------------------------------------------------------------------------------- supervision
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
 
-    def _look_later(self) -> None:
-        self._timer = asyncio.get_running_loop().call_later(_LOOK_EVERY_S, self._look)
+    def _schedule_poll(self) -> None:
+        self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll)
 
-    def _look(self) -> None:
-        ears, now = self._ears, self._now()
-        if ears.epoch is not None and ears.is_silent(now):
-            if self._place.alive(ears.epoch) not in self._alive:
-                self._lose("the vehicle side has gone")
+    def _poll(self) -> None:
+        tracker, now = self._tracker, self._now()
+        if tracker.epoch is not None and tracker.is_silent(now):
+            if self._keys.alive(tracker.epoch) not in self._alive:
+                self._lose("the vehicle side has left the network")
                 return
-            if now - ears.heard_at > LOST_AFTER_S:
-                self._lose(f"nothing has come from the vehicle side for {LOST_AFTER_S:g} s")
+            if now - tracker.received_at > LOST_AFTER_S:
+                self._lose(f"nothing was received from the vehicle side for {LOST_AFTER_S:g} s")
                 return
-        self._look_later()
+        self._schedule_poll()
 
-    def _who_is_there(self) -> str:
+    def _describe_missing(self) -> str:
         names = sorted({key.split("/")[2] for key in self._alive})
-        place = self._place
-        if place.name in names:
-            return (
-                f"{place.name} is on the network, but nothing was heard of it for {self._open_timeout_s:g} s"
-            )
-        others = f" (there are: {', '.join(names)})" if names else " (nobody else either)"
-        return f"nobody is called {place.name} in the fleet {place.fleet}{others}"
+        keys = self._keys
+        if keys.name in names:
+            return f"{keys.name} is on the network, but sent nothing for {self._open_timeout_s:g} s"
+        others = f" (available: {', '.join(names)})" if names else " (the fleet is empty)"
+        return f"no vehicle side named {keys.name} in the fleet {keys.fleet}{others}"
 
 
 def _own_name() -> str:
     host = re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()).strip("-_")[:40] or "client"
     return f"{host}-{os.getpid()}-{random.getrandbits(16):04x}"
-
-
-def _call(what: Callable[[], object]) -> object:
-    return what()

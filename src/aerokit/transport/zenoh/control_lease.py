@@ -1,12 +1,9 @@
-"""Who may order the vehicle when several programs can reach it: one has the helm, the others are told.
+"""Control of a vehicle that several programs can reach: freshness of datagrams, and the control lease. Sans-IO.
 
-Sans-IO; time is an argument.
+The vehicle side sends numbered beacons. A client stamps each datagram with the number of the last beacon that it
+received, so the vehicle side knows the maximum age. Data delayed by a broken connection has an old number.
 
-The vehicle side sends beacons, numbered; a client stamps each datagram with the last one that it has heard. So the
-datagram is not older than that beacon, and how old the beacon is the vehicle side knows. What a broken connection kept
-back bears an old number, whenever it comes.
-
-Time is an argument, seconds on any clock that does not go back.
+Times are seconds on any monotonic clock.
 """
 
 from __future__ import annotations
@@ -27,18 +24,19 @@ from aerokit.mavlink.messages import (
     MissionAck,
     Statustext,
 )
-from aerokit.transport.zenoh.keys import Beacon, Stamp, Told, Wish
+from aerokit.transport.zenoh.keys import Beacon, ControlMode, RefusalNotice, Stamp
 
 if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
 
-HELM_KEPT_S = 5.0
-"""Who has not been heard for so long has the helm no more."""
+LEASE_TIMEOUT_S = 5.0
+"""Silence of the holder after which the control lease is free."""
 
-TELL_EVERY_S = 0.5
-"""A client is told so often of messages of one kind that were refused (set-points come 20 times a second)."""
+NOTICE_INTERVAL_S = 0.5
+"""Minimum interval of notices about refused messages of one kind; set-points come 20 times a second."""
 
+# Messages without effect on the vehicle other than on streams. Any client may send them.
 READ_MESSAGES = frozenset(
     (
         "Heartbeat", "SystemTime", "Timesync", "Ping", "Statustext", "CommandAck", "MessageInterval", "LoggingAck",
@@ -48,8 +46,8 @@ READ_MESSAGES = frozenset(
         "DeviceOpRead",
     )
 )  # fmt: skip
-"""What anybody may send: it asks, or says something of its sender, and changes nothing but streams."""
 
+# The same for commands.
 READ_COMMANDS = frozenset(
     (
         MavCmd.REQUEST_MESSAGE, MavCmd.SET_MESSAGE_INTERVAL, MavCmd.GET_MESSAGE_INTERVAL, MavCmd.GET_HOME_POSITION,
@@ -59,34 +57,33 @@ READ_COMMANDS = frozenset(
         MavCmd.REQUEST_VIDEO_STREAM_INFORMATION, MavCmd.REQUEST_VIDEO_STREAM_STATUS,
     )
 )  # fmt: skip
-"""So do these commands."""
 
+# The same for MAVFTP operations.
 READ_FILES = frozenset(
     (
         MavFtpOpcode.NONE, MavFtpOpcode.TERMINATESESSION, MavFtpOpcode.RESETSESSION, MavFtpOpcode.LISTDIRECTORY,
         MavFtpOpcode.OPENFILERO, MavFtpOpcode.READFILE, MavFtpOpcode.CALCFILECRC, MavFtpOpcode.BURSTREADFILE,
     )
 )  # fmt: skip
-"""And these operations of MAVFTP."""
 
 _OPCODE_AT = 3  # https://mavlink.io/en/services/ftp.html#payload
 
-_SAYS = "network: "
+_TEXT_PREFIX = "network: "
 
-_LONGEST_TEXT = 50
+_MAX_TEXT_LENGTH = 50  # of STATUSTEXT
 
-_MOST_KINDS = 64
+_MAX_KINDS = 64
 
 _READ_IDS = frozenset(message_id for message_id, row in INDEX.items() if row[0] in READ_MESSAGES)
 
 COMMANDS = ("COMMAND_LONG", "COMMAND_INT")
 
-_PLANS = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
+_MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_LIST")
 
 
 def is_read(frame: Frame) -> bool:
-    """Whether anybody may send it; what is not known is an order."""
-    if frame.message_id in _READ_IDS:  # without decoding it: most are
+    """Return True if any client may send this frame. Unknown messages count as commands."""
+    if frame.message_id in _READ_IDS:  # the common case, without decoding
         return True
     if frame.message_id in (CommandLong.ID, CommandInt.ID):
         return getattr(_decoded(frame), "command", 0) in READ_COMMANDS
@@ -97,7 +94,7 @@ def is_read(frame: Frame) -> bool:
 
 
 def refusals_in(answer: bytes) -> tuple[bytes, ...]:
-    """The frames of an answer by which an order is refused; others have no business there."""
+    """Return the frames of an answer that reject a command; all others are ignored."""
     return tuple(frame.raw for frame in Framer().receive(answer) if _is_refusal(_decoded(frame)))
 
 
@@ -105,136 +102,130 @@ def _is_refusal(message: Message | None) -> bool:
     if isinstance(message, CommandAck):
         return message.result == MavResult.TEMPORARILY_REJECTED
     if isinstance(message, Statustext):
-        return message.text.startswith(_SAYS)
+        return message.text.startswith(_TEXT_PREFIX)
     return isinstance(message, MissionAck) and message.type == MavMissionResult.DENIED
 
 
-class Helm:
-    """Which client may order. Whoever orders first has it while it is free, and keeps it while it is heard.
+class ControlLease:
+    """The right of one client to command the vehicle.
 
-    It is free again when its holder has gone, or was not heard for `HELM_KEPT_S`; who takes it has it at once.
+    A client acquires a free lease with its first command, and holds it until it leaves or is silent for
+    `LEASE_TIMEOUT_S`. :meth:`take` acquires it in any case.
     """
 
     def __init__(self) -> None:
         self._holder: str | None = None
-        self._heard_at = 0.0
+        self._received_at = 0.0
 
     def holder(self, now: float) -> str | None:
-        """The client that has it; None: it is free."""
-        if self._holder is not None and now - self._heard_at > HELM_KEPT_S:
+        if self._holder is not None and now - self._received_at > LEASE_TIMEOUT_S:
             self._holder = None
         return self._holder
 
-    def hear(self, client: str, now: float) -> None:
-        """A client is there: something from now came of it."""
+    def record_activity(self, client: str, now: float) -> None:
         if self.holder(now) == client:
-            self._heard_at = now
+            self._received_at = now
 
-    def may_order(self, client: str, now: float) -> bool:
-        """Whether this client has it; it has when it was free."""
+    def acquire(self, client: str, now: float) -> bool:
+        """Acquire the lease if it is free. Return True if the client holds it."""
         if self.holder(now) is None:
             self.take(client, now)
         return self._holder == client
 
     def take(self, client: str, now: float) -> None:
-        """Give it to this client, whoever has it."""
-        self._holder, self._heard_at = client, now
+        """Give the lease to this client, even if another one holds it."""
+        self._holder, self._received_at = client, now
 
-    def leave(self, client: str) -> None:
-        """A client has gone, or wants it no more."""
+    def release(self, client: str) -> None:
         if self._holder == client:
             self._holder = None
 
 
-class Gate:
-    """What one client sends: whole frames that it may send pass, of the others it is told."""
+class ClientFilter:
+    """Passes the frames that one client may send, and makes notices of the others."""
 
-    heard_at: float
-
-    refused: int
-
-    def __init__(self, client: str, helm: Helm) -> None:
-        self.refused = 0
-        """Frames that did not pass."""
-        self.heard_at = 0.0
-        """When its owner heard something of the client."""
-        self._client, self._helm = client, helm
+    def __init__(self, client: str, lease: ControlLease) -> None:
+        self.refused: int = 0
+        """Number of refused frames."""
+        self.received_at: float = 0.0
+        """Time of the last data of the client; set by the owner."""
+        self._client, self._lease = client, lease
         self._framer = _framer()
-        self._nonce: int | None = None  # of the program that orders under this name
+        self._nonce: int | None = None  # of the program that uses this client name
         self._nonce_at = 0.0
-        self._told: dict[str, tuple[float, int]] = {}  # message → when it was told, and how many came since
+        self._notices: dict[str, tuple[float, int]] = {}  # message → time of last notice, refusals since then
 
-    def receive(self, data: bytes, wish: Wish, now: float, nonce: int = 0) -> tuple[bytes, list[Told]]:
-        """Take a datagram that is from now; return what passes, and what the client is to be told.
+    def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
+        """Process a fresh datagram. Return the accepted frames, and the notices for the client.
 
-        ``nonce`` tells programs apart that were given one name by mistake: the first of them is the client.
+        ``nonce`` distinguishes programs that use the same client name by mistake; only the first one gets control.
         """
-        is_namesake = self._is_namesake(nonce, wish, now)
+        is_namesake = self._is_namesake(nonce, mode, now)
         if not is_namesake:
-            self._helm.hear(self._client, now)
-        passed: list[bytes] = []
-        tell: list[Told] = []
+            self._lease.record_activity(self._client, now)
+        accepted: list[bytes] = []
+        notices: list[RefusalNotice] = []
         frames = self._framer.receive(data, now)
-        if self._framer.waiting:  # a datagram has whole frames: what is begun in one does not end in the next
+        if self._framer.waiting:  # datagrams have complete frames: drop a partial one
             self._framer = _framer()
         for frame in frames:
-            may_order = wish != "never" and not is_namesake
-            if is_read(frame) or (may_order and self._helm.may_order(self._client, now)):
-                passed.append(frame.raw)
+            may_control = mode != "never" and not is_namesake
+            if is_read(frame) or (may_control and self._lease.acquire(self._client, now)):
+                accepted.append(frame.raw)
                 continue
-            holder = self._helm.holder(now) if may_order else None
-            reason = "this link never orders (helm=never)" if holder is None else f"{holder} has the helm"
+            holder = self._lease.holder(now) if may_control else None
+            reason = "this link is read-only (control=never)" if holder is None else f"{holder} has control"
             if is_namesake:
-                reason = f"another program is called {self._client}, too"
-            tell += self._refuse(frame, _decoded(frame), reason, holder, now)
-        return b"".join(passed), tell
+                reason = f"another program uses the client name {self._client}"
+            notices += self._refuse(frame, _decoded(frame), reason, holder, now)
+        return b"".join(accepted), notices
 
-    def _is_namesake(self, nonce: int, wish: Wish, now: float) -> bool:
-        """Whether another program of this name was heard lately, and this one does not take the helm."""
-        if self._nonce not in (None, nonce) and wish != "take" and now - self._nonce_at <= HELM_KEPT_S:
+    def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
+        """Return True if another program used this name recently, and this one does not take control."""
+        if self._nonce not in (None, nonce) and mode != "take" and now - self._nonce_at <= LEASE_TIMEOUT_S:
             return True
         self._nonce, self._nonce_at = nonce, now
         return False
 
-    def refuse_late(self, data: bytes, now: float) -> list[Told]:
-        """Take a datagram that is not from now: nothing of it passes; its orders are told.
+    def refuse_late(self, data: bytes, now: float) -> list[RefusalNotice]:
+        """Refuse an outdated datagram. Return notices of its commands.
 
-        Without an answer: whoever waited for one may have given the same order again.
+        They have no answer, because the client may have repeated the command already.
         """
-        tell: list[Told] = []
+        notices: list[RefusalNotice] = []
         for frame in _framer().receive(data, now):
             if is_read(frame):
                 self.refused += 1
             else:
-                tell += self._refuse(frame, _decoded(frame), "it came too late", None, now, is_late=True)
-        return tell
+                notices += self._refuse(frame, _decoded(frame), "it came too late", None, now, is_late=True)
+        return notices
 
     def _refuse(
         self,
         frame: Frame,
         message: Message | None,
         reason: str,
-        helm: str | None,
+        holder: str | None,
         now: float,
         *,
         is_late: bool = False,
-    ) -> list[Told]:
+    ) -> list[RefusalNotice]:
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
-        told_at, waiting = self._told.get(name, (-TELL_EVERY_S, 0))
-        if not answer and now - told_at < TELL_EVERY_S:
-            self._told[name] = (told_at, waiting + 1)
+        noticed_at, waiting = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
+        if not answer and now - noticed_at < NOTICE_INTERVAL_S:
+            self._notices[name] = (noticed_at, waiting + 1)
             return []
-        if len(self._told) >= _MOST_KINDS:
-            self._told.clear()
-        self._told[name] = (now, 0)
-        return [Told(name, reason, helm, answer, waiting + 1)]
+        if len(self._notices) >= _MAX_KINDS:
+            self._notices.clear()
+        self._notices[name] = (now, 0)
+        return [RefusalNotice(name, reason, holder, answer, waiting + 1)]
 
 
 def _framer() -> Framer:
     framer = Framer()
-    framer.keep_unknown = True  # whoever has the helm may send what we do not know
+    framer.keep_unknown = True  # the lease holder may send messages of other dialects
     return framer
 
 
@@ -243,7 +234,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """The frames by which a vehicle would refuse, with the reason; empty where it has none, or the order is for all."""
+    """Return the frames by which a vehicle would reject a message; empty if it has none, or for broadcasts."""
     fields: object = message
     system: int = getattr(fields, "target_system", 0)
     component: int = getattr(fields, "target_component", 0) or 1
@@ -252,54 +243,48 @@ def _answer(frame: Frame, message: Message, reason: str) -> bytes:
         command: int = getattr(fields, "command", 0)
         result = MavResult.TEMPORARILY_REJECTED
         answer = CommandAck(command, result, 0, 0, frame.system_id, frame.component_id)
-    elif message.NAME in _PLANS:
+    elif message.NAME in _MISSION_WRITES:
         kind: int = getattr(fields, "mission_type", 0)
         answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, kind)
     if answer is None or system == 0:
         return b""
-    text = Statustext(MavSeverity.WARNING, f"{_SAYS}{reason}"[:_LONGEST_TEXT])
+    text = Statustext(MavSeverity.WARNING, f"{_TEXT_PREFIX}{reason}"[:_MAX_TEXT_LENGTH])
     encoder = FrameEncoder(system, component)
     return encoder.encode(text) + encoder.encode(answer)
 
 
-BEACON_EVERY_S = 0.5
-"""So often a vehicle side says that it is there."""
+BEACON_INTERVAL_S = 0.5
 
-FRESH_S = 2.0
-"""A datagram whose stamp is older is refused; a client that has heard no beacon for so long sends nothing."""
+MAX_DELAY_S = 2.0
+"""Datagrams with an older stamp are refused. A client that received no beacon for this time sends nothing."""
 
-_MOST_NONCES = 256
+_MAX_NONCES = 256
 
-_DRIFT = 0.001
-"""Two clocks go apart by less than this (a millisecond in a second; quartz is ten times better)."""
+_MAX_DRIFT = 0.001  # relative drift of two clocks; quartz is ten times better
 
 
-class Judge:
-    """The vehicle side: makes beacons, and judges what bears their numbers."""
-
-    doubled: int
-    late: int
+class FreshnessChecker:
+    """The vehicle side: makes beacons, and checks the stamps of received datagrams."""
 
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
-        self.late = 0
-        """Datagrams that were refused because their stamp was too old, or another vehicle side's."""
-        self.doubled = 0
-        """Datagrams that were refused because one like them, or a later one, had come."""
+        self.late: int = 0
+        """Datagrams refused because their stamp was too old, or from another vehicle side."""
+        self.duplicates: int = 0
+        """Datagrams refused because an equal or later one was received before."""
         self._number = 0
-        self._sent: deque[tuple[int, float]] = deque()  # (number, when) of the beacons that still count
+        self._sent: deque[tuple[int, float]] = deque()  # (number, time) of valid beacons
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
 
-    def beacon(self, now: float, helm: str | None = None) -> Beacon:
-        """The next beacon, to be sent at once."""
-        self._forget(now)
+    def beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
+        self._expire(now)
         self._number += 1
         self._sent.append((self._number, now))
-        return Beacon(self.epoch, self._number, now, helm)
+        return Beacon(self.epoch, self._number, now, lease_holder)
 
     def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
-        """Whether what bears this stamp is from now, and did not come before; counts what is not."""
-        self._forget(now)
+        """Return True if a datagram with this stamp is fresh and new. Refused ones are counted."""
+        self._expire(now)
         is_fresh = (
             stamp is not None
             and stamp.epoch == self.epoch
@@ -309,103 +294,97 @@ class Judge:
         if stamp is None or not is_fresh:
             self.late += 1
             return False
-        who = client, stamp.nonce
-        if stamp.sequence <= self._sequences.get(who, 0):
-            self.doubled += 1
+        key = client, stamp.nonce
+        if stamp.sequence <= self._sequences.get(key, 0):
+            self.duplicates += 1
             return False
-        self._sequences[who] = stamp.sequence
-        self._sequences.move_to_end(who)
-        if len(self._sequences) > _MOST_NONCES:
+        self._sequences[key] = stamp.sequence
+        self._sequences.move_to_end(key)
+        if len(self._sequences) > _MAX_NONCES:
             self._sequences.popitem(last=False)
         return True
 
-    def _forget(self, now: float) -> None:
-        while self._sent and now - self._sent[0][1] > FRESH_S:
+    def _expire(self, now: float) -> None:
+        while self._sent and now - self._sent[0][1] > MAX_DELAY_S:
             self._sent.popleft()
 
 
-class Lateness:
-    """How much later than the quickest something comes: the least delay ever seen is taken for no delay.
+class DelayEstimator:
+    """Estimates the delay of received data, relative to the smallest delay so far, which counts as zero.
 
-    The clocks need not agree, only go alike. What was late from the very beginning is not known to be.
+    The clocks need the same rate, not the same time. A constant delay from the start is not detected.
     """
 
     def __init__(self) -> None:
-        self._least: float | None = None  # of our time less the sender's
+        self._min_offset: float | None = None  # our time minus the sender's
         self._at = 0.0
 
-    def of(self, sent_s: float, now: float) -> float:
-        """Seconds, of what was sent then on the sender's clock and came ``now`` on ours."""
-        delay = now - sent_s
-        least = None if self._least is None else self._least + _DRIFT * (now - self._at)
-        if least is None or delay <= least:
-            self._least, self._at = delay, now
+    def delay(self, sent_s: float, now: float) -> float:
+        """Return the delay in seconds of data sent at ``sent_s`` on the sender's clock and received at ``now``."""
+        offset = now - sent_s
+        smallest = None if self._min_offset is None else self._min_offset + _MAX_DRIFT * (now - self._at)
+        if smallest is None or offset <= smallest:
+            self._min_offset, self._at = offset, now
             return 0.0
-        return delay - least
+        return offset - smallest
 
 
-class Ears:
-    """A client: which vehicle side it listens to, whether that one is there, and what to stamp."""
+class VehicleSideTracker:
+    """The client side: tracks one vehicle side by its beacons, and makes stamps."""
 
-    foreign: int
-    heard_at: float
-    late: int
-
-    def __init__(self, nonce: int, wish: Wish = "free") -> None:
+    def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None
-        """Of the vehicle side that is listened to; None: none was heard."""
-        self.helm: str | None = None
-        """Who has the helm, as told last."""
-        self.late = 0
-        """Frames of the vehicle side and beacons that came too late to be listened to."""
-        self.foreign = 0
-        """Those of another vehicle side of the same name than the one that is listened to."""
-        self.heard_at = 0.0
-        """When the last beacon came in time."""
-        self._nonce, self._wish = nonce, wish
+        """Epoch of the tracked vehicle side; None before the first beacon."""
+        self.lease_holder: str | None = None
+        """Client that holds the control lease, by the last beacon."""
+        self.late: int = 0
+        """Dropped frames and beacons that arrived too late."""
+        self.foreign: int = 0
+        """Dropped frames and beacons of another vehicle side with the same name."""
+        self.received_at: float = 0.0
+        """Time of the last valid beacon."""
+        self._nonce, self._mode = nonce, mode
         self._beacon = 0
         self._sequence = 0
-        self._lateness = Lateness()
+        self._delays = DelayEstimator()
 
-    def hear_beacon(self, beacon: Beacon, now: float) -> bool:
-        """Whether it counts: one of the vehicle side that is listened to, in time.
+    def receive_beacon(self, beacon: Beacon, now: float) -> bool:
+        """Return True if a beacon is valid, i.e. in time and from the tracked vehicle side.
 
-        Another one's counts as soon as the first has been silent for `FRESH_S`, or was :meth:`forget`-ten.
+        Another vehicle side is tracked when the first has been silent for `MAX_DELAY_S`, or after :meth:`reset`.
         """
         if beacon.epoch != self.epoch:
             if self.epoch is not None and not self.is_silent(now):
                 self.foreign += 1
                 return False
-            self.epoch, self._beacon, self._lateness = beacon.epoch, 0, Lateness()
+            self.epoch, self._beacon, self._delays = beacon.epoch, 0, DelayEstimator()
         elif beacon.number <= self._beacon:
             return False
-        if self._lateness.of(beacon.clock_s, now) > FRESH_S:
+        if self._delays.delay(beacon.clock_s, now) > MAX_DELAY_S:
             self.late += 1
             return False
-        self._beacon, self.heard_at, self.helm = beacon.number, now, beacon.helm
+        self._beacon, self.received_at, self.lease_holder = beacon.number, now, beacon.lease_holder
         return True
 
-    def hears(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Whether frames that were sent then, on the vehicle side's clock, are listened to."""
+    def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
+        """Return True if frames sent at ``sent_s``, on the vehicle side's clock, are to be delivered."""
         if epoch != self.epoch:
             self.foreign += 1
             return False
-        if self._lateness.of(sent_s, now) > FRESH_S:
+        if self._delays.delay(sent_s, now) > MAX_DELAY_S:
             self.late += 1
             return False
         return True
 
-    def stamp(self, now: float, wish: Wish | None = None) -> Stamp | None:
-        """For what is sent now; None: nothing may be sent, because no beacon has come for `FRESH_S`."""
+    def stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
+        """Make the stamp of a datagram; None if nothing may be sent, because beacons are missing."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1
-        return Stamp(self.epoch, self._beacon, self._nonce, self._sequence, wish or self._wish)
+        return Stamp(self.epoch, self._beacon, self._nonce, self._sequence, mode or self._mode)
 
     def is_silent(self, now: float) -> bool:
-        """Whether no beacon has come in time for `FRESH_S`."""
-        return self._beacon == 0 or now - self.heard_at > FRESH_S
+        return self._beacon == 0 or now - self.received_at > MAX_DELAY_S
 
-    def forget(self) -> None:
-        """The vehicle side has said that it ends."""
-        self.epoch, self._beacon, self.helm = None, 0, None
+    def reset(self) -> None:
+        self.epoch, self._beacon, self.lease_holder = None, 0, None

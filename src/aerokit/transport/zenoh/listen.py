@@ -1,4 +1,4 @@
-"""``zenohin:``: puts what a hub, a ground station or a companion has on a zenoh network, under a name."""
+"""``zenohin:`` link: the vehicle side, which serves clients on a zenoh network under a name."""
 
 from __future__ import annotations
 
@@ -14,40 +14,46 @@ import anyio
 
 from aerokit.errors import InvalidArgument, LinkOpenError
 from aerokit.transport.link import Peer
-from aerokit.transport.zenoh.control_lease import BEACON_EVERY_S, Gate, Helm, Judge
-from aerokit.transport.zenoh.keys import Beacon, Place, Stamp, Told, check_name, sent_at
+from aerokit.transport.zenoh.control_lease import (
+    BEACON_INTERVAL_S,
+    ClientFilter,
+    ControlLease,
+    FreshnessChecker,
+)
+from aerokit.transport.zenoh.keys import Beacon, KeySpace, RefusalNotice, Stamp, check_name, sent_at
 from aerokit.transport.zenoh.session import (
-    MOST_BYTES,
-    Handover,
+    MAX_PAYLOAD_BYTES,
+    LoopQueue,
     NetworkLink,
     NetworkOptions,
     attachment_of,
+    call,
     open_session,
     payload_of,
 )
 
 MAX_CLIENTS = 64
-"""Further clients are not listened to."""
+"""Further clients are ignored, unless one has been silent for `CLIENT_TIMEOUT_S`."""
 
-SILENT_AFTER_S = 30.0
-"""When there are so many, one that nothing has come of for so long makes room."""
+CLIENT_TIMEOUT_S = 30.0
+"""Silence after which a client may be replaced by a new one."""
 
-_SOONEST_S = 0.02  # after the last beacon, whoever comes
-_RIVAL_WAIT_S = 2.5 * BEACON_EVERY_S
+_MIN_BEACON_INTERVAL_S = 0.02
+_RIVAL_TIMEOUT_S = 2.5 * BEACON_INTERVAL_S
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class ZenohListen(NetworkLink):
-    """``zenohin:`` serves the clients (`ZenohConnect`) of one name; each is a peer, by its name.
+    """``zenohin:`` link: serves the clients (`ZenohConnect`) of one name. Each client is a peer.
 
-    Losing one of them, all of them, or the network itself does not lose the link. What comes of a client and is not
-    from now, or is an order although another one has the helm, is refused, counted, and the client is told.
+    The link is not lost when clients or the network fail. Outdated datagrams, and commands while another client has
+    control, are refused and counted, and the client is notified.
 
     Args:
-        fleet: its name, up to 63 letters, digits, ``_``, ``.`` and ``-``.
-        name: of this vehicle side in the fleet; no other may have it.
-        options: how this program is connected to the network.
+        fleet: name of the fleet, up to 63 letters, digits, ``_``, ``.`` and ``-``.
+        name: unique name of this vehicle side in the fleet.
+        options: connection to the network.
 
     Raises:
         InvalidArgument: an argument is wrong.
@@ -55,183 +61,176 @@ class ZenohListen(NetworkLink):
 
     def __init__(self, fleet: str, name: str, *, options: NetworkOptions | None = None) -> None:
         super().__init__(f"zenohin://{check_name('fleet', fleet)}/{check_name('name', name)}")
-        self._place = Place(fleet, name)
+        self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
-        self._judge = Judge(random.getrandbits(32))
-        self._helm = Helm()
-        self._clients: dict[Peer, Gate] = {}
-        self._refused = 0  # of clients that have gone
+        self._freshness = FreshnessChecker(random.getrandbits(32))
+        self._lease = ControlLease()
+        self._clients: dict[Peer, ClientFilter] = {}
+        self._refused = 0  # of former clients
         self._zenoh: Any = None
-        self._everybody: Any = None
+        self._publisher: Any = None
         self._has_others = self._is_serving = False
         self._rival = asyncio.Event()
-        self._beaten_at = 0.0
+        self._beacon_at = 0.0
 
     @property
     def peers(self) -> tuple[Peer, ...]:
-        """The clients that are there now."""
+        """Connected clients."""
         return tuple(self._clients)
 
     @property
-    def helm(self) -> str | None:
-        """The client that has the helm; None: it is free."""
-        return None if self._session is None else self._helm.holder(self._now())
+    def lease_holder(self) -> str | None:
+        """Client that has control; None: free."""
+        return None if self._session is None else self._lease.holder(self._now())
 
     @property
     def late_datagrams(self) -> int:
-        """Datagrams of clients that were refused because they were not proven to be from now."""
-        return self._judge.late
+        """Datagrams of clients that were refused as outdated."""
+        return self._freshness.late
 
     @property
     def refused_frames(self) -> int:
-        """Frames of clients that were refused: late, or orders of somebody without the helm."""
-        return self._refused + sum(gate.refused for gate in self._clients.values())
+        """Frames of clients that were refused: outdated, or commands without control."""
+        return self._refused + sum(client.refused for client in self._clients.values())
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """See `Link.write`; to everybody it is sent once, whoever listens."""
+        """See `Link.write`. Data for all clients is sent once."""
         if self._session is None or not self._is_serving:
             return
-        attachment = sent_at(self._judge.epoch, self._now())
+        attachment = sent_at(self._freshness.epoch, self._now())
         if peer is None:
-            self._try(lambda: self._everybody.put(bytes(data), attachment=attachment))
+            self._try(lambda: self._publisher.put(bytes(data), attachment=attachment))
         elif peer in self._clients:
-            self._put(self._place.from_vehicle(str(peer)), bytes(data), attachment)
+            self._put(self._keys.from_vehicle(str(peer)), bytes(data), attachment)
         else:
             self._drop(1)
 
     def has_peer(self, peer: Peer) -> bool:
-        """See `Link.has_peer`."""
         return peer in self._clients
 
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
-        self._handover = Handover(_call)
-        self._session = await open_session(
-            self.address, self._options, partial(self._look_around, self._handover)
-        )
+        self._queue = LoopQueue(call)
+        self._session = await open_session(self.address, self._options, partial(self._find_rivals, self._queue))
         self._released.clear()
         if self._has_others:
-            with anyio.move_on_after(_RIVAL_WAIT_S):
+            with anyio.move_on_after(_RIVAL_TIMEOUT_S):
                 await self._rival.wait()
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
         self._is_serving = True
-        self._serve(self._handover)
-        self._beat()
+        self._serve(self._queue)
+        self._send_beacon()
 
-    def _look_around(self, handover: Handover[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        """On a thread: is the name taken? A token alone may be that of a program that was killed just now."""
-
-        def hear_beacon(sample: Any) -> None:
+    def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
+        # Runs on a thread. A token alone does not show that the name is in use: it may be of a program that was killed.
+        def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
-            if len(payload) <= MOST_BYTES:
-                handover.post(partial(self._hear_beacon, payload))
+            if len(payload) <= MAX_PAYLOAD_BYTES:
+                queue.post(partial(self._on_beacon, payload))
 
         self._zenoh = zenoh
-        self._declared = [session.declare_subscriber(self._place.beacon, hear_beacon)]
-        self._has_others = any(True for _ in session.liveliness().get(self._place.alive(), timeout=1.0))
+        self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
+        self._has_others = any(True for _ in session.liveliness().get(self._keys.alive(), timeout=1.0))
 
-    def _serve(self, handover: Handover[Callable[[], object]]) -> None:
-        zenoh, session, place = self._zenoh, self._session, self._place
+    def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
+        zenoh, session, keys = self._zenoh, self._session, self._keys
 
-        def hear(sample: Any) -> None:
+        def on_datagram(sample: Any) -> None:
             client, payload = str(sample.key_expr).rpartition("/")[2], payload_of(sample)
-            if len(payload) <= MOST_BYTES:
-                handover.post(partial(self._hear, client, payload, attachment_of(sample)))
+            if len(payload) <= MAX_PAYLOAD_BYTES:
+                queue.post(partial(self._on_datagram, client, payload, attachment_of(sample)))
 
-        def hear_client(sample: Any) -> None:
+        def on_liveliness(sample: Any) -> None:
             client, is_put = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT
-            handover.post(partial(self._greet if is_put else self._go, client))
+            queue.post(partial(self._on_client_joined if is_put else self._remove_client, client))
 
         liveliness = session.liveliness()
-        self._everybody = session.declare_publisher(
-            place.everybody, congestion_control=zenoh.CongestionControl.DROP
+        self._publisher = session.declare_publisher(
+            keys.to_all_clients, congestion_control=zenoh.CongestionControl.DROP
         )
         self._declared += [
-            session.declare_subscriber(place.to_vehicle(), hear),
-            liveliness.declare_subscriber(place.client(), hear_client, history=True),
-            liveliness.declare_token(place.alive(self._judge.epoch)),
+            session.declare_subscriber(keys.to_vehicle(), on_datagram),
+            liveliness.declare_subscriber(keys.client(), on_liveliness, history=True),
+            liveliness.declare_token(keys.alive(self._freshness.epoch)),
         ]
 
-    def _leave(self, session: Any) -> None:
-        self._everybody = None
+    def _on_release(self, session: Any) -> None:
+        self._publisher = None
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            goodbye = sent_at(self._judge.epoch, 0.0)
+            goodbye = sent_at(self._freshness.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
-                session.delete(self._place.beacon, congestion_control=drop, attachment=goodbye)
+                session.delete(self._keys.beacon, congestion_control=drop, attachment=goodbye)
 
-    # ---------------------------------------------------------------------------------- what comes in
+    # ---------------------------------------------------------------------------------- receiving
 
-    def _hear(self, client: str, data: bytes, attachment: bytes) -> None:
-        gate, now = self._come(client), self._now()
-        if gate is None:
+    def _on_datagram(self, name: str, data: bytes, attachment: bytes) -> None:
+        client, now = self._add_client(name), self._now()
+        if client is None:
             return
-        gate.heard_at = now
-        stamp, late = Stamp.decode(attachment), self._judge.late
-        if not self._judge.accepts(client, stamp, now) or stamp is None:
-            if self._judge.late > late:
-                self._tell(client, gate.refuse_late(data, now))
+        client.received_at = now
+        stamp, late = Stamp.decode(attachment), self._freshness.late
+        if not self._freshness.accepts(name, stamp, now) or stamp is None:
+            if self._freshness.late > late:
+                self._send_notices(name, client.refuse_late(data, now))
             return
-        if stamp.wish == "take":
-            self._helm.take(client, now)
-        passed, told = gate.receive(data, stamp.wish, now, stamp.nonce)
-        self._tell(client, told)
-        if passed:
-            self._deliver(passed, client)
+        if stamp.mode == "take":
+            self._lease.take(name, now)
+        accepted, notices = client.receive(data, stamp.mode, now, stamp.nonce)
+        self._send_notices(name, notices)
+        if accepted:
+            self._deliver(accepted, name)
 
-    def _come(self, client: str) -> Gate | None:
-        gate = self._clients.get(client)
-        if gate is None and len(self._clients) >= MAX_CLIENTS:
-            self._forget_one_that_is_silent()
-        if gate is None and len(self._clients) < MAX_CLIENTS:
-            with contextlib.suppress(InvalidArgument):  # not a name: somebody else's key
-                gate = self._clients[client] = Gate(check_name("client", client), self._helm)
-                gate.heard_at = self._now()
-        return gate
+    def _add_client(self, name: str) -> ClientFilter | None:
+        client = self._clients.get(name)
+        if client is None and len(self._clients) >= MAX_CLIENTS:
+            self._remove_silent_client()
+        if client is None and len(self._clients) < MAX_CLIENTS:
+            with contextlib.suppress(InvalidArgument):  # the key of another program
+                client = self._clients[name] = ClientFilter(check_name("client", name), self._lease)
+                client.received_at = self._now()
+        return client
 
-    def _forget_one_that_is_silent(self) -> None:
-        """Whoever has put something and is no client, or whose end was not noticed, keeps nobody else away."""
-        silent = min(self._clients, key=lambda each: self._clients[each].heard_at)
-        if self._now() - self._clients[silent].heard_at > SILENT_AFTER_S:
-            self._go(str(silent))
+    def _remove_silent_client(self) -> None:
+        # A sender without a liveliness token, or whose end was not noticed, must not block new clients.
+        oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
+        if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
+            self._remove_client(str(oldest))
 
-    def _greet(self, client: str) -> None:
-        """It need not wait for the next beacon: it knows at once that we are there."""
-        if self._come(client) is not None and self._timer is not None:
+    def _on_client_joined(self, name: str) -> None:
+        # An extra beacon, so that the client need not wait for the next one.
+        if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
-            soon = max(0.0, self._beaten_at + _SOONEST_S - self._now())
-            self._timer = asyncio.get_running_loop().call_later(soon, self._beat)
+            delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
+            self._timer = asyncio.get_running_loop().call_later(delay_s, self._send_beacon)
 
-    def _go(self, client: str) -> None:
-        gate = self._clients.pop(client, None)
-        if gate is not None:
-            self._refused += gate.refused
-            self._helm.leave(client)
+    def _remove_client(self, name: str) -> None:
+        client = self._clients.pop(name, None)
+        if client is not None:
+            self._refused += client.refused
+            self._lease.release(name)
 
-    def _hear_beacon(self, data: bytes) -> None:
+    def _on_beacon(self, data: bytes) -> None:
         beacon = Beacon.decode(data)
-        if beacon is None or beacon.epoch == self._judge.epoch or self._rival.is_set():
+        if beacon is None or beacon.epoch == self._freshness.epoch or self._rival.is_set():
             return
         self._rival.set()
         if self._is_serving:
-            logger.warning(
-                "%s: another program serves this name, too; clients stay with theirs", self.address
-            )
+            logger.warning("%s: another program serves the same name; clients keep the first one", self.address)
 
-    # ---------------------------------------------------------------------------------- what goes out
+    # ---------------------------------------------------------------------------------- sending
 
-    def _beat(self) -> None:
-        """The beacon is what proves to clients that we are there, and to us that what they send is from now."""
-        self._beaten_at = now = self._now()
-        self._put(self._place.beacon, self._judge.beacon(now, self._helm.holder(now)).encode(), b"")
-        self._timer = asyncio.get_running_loop().call_later(BEACON_EVERY_S, self._beat)
+    def _send_beacon(self) -> None:
+        self._beacon_at = now = self._now()
+        self._put(self._keys.beacon, self._freshness.beacon(now, self._lease.holder(now)).encode(), b"")
+        self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
-    def _tell(self, client: str, told: list[Told]) -> None:
-        for each in told:
-            self._put(self._place.told(client), each.encode(), b"")
+    def _send_notices(self, client: str, notices: list[RefusalNotice]) -> None:
+        for notice in notices:
+            self._put(self._keys.notices(client), notice.encode(), b"")
 
     def _put(self, key: str, data: bytes, attachment: bytes) -> None:
         drop = self._zenoh.CongestionControl.DROP
@@ -242,12 +241,8 @@ class ZenohListen(NetworkLink):
     def _try(self, put: Callable[[], object]) -> None:
         try:
             put()
-        except Exception:  # zenoh's own: the session has ended
+        except Exception:  # of zenoh: the session has ended
             self._drop(1)
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
-
-
-def _call(what: Callable[[], object]) -> object:
-    return what()

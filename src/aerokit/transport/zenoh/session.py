@@ -1,4 +1,4 @@
-"""Sessions of zenoh: made from an address's options, opened and closed without keeping the loop waiting."""
+"""zenoh sessions: configured by an address's options, opened and closed without blocking the event loop."""
 
 from __future__ import annotations
 
@@ -13,76 +13,72 @@ from typing import Any, Generic, TypeVar
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, LinkOpenError
-from aerokit.transport.link import BaseLink, needed
+from aerokit.transport.link import BaseLink, import_optional
 
 ItemT = TypeVar("ItemT")
 
-MOST_WAITING = 2048
-"""So much waits for a loop that does not come round; then the oldest goes."""
+MAX_QUEUED = 2048
+"""Items that wait for a blocked event loop. Then the oldest is dropped."""
 
-_AT_ONCE = 256  # in one turn of the loop, before everybody else gets one
+_MAX_PER_ITERATION = 256  # so that other tasks can run
 
 
-class Handover(Generic[ItemT]):
-    """``post(item)`` from any thread calls ``take(item)`` on the loop; nothing is called after :meth:`close`.
+class LoopQueue(Generic[ItemT]):
+    """Queue from other threads to the event loop: ``post(item)`` in any thread calls ``process(item)`` on the loop.
 
-    At most ``most`` items wait; the oldest are dropped then, and counted. The loop is woken once for all that wait.
+    At most ``limit`` items wait; then the oldest is dropped and counted. The loop is woken once for all waiting items.
     """
 
-    dropped: int
-
-    def __init__(self, take: Callable[[ItemT], object], most: int = MOST_WAITING) -> None:
-        self.dropped = 0
-        """Items that the loop was too slow for."""
+    def __init__(self, process: Callable[[ItemT], object], limit: int = MAX_QUEUED) -> None:
+        self.dropped: int = 0
+        """Number of dropped items."""
         self._loop = asyncio.get_running_loop()
-        self._take: Callable[[ItemT], object] | None = take
-        self._most = most
+        self._process: Callable[[ItemT], object] | None = process
+        self._limit = limit
         self._waiting: deque[ItemT] = deque()
-        self._is_called = False
+        self._is_scheduled = False
         self._lock = threading.Lock()
 
     def post(self, item: ItemT) -> None:
-        """Hand over; never blocks, never raises."""
+        """Add an item. Never blocks or raises; ignored after :meth:`close`."""
         with self._lock:
-            if self._take is None:
+            if self._process is None:
                 return
-            if len(self._waiting) >= self._most:
+            if len(self._waiting) >= self._limit:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append(item)
-            if self._is_called:
+            if self._is_scheduled:
                 return
-            self._is_called = True
+            self._is_scheduled = True
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._drain)
 
     def close(self) -> None:
-        """What waits is forgotten."""
         with self._lock:
-            self._take = None
+            self._process = None
             self._waiting.clear()
 
     def _drain(self) -> None:
-        """A burst of what waits."""
-        for _ in range(_AT_ONCE):
+        for _ in range(_MAX_PER_ITERATION):
             with self._lock:
-                take = self._take
-                if take is None or not self._waiting:
-                    self._is_called = False
+                process = self._process
+                if process is None or not self._waiting:
+                    self._is_scheduled = False
                     return
                 item = self._waiting.popleft()
             try:
-                take(item)
+                process(item)
             except BaseException:
-                self._loop.call_soon(self._drain)  # the others are handed over all the same
+                self._loop.call_soon(self._drain)  # process the other items
                 raise
         self._loop.call_soon(self._drain)
 
 
-async def opened_in_a_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
-    """What ``work()`` opens, in a thread of the loop's; ``close`` it when nobody waits for it any more.
+async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
+    """Run ``work()`` in a thread of the loop's executor and return what it opens.
 
-    A thread cannot be stopped: when this is cancelled, what it opens is closed as soon as it is there.
+    A thread cannot be stopped. If this is cancelled, the result is passed to ``close`` as soon as it is available.
     """
     opening = asyncio.get_running_loop().run_in_executor(None, work)
 
@@ -97,81 +93,81 @@ async def opened_in_a_thread(work: Callable[[], ItemT], close: Callable[[ItemT],
         raise
 
 
-MOST_BYTES = 65535
-"""Nothing larger is listened to: either side sends single frames, or as many as are in a datagram."""
+MAX_PAYLOAD_BYTES = 65535
+"""Larger payloads are ignored. Both sides send single frames, or those of one datagram."""
 
-_NOBODY_THERE = "Unable to connect to any of"
+_CONNECT_FAILED = "Unable to connect to any of"
 
 _ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")  # "[Single(tcp/a:1)]", by 1.6 "[tcp/a:1]"
 
 _TX = "transport/link/tx/queue"
 
-_NO_WAITING = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
-"""What is thrown away keeps nobody waiting; else a put may keep the loop for a millisecond, each time."""
+# Without this, each put that drops data may block the loop for a millisecond.
+_DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
 _SETTINGS = (
-    # Batches, of 64 KB at most: a burst of 1000 frames fits, a broken connection holds back no more than these.
+    # Batches of up to 64 KB: enough for a burst of 1000 frames, and the maximum that a broken connection delays.
     (f"{_TX}/size/data", 4),
     (f"{_TX}/size/real_time", 4),
-    ("transport/shared_memory/enabled", False),  # frames are small; a pool for large messages is 16 MB
+    ("transport/shared_memory/enabled", False),  # its pool for large messages takes 16 MB
 )
 
 
 class NetworkOptions(Snapshot):
-    """How a program is connected to a zenoh network; what is "" or None is as zenoh, or its file, has it."""
+    """Connection to a zenoh network. Empty values use the defaults of zenoh or of the configuration file."""
 
     connect: tuple[str, ...] = ()
     """Endpoints of routers and peers: "tcp/192.168.1.5:7447", "tls/…", "quic/…"."""
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""
     mode: str = ""
-    """"peer" or "client"; "": a client where there is somebody to connect to and nothing to listen on, else a peer."""
+    """"peer" or "client"; "": client if there are endpoints to connect to and none to listen on, otherwise peer."""
     config: str = ""
-    """A configuration file of zenoh's own (JSON5): TLS, access control, queues."""
+    """zenoh configuration file (JSON5): TLS, access control, queues."""
 
     @property
     def scouts(self) -> bool:
-        """Whether it looks for others by multicast, unless the file says otherwise: when nobody is named."""
+        """True if peers are discovered by multicast, unless the file disables it: when no endpoints are given."""
         return not (self.connect or self.listen)
 
 
 class NetworkLink(BaseLink):
-    """What both sides of a name have: a session, what is declared in it, and a timer."""
+    """Common base of both sides: a session, its declarations, and a timer."""
 
     def __init__(self, address: str) -> None:
         super().__init__(address)
         self._session: Any = None
-        self._declared: list[Any] = []  # they end when they are forgotten
-        self._handover: Handover[Callable[[], object]] | None = None
+        self._declared: list[Any] = []  # they end when they are garbage-collected
+        self._queue: LoopQueue[Callable[[], object]] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
-    def _leave(self, session: Any) -> None:
-        """Forget what is made of the session, and say goodbye; None: there is no session any more."""
+    def _on_release(self, session: Any) -> None:
+        """Release objects of the session and announce the end; ``session`` is None if it is not open."""
         raise NotImplementedError
 
     def _release(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        if self._handover is not None:
-            self._handover.close()
+        if self._queue is not None:
+            self._queue.close()
         session, self._session = self._session, None
-        self._timer = self._handover = None
+        self._timer = self._queue = None
         self._declared = []
-        self._leave(session)
+        self._on_release(session)
         if session is not None:
             close_session(session, self._released.set)
 
 
 def zenoh_module(address: str) -> Any:
-    """The module ``zenoh``; LinkOpenError with what to install when it is not there."""
-    return needed(address, "zenoh", "eclipse-zenoh", "zenoh")
+    """Import ``zenoh``; raise LinkOpenError with the package to install if it is missing."""
+    return import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
 
 
 async def open_session(address: str, options: NetworkOptions, prepare: Callable[[Any, Any], object]) -> Any:
-    """Open a session; then ``prepare(zenoh, session)`` in the same thread, where declaring may take its time.
+    """Open a session, and call ``prepare(zenoh, session)`` in the same thread, where declarations may block.
 
     Raises:
-        LinkOpenError: zenoh is not installed, or could not open it.
+        LinkOpenError: zenoh is not installed, or the session could not be opened.
         InvalidArgument: the configuration is wrong.
     """
     zenoh = zenoh_module(address)
@@ -187,34 +183,35 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
         return session
 
     try:
-        return await opened_in_a_thread(work, lambda session: close_session(session, _nothing))
+        return await open_in_thread(work, lambda session: close_session(session, _nothing))
     except zenoh.ZError as error:
         raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from None
 
 
 def close_session(session: Any, closed: Callable[[], object]) -> None:
-    """Close it in a thread of the loop's; ``closed()`` is called on the loop then."""
 
     def work() -> None:
-        with contextlib.suppress(Exception):  # whatever it says, it is closed
+        with contextlib.suppress(Exception):  # the session is closed in any case
             session.close()
 
     try:
         future = asyncio.get_running_loop().run_in_executor(None, work)
-    except RuntimeError:  # the loop is closed, or on its way
+    except RuntimeError:  # the loop is closed or closing
         work()
         closed()
     else:
         future.add_done_callback(lambda _: closed())
 
 
+def call(function: Callable[[], object]) -> object:
+    return function()
+
+
 def payload_of(sample: Any) -> bytes:
-    """The bytes of a sample."""
     return bytes(sample.payload.to_bytes())
 
 
 def attachment_of(sample: Any) -> bytes:
-    """The bytes of its attachment; empty when it has none."""
     attachment = sample.attachment
     return b"" if attachment is None else bytes(attachment.to_bytes())
 
@@ -229,8 +226,8 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: {_reason(error)}") from error
-    for key, value in (_NO_WAITING, *(_SETTINGS if not options.config else ())):
-        with contextlib.suppress(zenoh.ZError):  # another version's
+    for key, value in (_DROP_AT_ONCE, *(_SETTINGS if not options.config else ())):
+        with contextlib.suppress(zenoh.ZError):  # unknown to this version of zenoh
             config.insert_json5(key, json.dumps(value))
     return config
 
@@ -245,19 +242,17 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
         yield "listen/endpoints", list(options.listen)
     if not options.config and not options.scouts:
         yield "scouting/multicast/enabled", False
-        yield "scouting/delay", 0  # nobody is waited for who would be found so
+        yield "scouting/delay", 0  # do not wait for discovered peers
         if not options.listen:
             yield "listen/endpoints", []
 
 
 def _reason(error: Exception) -> str:
-    """Without the place in zenoh's source."""
+    """Return the error text without zenoh's source location."""
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
-    if text.startswith(_NOBODY_THERE):
+    if text.startswith(_CONNECT_FAILED):
         where = ", ".join(_ENDPOINTS.findall(text)) or text
-        return (
-            f"nobody can be reached at {where} (is a router or peer running there, and is this its address?)"
-        )
+        return f"cannot connect to {where} (is a router or peer running there, and is this its address?)"
     return text.replace(": [", ": ")
 
 

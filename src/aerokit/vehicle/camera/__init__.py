@@ -1,1 +1,1 @@
-"""Cameras: pictures, video, lens, tracking, storage and streams, by MAVLink's camera protocol and what was before."""
+"""Cameras: photos, video, lens, tracking, storage, streams, by MAVLink's camera protocol and older commands."""

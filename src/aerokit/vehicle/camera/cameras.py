@@ -1,176 +1,277 @@
-"""``Cameras``: those of one vehicle, as they are heard."""
+"""``Camera`` and ``Cameras``: the cameras of one vehicle."""
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
 from aerokit.connection.cells import Source, StateCell
-from aerokit.errors import InvalidArgument
+from aerokit.errors import FileFormatError, InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavType
-from aerokit.vehicle.camera.controls import LensCalls, StorageCalls, TrackingCalls
-from aerokit.vehicle.camera.link import BEHIND, HEARD_WITHIN_S, CameraLine
-from aerokit.vehicle.camera.photos import PhotoCalls
+from aerokit.vehicle.camera.capture import Capture
+from aerokit.vehicle.camera.capture_log import MAX_CAPTURES, CaptureLog
+from aerokit.vehicle.camera.controls import LensMixin, StorageMixin, TrackingMixin
+from aerokit.vehicle.camera.link import DISCOVERY_TIMEOUT_S, CameraLink
+from aerokit.vehicle.camera.orders import AUTOPILOT_CAMERA_IDS
+from aerokit.vehicle.camera.photos import PhotoInterval, Shutter
 from aerokit.vehicle.camera.values import CameraInformation
-from aerokit.vehicle.camera.videos import VideoCalls
+from aerokit.vehicle.camera.videos import VideoMixin
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.components.components import Components
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.components.component import Components
 
 __all__ = ["Camera", "Cameras"]
 
+MAX_SERIES_LENGTH, MAX_CONSECUTIVE_MISSING = 32_767, 3
+MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
+
 
 @checks_arguments
-class Camera(ReadOnly, PhotoCalls, VideoCalls, LensCalls, TrackingCalls, StorageCalls):
-    """One camera: pictures, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
+class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
+    """One camera: photos, video, lens, tracking, storage, streams (https://mavlink.io/en/services/camera.html).
 
-    ``vehicle.camera`` is the first one that is heard, ``vehicle.camera_at(number)`` any: one with a component id of its
-    own (100 to 105), or behind the autopilot (1 to 6), which are ArduPilot's own drivers and PX4's trigger. What a
-    camera says that it cannot do is refused before anything is sent. Cells are asked for while somebody looks at them.
+    ``vehicle.camera`` is the first camera, ``vehicle.camera_at(number)`` any: one with its own component id (100 to
+    105), or one attached to the autopilot (1 to 6), e.g. ArduPilot's drivers and PX4's trigger. Calls outside its
+    reported capabilities are refused before anything is sent. Cells are polled only while your program uses them.
     """
 
-    def __init__(self, line: CameraLine) -> None:
-        super().__init__(line)
-        self.information: StateCell[CameraInformation] = line.information
-        """What it is (CAMERA_INFORMATION): asked for once, by the first call."""
+    def __init__(self, link: CameraLink) -> None:
+        super().__init__(link)
+        self._log = CaptureLog(link)
+        self._shutter = Shutter(link, self._log)
+        self.capture: StateCell[Capture] = self._log.cell
+        """The latest capture."""
+        self.information: StateCell[CameraInformation] = link.information
+        """Vendor, model, capabilities (CAMERA_INFORMATION); the first call requests it."""
 
     @property
     def number(self) -> int | None:
-        """1 to 6 behind the autopilot, otherwise its component id; None before the first camera was heard."""
-        return self._line.number
+        """1 to 6 if attached to the autopilot, otherwise the component id; None until a camera is found."""
+        return self._link.number
 
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is heard and says what it is; other calls do so by themselves.
+        """Wait until the camera is found and has identified itself; other calls do so by themselves.
 
         Raises:
-            CommandRejected: it does not say what it is.
-            OperationTimeout: none was heard, or it does not say what it is: PX4's trigger never does.
+            CommandRejected: the camera refused to identify itself.
+            OperationTimeout: no camera was found, or it did not identify itself: PX4's trigger never does.
         """
         found: CameraInformation | None = None
         with anyio.move_on_after(timeout):
-            found = await self._line.find()
+            found = await self._link.identify()
         if found is None:
-            raise self._line.timed_out(f"says nothing of itself; waited for {timeout:g} s at most")
+            raise self._link.timeout_error(f"did not identify itself within {timeout:g} s")
         return found
 
+    async def take_photo(self, *, timeout: float = 10.0) -> Capture:
+        """Take one photo; returns when the camera has reported it.
+
+        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), or MAV_CMD_DO_DIGICAM_CONTROL to
+        PX4's trigger and to cameras that do not support the former. The order is sent again only if the camera then
+        reports that it is not taking a picture and has taken none. A lost CAMERA_IMAGE_CAPTURED is requested. If you
+        cancel the call, the camera may still take the picture.
+
+        Args:
+            timeout: seconds to wait for the report.
+
+        Raises:
+            NotSupported: the camera takes no pictures. Nothing was sent.
+            CommandRejected: the camera refused: it is busy, or in the wrong mode.
+            CommandTimeout: it did not answer; it may have taken the picture.
+            OperationRejected: it failed to take the picture.
+            OperationTimeout: it reported no picture, or no camera was found.
+        """
+        await self._link.require_capability("take_photo", "capture_image")
+        return await self._shutter.take(timeout)
+
+    def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
+        """Take a photo every ``seconds`` for the duration of an ``async with`` block.
+
+        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …`` gives the
+        captures in order; lost ones are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block,
+        also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+
+        Args:
+            seconds: time between two pictures, above 0 to 3600.
+            count: number of pictures, after which the iterator ends: 1 to 32767, or 0 for no limit.
+
+        Raises:
+            InvalidArgument: an argument is out of range. Nothing was sent.
+        """
+        check_range("seconds", seconds, 0, 3600, above=True)
+        check_range("count", count, 0, MAX_SERIES_LENGTH)
+        return PhotoInterval(self._shutter, seconds, count)
+
+    def captures(self) -> list[Capture]:
+        """Return the captures received so far, ordered by index: at most the newest 20,000."""
+        return self._log.captures()
+
+    async def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
+        """Return all captures in the camera's log, including earlier ones, after requesting the missing ones.
+
+        At most the newest 20,000; of a camera attached to the autopilot only the newest one. Stops after three
+        successive captures that the camera does not send.
+
+        Args:
+            timeout: seconds to wait for all of them; :meth:`captures` has those that arrived in time.
+
+        Raises:
+            OperationTimeout: the camera did not report its count or identify itself, or it took too long.
+        """
+        count: int | None = None
+        with anyio.move_on_after(timeout):
+            await self._link.identify()
+            status = await self._shutter.status()
+            if status is None:
+                raise self._link.timeout_error("did not report how many pictures it has taken")
+            count = status.image_count
+            missing = 0
+            available = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
+            for index in range(max(0, count - available), count):
+                missing = 0 if await self._log.fetch(index) else missing + 1
+                if missing == MAX_CONSECUTIVE_MISSING:
+                    break
+            return self.captures()
+        what = "how many pictures it has taken" if count is None else f"all of its {count} pictures"
+        raise self._link.timeout_error(f"did not report {what} within {timeout:g} s")
+
+    async def read_picture(self, capture: Capture) -> bytes:
+        """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
+
+        Raises:
+            NotSupported: the capture has another URL, or none. Nothing was sent.
+            FileError: the camera has no such file.
+            OperationTimeout: the transfer stopped, or no camera was found.
+        """
+        url = capture.file_url
+        if not MAVFTP.match(url):
+            what = f"{url[:100]!r} is not a MAVFTP URL" if url else "the capture has no URL"
+            raise NotSupported(f"read_picture: {what}; nothing was sent")
+        await self._link.identify()
+        try:
+            return await self._link.component.fetch(f"mftp://{url}" if url.startswith("/") else url)
+        except FileFormatError:
+            raise
+        except InvalidArgument as error:
+            raise NotSupported(f"read_picture: {error}; nothing was sent") from None
+
     def __repr__(self) -> str:
-        return f"<Camera {self._line.describe().removeprefix('camera ')}>"
+        return f"<Camera {self._link.describe().removeprefix('camera ')}>"
 
 
-OWN_IDS = range(100, 106)
-
-MOST_EARLY = 99
+CAMERA_COMPONENT_IDS = range(100, 106)
+MAX_EARLY_CAPTURES = 99
 
 
 class Cameras:
-    """Finds cameras by heartbeats and by what only cameras say, and keeps the objects that were made of them."""
+    """Discovers the cameras of one vehicle and creates their ``Camera`` objects."""
 
-    def __init__(self, bridge: Bridge, components: Components) -> None:
-        self._bridge, self._talk, self._components = bridge, bridge.talk, components
+    def __init__(self, context: VehicleContext, components: Components) -> None:
+        self._context, self._session, self._components = context, context.session, components
         self._made: dict[int, Camera] = {}
-        talk = bridge.talk
-        self.cell: StateCell[tuple[int, ...]] = talk.connection.new_cell(
+        session = context.session
+        self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
+        # Captures of cameras attached to the autopilot, kept until the first camera is known.
         self._early: list[tuple[int, Any]] = []
-        """Pictures of a camera behind the autopilot, while it is not known yet whether it is the first."""
-        self._first_line = CameraLine(bridge, components.component, None, on_bound=self._on_first_bound)
-        self._first = Camera(self._first_line)
-        self._is_first_given = False
-        """Somebody has it, and always gets the same."""
-        talk.keep(self.cell)
-        bus = talk.connection.bus
-        for message_type, find in (
+        self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
+        self._first = Camera(self._first_link)
+        # Once `first` has returned `_first`, it always returns the same object.
+        self._is_first_in_use = False
+        session.keep(self.cell)
+        bus = session.connection.bus
+        for message_type, callback in (
             (m.Heartbeat, self._on_heartbeat),
             (m.CameraInformation, self._on_information),
-            (m.CameraFeedback, lambda each: self._on_picture(each, each.cam_idx + 1)),
-            (m.CameraImageCaptured, lambda each: self._on_picture(each, each.camera_id or 1)),
-            (m.CameraTrigger, lambda each: self._on_picture(each, 1)),
+            (m.CameraFeedback, lambda message: self._on_capture(message, message.cam_idx + 1)),
+            (m.CameraImageCaptured, lambda message: self._on_capture(message, message.camera_id or 1)),
+            (m.CameraTrigger, lambda message: self._on_capture(message, 1)),
         ):
             if bus.dialect.get(message_type.ID) is not None:
-                talk.at_close(bus.attach(message_type, find, system_id=talk.system_id))
-        for (system_id, _), heartbeat in tuple(talk.connection.heard.items()):
-            if system_id == talk.system_id:
+                session.at_close(bus.attach(message_type, callback, system_id=session.system_id))
+        for (system_id, _), heartbeat in tuple(session.connection.heartbeats.items()):
+            if system_id == session.system_id:
                 self._on_heartbeat(heartbeat)
 
     @property
     def first(self) -> Camera:
-        """That which is heard first, or has the lowest component id of those that are; the autopilot's come last."""
-        if not self._is_first_given and self._first_line.number in self._made:
-            return self._made[self._first_line.number]
-        self._is_first_given = True
-        self._first_line.look()
+        """The camera found first, preferring low component ids; those attached to the autopilot come last."""
+        if not self._is_first_in_use and self._first_link.number in self._made:
+            return self._made[self._first_link.number]
+        self._is_first_in_use = True
+        self._first_link.start_polling()
         return self._first
 
     def at(self, number: int) -> Camera:
-        """The object of one camera, the same each time; it need not have been heard yet."""
-        if number not in BEHIND and not 7 <= number <= 255:
+        """Return the camera of this number, always the same object, whether or not it has been discovered."""
+        if number not in AUTOPILOT_CAMERA_IDS and not 7 <= number <= 255:
             raise InvalidArgument(
-                f"number = {number} is not allowed: 1 to 6 behind the autopilot, or a component id up to 255"
+                f"number = {number} is not allowed: 1 to 6 if attached to the autopilot, or a component id up to 255"
             )
         if number not in self._made:
-            if number == self._first_line.number:
+            if number == self._first_link.number:
                 return self.first
-            line = CameraLine(self._bridge, self._components.component, number)
-            line.look()
-            self._made[number] = Camera(line)
+            link = CameraLink(self._context, self._components.component, number)
+            link.start_polling()
+            self._made[number] = Camera(link)
         return self._made[number]
 
     def _on_heartbeat(self, heartbeat: m.Heartbeat) -> None:
         frame = heartbeat.received_frame
-        if frame is not None and (heartbeat.type == MavType.CAMERA or frame.component_id in OWN_IDS):
-            self._note(heartbeat, frame.component_id)
+        if frame is not None and (heartbeat.type == MavType.CAMERA or frame.component_id in CAMERA_COMPONENT_IDS):
+            self._record(heartbeat, frame.component_id)
 
     def _on_information(self, message: m.CameraInformation) -> None:
-        self._note(message, message.camera_device_id or message.lens_id + 1)
+        self._record(message, message.camera_device_id or message.lens_id + 1)
 
     def _on_first_bound(self, number: int) -> None:
-        """One that was made before goes on telling of its pictures alone."""
-        self._first_line.is_quiet = number in self._made
+        # Only one of two objects for the same camera publishes its events.
+        self._first_link.is_muted = number in self._made
 
-    def _on_picture(self, message: Any, device: int) -> None:
-        """Have somebody hear of the pictures of this camera, this one included."""
-        number = self._note(message, device)
-        if number in (0, self._first_line.number, *self._made):
+    def _on_capture(self, message: Any, device: int) -> None:
+        """Create the camera if needed, so that its capture log gets this capture, too."""
+        number = self._record(message, device)
+        if number in (0, self._first_link.number, *self._made):
             return
-        if self._first_line.number is None:
+        if self._first_link.number is None:
             if not self._early:
-                self._first_line.later(HEARD_WITHIN_S, self._give_early)
-            del self._early[MOST_EARLY:]
+                self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early)
+            del self._early[MAX_EARLY_CAPTURES:]
             self._early.append((number, message))
         else:
-            self.at(number)._album.hear(message)
+            self.at(number)._log.record(message)
 
-    def _give_early(self) -> None:
-        """No camera with a heartbeat of its own was heard: those of the autopilot are all there are."""
+    def _process_early(self) -> None:
+        # No camera with its own component id was discovered, so the autopilot's is the first.
         early, self._early = self._early, []
-        self._first_line.bind(early[0][0])
+        self._first_link.bind(early[0][0])
         for number, message in early:
-            self.at(number)._album.hear(message)
+            self.at(number)._log.record(message)
 
-    def _note(self, message: Any, device: int) -> int:
-        """Its number. ``device`` counts only for what the autopilot says; 0 is nobody who can be spoken to."""
+    def _record(self, message: Any, device: int) -> int:
+        """Add the sender to the cell and return its number, or 0. ``device`` counts only if the autopilot sent it."""
         frame = message.received_frame
         if frame is None:
             return 0
-        is_autopilots = frame.component_id == self._talk.component_id
-        number = device if is_autopilots else frame.component_id
-        if (number in BEHIND) is not is_autopilots or number == 0:
+        is_from_autopilot = frame.component_id == self._session.component_id
+        number = device if is_from_autopilot else frame.component_id
+        if (number in AUTOPILOT_CAMERA_IDS) is not is_from_autopilot or number == 0:
             return 0
-        before = self.cell.latest or ()
-        if number not in before:
-            source = Source(self._talk.system_id, frame.component_id, message.NAME)
-            self.cell.set(tuple(sorted((*before, number), key=_rank)), source)
-        if number not in BEHIND and self._first_line.number is None:
-            self._first_line.bind(number)
+        known = self.cell.latest or ()
+        if number not in known:
+            source = Source(self._session.system_id, frame.component_id, message.NAME)
+            self.cell.set(tuple(sorted((*known, number), key=_sort_key)), source)
+        if number not in AUTOPILOT_CAMERA_IDS and self._first_link.number is None:
+            self._first_link.bind(number)
         return int(number)
 
 
-def _rank(number: int) -> tuple[bool, int]:
-    """Those with a component id of their own first."""
-    return number in BEHIND, number
+def _sort_key(number: int) -> tuple[bool, int]:
+    return number in AUTOPILOT_CAMERA_IDS, number

@@ -1,6 +1,6 @@
-"""``Capture``: one picture that was taken, from the three messages that tell of one.
+"""``Capture``: one picture, decoded from any of three messages; CSV export and geotagging.
 
-EXIF is made by Pillow (``pip install aerokit-mavlink[pictures]``); the picture itself stays byte for byte what it was.
+Pillow (``pip install aerokit-mavlink[pictures]``) writes the EXIF; the image data of the JPEG stays unchanged.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checked
-from aerokit._internal.files import write_whole
+from aerokit._internal.files import write_atomically
 from aerokit._internal.values import Snapshot
 from aerokit.errors import AerokitError, FileFormatError, InvalidArgument
 from aerokit.position import Position
-from aerokit.vehicle.camera.values import known, place_of
+from aerokit.vehicle.camera.values import finite_or_none, place_of
 
 if TYPE_CHECKING:
     import os
@@ -28,49 +28,37 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import CameraFeedback, CameraImageCaptured, CameraTrigger
     from aerokit.vehicle.state.telemetry import Telemetry
 
-__all__ = [
-    "LAST_SECOND",
-    "SECONDS_IN_1990",
-    "WRAPS",
-    "Capture",
-    "captures_csv",
-    "from_feedback",
-    "from_image",
-    "from_trigger",
-    "geotag_file",
-    "geotagged",
-    "write_captures",
-]
+__all__ = ["Capture", "captures_csv", "geotag_file", "geotagged", "write_captures"]
 
 Quaternion = tuple[float, float, float, float]
 
+# Time stamps below this (the year 1990) are not UTC: they count from the boot of the vehicle.
 SECONDS_IN_1990 = 631_152_000
-"""A time stamp below this counts from the vehicle's boot."""
 
-LAST_SECOND = 253_402_300_799
-"""The last one of the year 9999, with which calendars end."""
+# End of the year 9999, the largest that datetime can represent.
+MAX_UTC_S = 253_402_300_799
 
-WRAPS = 1 << 16
-"""CAMERA_FEEDBACK counts in 16 bits."""
+# CAMERA_FEEDBACK counts pictures in 16 bits.
+FEEDBACK_INDEX_RANGE = 1 << 16
 
-STRAIGHT = 0.99999
-"""Sine of a pitch at which roll and yaw turn about the same axis."""
+# Sine of the pitch beyond which roll and yaw turn about the same axis (gimbal lock).
+MAX_PITCH_SINE = 0.99999
 
 
 class Capture(Snapshot):
-    """One picture. None, or an empty text, is what was not told.
+    """One picture. Values that the camera did not report are None, or an empty text.
 
-    - ``camera``: 1 to 6 behind the autopilot, otherwise the camera's component id; ``index`` counts from 0
-    - ``success``: False when the camera could not take it; None when nobody said (CAMERA_TRIGGER)
-    - ``heard_at``: when we heard of it, on the loop's clock; ``taken_at``: seconds since 1970
-    - ``place``, and how the camera lay: ``quaternion`` (w, x, y, z), angles from the horizon and from north
-    - ``file_url``: where the file is: ``mftp:///…`` on the camera itself, or ``http://…``
+    - ``camera``: 1 to 6 for a camera attached to the autopilot, otherwise its component id; ``index`` counts from 0
+    - ``success``: False if the camera failed to take it; None if it did not say so (CAMERA_TRIGGER)
+    - ``received_at``: when the message arrived, on the loop's clock; ``taken_at``: seconds since 1970
+    - ``place`` and attitude of the camera: ``quaternion`` (w, x, y, z), angles from the horizon and from north
+    - ``file_url``: ``mftp:///…`` on the camera itself, or ``http://…``
     """
 
     camera: int
     index: int
     success: bool | None
-    heard_at: float
+    received_at: float
     taken_at: float | None
     place: Position | None
     quaternion: tuple[float, float, float, float] | None
@@ -80,22 +68,18 @@ class Capture(Snapshot):
     file_url: str
 
 
-def from_image(message: CameraImageCaptured, camera: int, heard_at: float) -> Capture:
-    """Of CAMERA_IMAGE_CAPTURED, the standard's."""
+def from_image(message: CameraImageCaptured, camera: int, received_at: float) -> Capture:
     q = message.q
-    length = math.sqrt(sum(each * each for each in q))
+    length = math.sqrt(sum(value * value for value in q))
     quaternion = (q[0], q[1], q[2], q[3]) if math.isfinite(length) and length > 0 else None
     roll, pitch, yaw = (None, None, None) if quaternion is None else _euler(quaternion)
-    place = place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000)
-    taken_at = _utc(message.time_utc)
-    success = message.capture_result == 1
     return Capture(
         camera,
         message.image_index,
-        success,
-        heard_at,
-        taken_at,
-        place,
+        message.capture_result == 1,
+        received_at,
+        _utc(message.time_utc),
+        place_of(message.lat, message.lon, message.alt / 1000, message.relative_alt / 1000),
         quaternion,
         roll,
         pitch,
@@ -104,73 +88,63 @@ def from_image(message: CameraImageCaptured, camera: int, heard_at: float) -> Ca
     )
 
 
-def from_feedback(message: CameraFeedback, camera: int, heard_at: float) -> Capture:
-    """Of CAMERA_FEEDBACK, ArduPilot's, which counts from 1."""
-    roll, pitch, yaw = _angles(message.roll, message.pitch, message.yaw)
+def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> Capture:
+    """Decode ArduPilot's CAMERA_FEEDBACK, which counts from 1."""
+    angles = _angles(message.roll, message.pitch, message.yaw)
     return Capture(
         camera,
-        (message.img_idx - 1) % WRAPS,
+        (message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
         True,
-        heard_at,
+        received_at,
         _utc(message.time_usec),
         place_of(message.lat, message.lng, message.alt_msl, message.alt_rel),
-        _quaternion_of(roll, pitch, yaw),
-        roll,
-        pitch,
-        yaw,
+        _quaternion_of(*angles),
+        *angles,
         "",
     )
 
 
-def from_trigger(message: CameraTrigger, camera: int, heard_at: float, telemetry: Telemetry) -> Capture:
-    """Of CAMERA_TRIGGER, PX4's, which tells no place: the vehicle's own is taken."""
+def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
+    """Decode PX4's CAMERA_TRIGGER, which has no position: use position and attitude of the vehicle."""
     position, attitude = telemetry.position.latest, telemetry.attitude.latest
-    roll, pitch, yaw = (
-        (None, None, None)
-        if attitude is None
-        else _angles(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
-    )
-    return Capture(
-        camera,
-        message.seq,
-        None,
-        heard_at,
-        _utc(message.time_usec),
-        None
-        if position is None
-        else Position(
+    angles: tuple[float | None, float | None, float | None] = (None, None, None)
+    if attitude is not None:
+        angles = _angles(attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
+    place = None
+    if position is not None:
+        place = Position(
             position.latitude_deg,
             position.longitude_deg,
             position.altitude_amsl_m,
             position.altitude_relative_m,
-        ),
-        _quaternion_of(roll, pitch, yaw),
-        roll,
-        pitch,
-        yaw,
+        )
+    return Capture(
+        camera,
+        message.seq,
+        None,
+        received_at,
+        _utc(message.time_usec),
+        place,
+        _quaternion_of(*angles),
+        *angles,
         "",
     )
 
 
 def _utc(microseconds: int) -> float | None:
     seconds = microseconds / 1e6
-    return seconds if SECONDS_IN_1990 <= seconds < LAST_SECOND else None
+    return seconds if SECONDS_IN_1990 <= seconds < MAX_UTC_S else None
 
 
 def _angles(roll: float, pitch: float, yaw: float) -> tuple[float | None, float | None, float | None]:
-    """Those that are numbers."""
-    return known(roll), known(pitch), known(yaw % 360.0)
+    return finite_or_none(roll), finite_or_none(pitch), finite_or_none(yaw % 360.0)
 
 
 def _quaternion_of(roll: float | None, pitch: float | None, yaw: float | None) -> Quaternion | None:
-    """Of angles in degrees, if all are known."""
     if roll is None or pitch is None or yaw is None:
         return None
-    return _quaternion(math.radians(roll), math.radians(pitch), math.radians(yaw))
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(each / 2), math.sin(each / 2)) for each in (roll, pitch, yaw))
+    halves = (math.radians(angle) / 2 for angle in (roll, pitch, yaw))
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(half), math.sin(half)) for half in halves)
     return (
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
@@ -180,11 +154,11 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in degrees; of a camera that looks straight up or down all turning is yaw."""
-    length = math.sqrt(sum(each * each for each in quaternion))
-    w, x, y, z = (each / length for each in quaternion)
+    """Convert to roll, pitch and yaw in degrees. Straight up or down, roll is 0 and yaw has all of the rotation."""
+    length = math.sqrt(sum(value * value for value in quaternion))
+    w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    if abs(sine) > STRAIGHT:
+    if abs(sine) > MAX_PITCH_SINE:
         roll, yaw = 0.0, -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -197,7 +171,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
 
 
 def _round(degrees: float) -> float:
-    """The noise of 32 bits is not worth showing."""
+    # 32-bit floats have no more digits; adding 0.0 turns -0.0 into 0.0.
     return round(degrees, 3) + 0.0
 
 
@@ -207,90 +181,88 @@ COLUMNS = (
 )  # fmt: skip
 
 START, EXIF, SCAN = 0xD8, 0xE1, 0xDA
-
 EXIF_HEADER = b"Exif\0\0"
-
-LONGEST_SEGMENT = 0xFFFF - 2
-
+MAX_SEGMENT_SIZE = 0xFFFF - 2
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
-
 DATE_TIME_ORIGINAL, OFFSET_TIME_ORIGINAL, CAMERA_ELEVATION_ANGLE = 0x9003, 0x9011, 0x9405
 
 
 @checked
 def captures_csv(captures: Iterable[Capture]) -> str:
-    """A line for each picture under a line with the names of the columns; what is not known is empty.
+    """Format captures as CSV: a header line, then a line for each capture; unknown values are empty.
 
-    ``file`` is the last part of its URL, ``taken_at`` in UTC (ISO 8601), angles in degrees from horizon and north.
+    ``file`` is the last part of the URL, ``taken_at`` is UTC in ISO 8601, angles are in degrees from horizon and north.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for each in captures:
-        place = each.place
-        told = (None,) * 4 if place is None else _numbers(place)
-        time = _time_of(each)
+    for capture in captures:
+        place = capture.place
+        coordinates = (None,) * 4 if place is None else _coordinates(place)
+        time = _time_of(capture)
         taken_at = "" if time is None else time.isoformat(timespec="milliseconds")
-        success = "" if each.success is None else int(each.success)
-        name = each.file_url.rpartition("/")[2]
-        angles = (each.roll_deg, each.pitch_deg, each.yaw_deg)
-        row = (name, each.camera, each.index, success, taken_at, *told, *angles)
+        success = "" if capture.success is None else int(capture.success)
+        name = capture.file_url.rpartition("/")[2]
+        angles = (capture.roll_deg, capture.pitch_deg, capture.yaw_deg)
+        row = (name, capture.camera, capture.index, success, taken_at, *coordinates, *angles)
         writer.writerow("" if value is None else value for value in row)
     return text.getvalue()
 
 
 @checked
 def write_captures(path: str | os.PathLike[str], captures: Iterable[Capture]) -> None:
-    """Write :func:`captures_csv` into a file, whole or not at all; OSError when that cannot be done."""
-    write_whole(path, captures_csv(captures))
+    """Write :func:`captures_csv` to a file, atomically. Raises OSError if that fails."""
+    write_atomically(path, captures_csv(captures))
 
 
 @checked
 def geotagged(jpeg: bytes, capture: Capture) -> bytes:
-    """A JPEG with the capture's time, place and direction in its EXIF; what else is in there stays.
+    """Return the JPEG with time, position and direction of the capture in its EXIF; other EXIF tags stay.
 
-    Writes GPSLatitude, GPSLongitude, GPSAltitude (above the sea), GPSImgDirection (from true north), GPSDateStamp and
-    GPSTimeStamp, DateTimeOriginal, and CameraElevationAngle (from the horizon), as far as the capture knows them.
+    Writes GPSLatitude, GPSLongitude, GPSAltitude (above mean sea level), GPSImgDirection (from true north),
+    GPSDateStamp and GPSTimeStamp, DateTimeOriginal, and CameraElevationAngle (from the horizon), where known.
 
     Raises:
-        InvalidArgument: the capture has no place.
-        FileFormatError: these bytes are no JPEG, or their EXIF cannot be read.
+        InvalidArgument: the capture has no position.
+        FileFormatError: the bytes are not a JPEG, or its EXIF is unreadable or would become too long.
         AerokitError: Pillow is not installed.
     """
     if capture.place is None:
-        raise InvalidArgument(f"capture {capture.index} of camera {capture.camera} has no place")
+        raise InvalidArgument(f"capture {capture.index} of camera {capture.camera} has no position")
     segments, rest = _split(jpeg)
-    before = next((each for each in segments if _is_exif(each)), b"")
+    existing = next((segment for segment in segments if _is_exif(segment)), b"")
     image = _pillow("Image")
     exif = image.Exif()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # by which Pillow tells that it leaves out what it cannot read
-            exif.load(before[4:])
+            warnings.simplefilter("error")  # Pillow only warns when it drops tags that it cannot parse.
+            exif.load(existing[4:])
             exif.get_ifd(EXIF_IFD).update(_exif_tags(capture))
             exif.get_ifd(GPS_IFD).update(_gps_tags(capture))
             body: bytes = exif.tobytes()
-    except Exception as error:  # whatever Pillow says of bytes that somebody else has written
-        raise FileFormatError(f"the EXIF of this picture cannot be read: {error}") from error
+    except Exception as error:  # Pillow raises many types for malformed EXIF.
+        raise FileFormatError(f"cannot read the EXIF of this picture: {error}") from error
     if not body.startswith(EXIF_HEADER):
         body = EXIF_HEADER + body
-    if len(body) > LONGEST_SEGMENT:
-        raise FileFormatError("the EXIF of this picture is too long to add a place to")
+    if len(body) > MAX_SEGMENT_SIZE:
+        raise FileFormatError(
+            f"cannot add the position: the EXIF would have {len(body)} bytes, more than {MAX_SEGMENT_SIZE}"
+        )
     tagged = bytes((0xFF, EXIF)) + (len(body) + 2).to_bytes(2, "big") + body
-    others = b"".join(each for each in segments if not _is_exif(each))
+    others = b"".join(segment for segment in segments if not _is_exif(segment))
     return bytes((0xFF, START)) + tagged + others + rest
 
 
 @checked
-def geotag_file(
-    path: str | os.PathLike[str], capture: Capture, *, to: str | os.PathLike[str] | None = None
-) -> None:
-    """Write a capture's place into a JPEG file, or into a copy of it; errors as :func:`geotagged`, and OSError.
+def geotag_file(path: str | os.PathLike[str], capture: Capture, *, to: str | os.PathLike[str] | None = None) -> None:
+    """Write the position of a capture into a JPEG file, or a copy of it.
+
+    Raises what :func:`geotagged` does, and OSError.
 
     Args:
         path: the picture.
-        capture: which one it is.
-        to: the copy; None: the file itself is replaced, whole or not at all.
+        capture: its capture.
+        to: path of the copy; None replaces the file itself, atomically.
     """
     source = Path(path)
     target = source if to is None else Path(to)
@@ -303,11 +275,10 @@ def geotag_file(
         part.unlink(missing_ok=True)
 
 
-# ---------------------------------------------------------------------------------------------- JPEG
 def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
-    """The segments in front of the picture itself, and that."""
+    """Return the segments in front of the image data, and the image data."""
     if jpeg[:3] != bytes((0xFF, START, 0xFF)):
-        raise FileFormatError("these bytes are no JPEG: they do not begin as one")
+        raise FileFormatError("not a JPEG: the bytes do not begin with its marker (FF D8 FF)")
     segments = list(_walk(jpeg))
     return segments, jpeg[2 + sum(map(len, segments)) :]
 
@@ -318,7 +289,7 @@ def _walk(jpeg: bytes) -> Iterator[bytes]:
         length = int.from_bytes(jpeg[at + 2 : at + 4], "big")
         segment = jpeg[at : at + 2 + length]
         if segment[:1] != b"\xff" or length < 2 or len(segment) < 2 + length:
-            raise FileFormatError("these bytes are no whole JPEG: they end before the picture begins")
+            raise FileFormatError("incomplete JPEG: it ends before the image data")
         yield segment
         at += len(segment)
 
@@ -334,7 +305,6 @@ def _pillow(module: str) -> Any:
         raise AerokitError("geotagging needs Pillow: pip install aerokit-mavlink[pictures]") from None
 
 
-# ---------------------------------------------------------------------------------------------- tags
 def _exif_tags(capture: Capture) -> dict[int, Any]:
     tags: dict[int, Any] = {}
     time = _time_of(capture)
@@ -347,7 +317,7 @@ def _exif_tags(capture: Capture) -> dict[int, Any]:
 
 
 def _gps_tags(capture: Capture) -> dict[int, Any]:
-    """By their numbers in the EXIF standard."""
+    """Tags by their numbers in the EXIF standard."""
     place = capture.place
     assert place is not None
     tags: dict[int, Any] = {
@@ -370,7 +340,7 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
 
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
-    """Degrees, minutes, seconds; four places of a second are some millimetres."""
+    """Convert to degrees, minutes and seconds, rounded to 0.0001 seconds (some millimetres)."""
     units = round(abs(degrees) * 36_000_000)
     minutes, seconds = divmod(units, 600_000)
     whole, minutes = divmod(minutes, 60)
@@ -378,13 +348,13 @@ def _sexagesimal(degrees: float) -> tuple[float, float, float]:
 
 
 def _time_of(capture: Capture) -> datetime | None:
-    """``math.floor``: EXIF has whole seconds, which may not be rounded into the next one."""
-    if capture.taken_at is None or not 0 <= capture.taken_at < LAST_SECOND:
-        return None  # no calendar holds it
+    if capture.taken_at is None or not 0 <= capture.taken_at < MAX_UTC_S:
+        return None
+    # Rounded down, because EXIF has whole seconds: rounding up could change the second.
     return datetime.fromtimestamp(math.floor(capture.taken_at * 1000) / 1000, timezone.utc)
 
 
-def _numbers(place: Any) -> tuple[float | None, ...]:
+def _coordinates(place: Any) -> tuple[float | None, ...]:
     return (
         round(place.latitude_deg, 7),
         round(place.longitude_deg, 7),

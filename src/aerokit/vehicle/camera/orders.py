@@ -1,184 +1,338 @@
-"""Orders to one camera: given once where a second time would be harm, and at the ends of blocks."""
+"""Commands to one camera, and requests for its messages."""
 
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
-from aerokit.errors import AerokitError, CommandRejected, CommandTimeout
+from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, OperationTimeout
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.message import Message
 from aerokit.protocols.command import command_long, command_name
-from aerokit.vehicle.commanding.order import OVERRULED
+from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
-    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.connection.cells import StateCell
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, SentCommand, Topic
     from aerokit.vehicle.components.component import Component
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
-SENT = 8
-"""An order that must not be given twice goes out so often at most, each time because the one before was lost."""
+MessageT = TypeVar("MessageT", bound=Message)
+
+# Camera device ids of cameras that are attached to the autopilot and have no component id of their own.
+AUTOPILOT_CAMERA_IDS = range(1, 7)
+
+# Limit for orders that must not be executed twice: each is sent again only after the one before was found lost.
+MAX_ORDER_ATTEMPTS = 8
 
 
-class _Standing:
-    """Whether a command to a camera may be sent again: to one that has told of itself.
+class _ResendGuard:
+    """Decides whether a command to a camera may be sent again.
 
-    One with a component id of its own must have been heard since the order: HEARTBEAT of the autopilot is none of its.
+    A camera with its own component id must have been received since the command; the HEARTBEAT of the autopilot says
+    nothing about it.
     """
 
-    def __init__(self, line: Ordering, sent: SentCommand) -> None:
-        self._line, self._sent = line, sent
+    def __init__(self, link: CameraOrders, sent: SentCommand) -> None:
+        self._link, self._sent = link, sent
 
     @property
     def end(self) -> str:
-        """Why it must not be sent again, as a clause; empty while it may."""
         return self._sent.end
 
     @property
-    def told_at(self) -> float:
-        """When the camera last told of itself, of a vehicle that is not silent either."""
-        return self._sent.told_at if self._line.is_behind else self._line.heard_at()
+    def heartbeat_at(self) -> float:
+        return self._sent.heartbeat_at if self._link.is_autopilot_attached else self._link.heartbeat_at()
 
 
-class Ordering:
-    """What a line to a camera gives orders by."""
+class CameraOrders:
+    """Base class of `CameraLink`: orders and commands to one camera."""
 
-    _bridge: Bridge
-    _talk: Talk
+    _context: VehicleContext
+    _session: VehicleSession
     _component: Component | None
+    # 1 to 6 if attached to the autopilot, otherwise the component id; None until bound.
+    number: int | None
 
     @property
-    def is_behind(self) -> bool:
-        """Whether the autopilot speaks for it."""
-        raise NotImplementedError
+    def is_autopilot_attached(self) -> bool:
+        return self.number in AUTOPILOT_CAMERA_IDS
 
     @property
     def device(self) -> int:
-        """The target camera id in commands."""
-        raise NotImplementedError
+        """Camera device id for commands; 0 means the component itself."""
+        return self.number if self.number is not None and self.is_autopilot_attached else 0
 
     @property
     def component(self) -> Component:
-        """What it is reached by; only once it is found."""
-        assert self._component is not None
+        assert self._component is not None, "the camera is not bound yet"
         return self._component
 
-    def heard_at(self) -> float:
-        """When its own HEARTBEAT came last; never, while the vehicle is silent."""
-        heard_at = self._talk.connection.heard_at(self._talk.system_id, self.component.component_id)
-        return heard_at if self._bridge.arbiter.is_known else -math.inf
+    def now(self) -> float:
+        return self._session.connection.now()
+
+    def heartbeat_at(self) -> float:
+        """Loop time of the camera's last HEARTBEAT; -inf while the vehicle is silent."""
+        heard_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
+        return heard_at if self._context.arbiter.is_known else -math.inf
 
     @property
     def on_finish(self) -> list[Callable[[], None]]:
-        """What is to be sent when the vehicle's block ends, without waiting."""
-        return self._bridge.on_finish
+        """Called when the block of the vehicle ends; may send, must not wait."""
+        return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
-        """What orders to this camera are about; the same for all objects of it."""
+        """Arbiter topic of a subject such as ``"video"``; the same for all objects of this camera."""
         return ("camera", self.component.component_id, self.device, subject)
 
-    def begin(self, subject: str) -> Order:
-        """A new order about this; withdrawn, it lets the one before count again."""
-        return self._bridge.arbiter.of_device(self.topic(subject), may_be_withdrawn=True)
+    def begin_order(self, subject: str) -> Order:
+        return self._context.arbiter.of_device(self.topic(subject), may_be_withdrawn=True)
 
-    def latest(self, subject: str) -> Order | None:
-        """The newest order about this that was not withdrawn."""
-        return self._bridge.arbiter.latest(self.topic(subject))
+    def latest_order(self, subject: str) -> Order | None:
+        return self._context.arbiter.latest(self.topic(subject))
 
     @contextmanager
-    def giving(self, subject: str) -> Iterator[Order]:
-        """A new order about this is given, for the time of the block; one that fails lets those before count again."""
-        given = self.begin(subject)
+    def new_order(self, subject: str) -> Iterator[Order]:
+        """Begin an order; withdraw it if the block raises, settle it otherwise."""
+        order = self.begin_order(subject)
         try:
-            yield given
+            yield order
         except BaseException:
-            given.withdraw()
+            order.withdraw()
             raise
-        given.settle()
+        order.commit()
 
-    async def order(self, command: int, *params: float, given: Order | None = None, **options: Any) -> None:
-        """A command that changes something; sent again as docs/reliability.md has it.
+    async def command(self, command: int, *params: float, order: Order | None = None, **options: Any) -> None:
+        """Send a command that changes something, retried according to docs/reliability.md.
 
-        ``given`` is the order that it is of, if a newer one about the same may end it.
+        A newer order about the same topic ends the retries of ``order``.
         """
-        if given is not None and not given.is_newest:
-            raise CommandTimeout(f"{command_name(command)} was not sent: {OVERRULED}")
-        if given is not None and not self._talk.is_closed:
-            given.is_given = True
-        talk, started = self._talk, self._talk.connection.now()
-        arbiter = self._bridge.arbiter
-        with arbiter.aside(given) as order, arbiter.sending(order) as sent:
+        if order is not None and not order.is_newest:
+            raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}")
+        if order is not None and not self._session.is_closed:
+            order.may_move = True
+        session, started = self._session, self._session.connection.now()
+        arbiter = self._context.arbiter
+        with arbiter.auxiliary_order(order) as sent_order, arbiter.sending(sent_order) as sent:
             try:
-                await talk.commands.send_long(
+                await session.commands.send_long(
                     command,
                     *params,
                     component_id=self.component.component_id,
-                    standing=_Standing(self, sent),
+                    order_status=_ResendGuard(self, sent),
                     **options,
                 )
             except CommandRejected as error:
-                await talk.settle()
-                raise talk.explained(error, started) from None
+                await session.wait_for_status_texts()
+                raise session.with_reasons(error, started) from None
 
     async def order_once(
         self,
-        given: Order,
+        order: Order,
         send: Callable[[], Awaitable[None]],
-        has_worked: Callable[[], Awaitable[bool | None]],
+        is_confirmed: Callable[[], Awaitable[bool | None]],
     ) -> None:
-        """An order that must not be given twice: again only when the camera, asked after it, has done nothing.
+        """Send an order that must not be executed twice; retry only if the camera reports that it had no effect.
 
-        ``has_worked`` asks; None is no answer, and then nobody knows. A newer order is not undone.
+        ``is_confirmed`` asks the camera; None means that it did not answer. A newer order ends the retries.
         """
-        for sent in range(1, SENT + 1):
+        for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
                 await send()
                 return
             except CommandTimeout as error:
-                if not given.is_newest:
-                    raise CommandTimeout(f"{error}; not sent again: {OVERRULED}") from None
-                worked = await has_worked()
-                if not given.is_newest:
-                    raise CommandTimeout(f"{error}; not sent again: {OVERRULED}") from None
+                worked = await is_confirmed() if order.is_newest else None
+                if not order.is_newest:
+                    raise CommandTimeout(f"{error}; not sent again: {SUPERSEDED}") from None
                 if worked:
                     return
-                if worked is None or sent == SENT:
+                if worked is None or attempt == MAX_ORDER_ATTEMPTS:
                     raise
 
-    def order_now(self, command: int, *params: float) -> None:
-        """Send a command once and do not wait: for ends of blocks, which must not await."""
-        if self._component is None or self._talk.is_closed or not self._talk.connection.is_open:
+    def send_now(self, command: int, *params: float) -> None:
+        """Send a command once without waiting, e.g. when a block exits by cancellation."""
+        if self._component is None or self._session.is_closed or not self._session.connection.is_open:
             return
         target = self._component.component_id
-        self._talk.connection.send(command_long(self._talk.system_id, target, command, params))
+        self._session.connection.send(command_long(self._session.system_id, target, command, params))
 
-    async def finish(self, given: Order, command: int, *params: float, is_awaited: bool) -> None:
-        """The end of a block: the command leaves at once, and is sent again beside the program until it is answered.
+    async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
+        """Send the command that ends a block at once, and retry it in the background until it is acknowledged.
 
-        Not if a newer order about the same was given meanwhile. Raises, if ``is_awaited``, what :meth:`order` does.
+        Does nothing if a newer order was given. With ``is_awaited``, raises what :meth:`command` does.
         """
-        if not given.is_newest or self._talk.is_closed:
+        if not order.is_newest or self._session.is_closed:
             return
         answered, errors = anyio.Event(), []
 
-        async def insist() -> None:
+        async def confirm() -> None:
             try:
-                if given.is_newest:
-                    await self.order(command, *params, given=given, is_sent=True)
+                if order.is_newest:
+                    await self.command(command, *params, order=order, is_sent=True)
             except AerokitError as error:
-                if given.is_newest:
+                if order.is_newest:
                     errors.append(error)
             finally:
                 answered.set()
 
-        self.order_now(command, *params)
-        self._talk.background.start(insist, "aerokit end of a camera's block")
+        self.send_now(command, *params)
+        self._session.background.start(confirm, "aerokit end of a camera's block")
         if not is_awaited:
             return
         await answered.wait()
         if errors:
             raise errors[0]
+
+
+# A cell is polled for this long after the program has read it.
+INTEREST_TIMEOUT_S = 10.0
+
+POLL_INTERVAL_S = 1.0
+
+# Commands that requested a message before MAV_CMD_REQUEST_MESSAGE existed, and their parameters. The first parameter
+# of NUMBERED_MESSAGES selects the item.
+LEGACY_REQUESTS: dict[type[Message], tuple[int, tuple[float, ...]]] = {
+    m.CameraInformation: (MavCmd.REQUEST_CAMERA_INFORMATION, (1,)),
+    m.CameraSettings: (MavCmd.REQUEST_CAMERA_SETTINGS, (1,)),
+    m.CameraCaptureStatus: (MavCmd.REQUEST_CAMERA_CAPTURE_STATUS, (1,)),
+    m.StorageInformation: (MavCmd.REQUEST_STORAGE_INFORMATION, (0, 1)),
+    m.CameraImageCaptured: (MavCmd.REQUEST_CAMERA_IMAGE_CAPTURE, (0,)),
+    m.VideoStreamInformation: (MavCmd.REQUEST_VIDEO_STREAM_INFORMATION, (0,)),
+    m.VideoStreamStatus: (MavCmd.REQUEST_VIDEO_STREAM_STATUS, (0,)),
+}
+
+NUMBERED_MESSAGES = (
+    m.StorageInformation,
+    m.CameraImageCaptured,
+    m.VideoStreamInformation,
+    m.VideoStreamStatus,
+)
+
+# Results that are final until the next reboot; others are temporary.
+UNSUPPORTED = (MavResult.UNSUPPORTED, MavResult.DENIED)
+
+# ArduPilot answers FAILED if it does not support a message, other firmware if it cannot send it now: poll rarely.
+MAYBE_UNSUPPORTED = (*UNSUPPORTED, MavResult.FAILED)
+DOUBTFUL_POLL_INTERVAL_S = 60.0
+
+
+class _PolledCell:
+    """Poll state of one cell: notices that the program reads or watches it. Implements ``Feed`` of the cell."""
+
+    def __init__(
+        self, now: Callable[[], float], cell: StateCell[Any], message_type: type[Message], period_s: float
+    ) -> None:
+        self._now, self._cell = now, cell
+        self.message_type, self.period_s = message_type, period_s
+        self.read_at = self.requested_at = -math.inf
+        self.is_refused = self.is_doubtful = False
+        cell._feed_from(self)
+
+    @property
+    def pending(self) -> bool:
+        # The cell asks this on every read.
+        self.read_at = self._now()
+        return False
+
+    def catch_up(self) -> None:
+        pass
+
+    def watchers_changed(self) -> None:
+        self.read_at = self._now()
+
+    def is_due(self) -> bool:
+        now = self._now()
+        is_wanted = self._cell._is_watched or now - self.read_at <= INTEREST_TIMEOUT_S
+        period_s = max(DOUBTFUL_POLL_INTERVAL_S, self.period_s) if self.is_doubtful else self.period_s
+        newest = max(self.requested_at, self._cell._updated_at)
+        return is_wanted and not self.is_refused and now - newest >= period_s
+
+
+class MessageRequests:
+    """Requests messages from one camera, by MAV_CMD_REQUEST_MESSAGE or the older commands, and polls cells."""
+
+    def __init__(self, link: CameraOrders) -> None:
+        self._link = link
+        self._polled: list[_PolledCell] = []
+        self._legacy_types: set[type[Message]] = set()
+
+    async def request(
+        self,
+        message_type: type[MessageT],
+        *params: float,
+        where: Callable[[MessageT], bool] = lambda _: True,
+        timeout: float = 3.0,
+    ) -> MessageT | None:
+        """Request one message; None if it does not arrive in time, CommandRejected if it is not supported."""
+        refusal: CommandRejected | None = None
+        if message_type not in self._legacy_types:
+            try:
+                return await self._link.component.request(message_type, *params, where=where, timeout=timeout)
+            except OperationTimeout:
+                return None
+            except CommandRejected as error:
+                if (
+                    message_type not in LEGACY_REQUESTS
+                    or error.result not in MAYBE_UNSUPPORTED
+                    or self._link.is_autopilot_attached
+                ):
+                    raise
+                refusal = error
+        try:
+            found = await self._request_legacy(message_type, params, where, timeout)
+        except CommandRejected as error:
+            raise refusal or error from None
+        self._legacy_types.add(message_type)
+        return found
+
+    async def _request_legacy(
+        self,
+        message_type: type[MessageT],
+        params: tuple[float, ...],
+        where: Callable[[MessageT], bool],
+        timeout: float,
+    ) -> MessageT | None:
+        command, (first, *others) = LEGACY_REQUESTS[message_type]
+        if message_type in NUMBERED_MESSAGES and params:
+            first = params[0]
+        with self._link.component.subscribe(message_type, capacity=100) as answers:
+            with suppress(CommandTimeout):
+                await self._link.component.command(command, first, *others, retries=1)
+            with anyio.move_on_after(timeout):
+                async for answer in answers:
+                    if where(answer):
+                        return answer
+        return None
+
+    def poll_for(self, cell: StateCell[Any], message_type: type[Message], period_s: float) -> None:
+        """Poll the message of a cell every ``period_s`` seconds while the program uses the cell."""
+        self._polled.append(_PolledCell(self._link.now, cell, message_type, period_s))
+
+    def forget_refusals(self) -> None:
+        self._legacy_types.clear()
+        for cell in self._polled:
+            cell.is_refused = cell.is_doubtful = False
+
+    async def run(self) -> None:
+        while True:
+            await anyio.sleep(POLL_INTERVAL_S)
+            for cell in self._polled:
+                if self._link.number is not None and cell.is_due():
+                    await self._refresh(cell)
+
+    async def _refresh(self, cell: _PolledCell) -> None:
+        cell.requested_at = self._link.now()
+        try:
+            await self.request(cell.message_type, timeout=POLL_INTERVAL_S)
+        except CommandRejected as error:
+            cell.is_refused = error.result in UNSUPPORTED
+            cell.is_doubtful = error.result in MAYBE_UNSUPPORTED
+        else:
+            cell.is_doubtful = False

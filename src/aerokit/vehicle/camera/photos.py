@@ -1,131 +1,331 @@
-"""Pictures: one, or one after the other, and what was taken before."""
+"""Taking photos, one or a series."""
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit._internal.wording import shown
-from aerokit.errors import FileFormatError, InvalidArgument, NotSupported
-from aerokit.vehicle.camera.album import LONGEST, Album
+from aerokit.errors import CommandRejected, CommandTimeout, OperationRejected
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.vehicle.camera.capture import Capture
-from aerokit.vehicle.camera.part import CameraPart
-from aerokit.vehicle.camera.shooting import PhotoInterval, Shutter
+from aerokit.vehicle.camera.capture_log import CaptureLog, CaptureQueue
+from aerokit.vehicle.camera.link import ActiveOperation
+from aerokit.vehicle.camera.orders import MAX_ORDER_ATTEMPTS
+from aerokit.vehicle.camera.values import CameraStatus, status_of
 
 if TYPE_CHECKING:
-    from aerokit.connection.cells import StateCell
-    from aerokit.vehicle.camera.link import CameraLine
+    from types import TracebackType
 
-MOST, MOST_MISSING = 32_767, 3
-MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://.|/.", re.IGNORECASE)
+    from typing_extensions import Self
+
+    from aerokit.vehicle.camera.link import CameraLink
+    from aerokit.vehicle.commanding.order import Order
+
+START, STOP = MavCmd.IMAGE_START_CAPTURE, MavCmd.IMAGE_STOP_CAPTURE
+CONTROL, TRIGGER = MavCmd.DO_DIGICAM_CONTROL, MavCmd.DO_TRIGGER_CONTROL
+TRIGGER_INTERVAL = MavCmd.DO_SET_CAM_TRIGG_INTERVAL
+# A series is checked after this long without a capture.
+CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
+# Status requests before an order, to a camera that has answered them before, and to others.
+STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
+# Checks of a silent series without a result before it is given up.
+MAX_SILENT_CHECKS = 6
+# An index in a series is plausible up to this many captures above twice the number that its interval allows.
+MAX_EXTRA_CAPTURES = 10
+# After this many unanswered requests in a row, the remaining gap is skipped.
+MAX_UNANSWERED = 3
 
 
-@checks_arguments
-class PhotoCalls(CameraPart):
-    """Taking pictures, and the list of those that were taken."""
+class Shutter:
+    """Orders one photo, or a series, and determines whether a lost order was executed."""
 
-    def __init__(self, line: CameraLine) -> None:
-        super().__init__(line)
-        self._album = Album(line)
-        self._shutter = Shutter(line, self._album)
-        self.capture: StateCell[Capture] = self._album.cell
-        """The latest picture that was heard of."""
+    def __init__(self, link: CameraLink, log: CaptureLog) -> None:
+        self.link: CameraLink = link
+        self.log: CaptureLog = log
+        self._number = 0
+        self._lock = anyio.Lock()
+        self._reports_status = self._has_no_status = False
 
-    async def take_photo(self, *, timeout: float = 10.0) -> Capture:
-        """Take one picture; returns when the camera has told of it.
+    async def status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
+        """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""
+        if self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
+            return None
+        message = await self.link.request(m.CameraCaptureStatus, timeout=timeout)
+        self._reports_status = self._reports_status or message is not None
+        return None if message is None else status_of(message)
 
-        Sends MAV_CMD_IMAGE_START_CAPTURE (https://mavlink.io/en/services/camera.html), MAV_CMD_DO_DIGICAM_CONTROL to
-        PX4's trigger and to whoever knows nothing better. The order is never sent again blindly: only when the camera,
-        asked after it, says that it takes no picture and has taken none. CAMERA_IMAGE_CAPTURED that was lost is asked
-        for. Cancelled, it may still be taken.
+    async def baseline_status(self) -> CameraStatus | None:
+        # The status before an order shows later whether it was executed, so it is requested more often.
+        first_attempts = 1 if self._has_no_status else FIRST_STATUS_ATTEMPTS
+        for _ in range(STATUS_ATTEMPTS if self._reports_status else first_attempts):
+            status = await self.status(STATUS_TIMEOUT_S)
+            if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
+                return status
+        self._has_no_status = not self._reports_status
+        return None
 
-        Args:
-            timeout: seconds until it must have been told.
-
-        Raises:
-            NotSupported: the camera takes no pictures. Nothing was sent.
-            CommandRejected: the camera refused: it is busy, or in the wrong mode.
-            CommandTimeout: it did not answer; it may have taken the picture.
-            OperationRejected: it could not take the picture.
-            OperationTimeout: it told of no picture, or no camera was heard.
-        """
-        await self._line.able("take_photo", "capture_image")
-        return await self._shutter.take(timeout)
-
-    def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
-        """A picture every so many seconds for the time of an ``async with`` block, which gives them in order.
-
-        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …``. Those of which
-        the message was lost are asked for again. MAV_CMD_IMAGE_STOP_CAPTURE at the end of the block, also when it is
-        cancelled; PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
-
-        Args:
-            seconds: from one picture to the next, above 0 to 3600.
-            count: 0 (until the block ends) to 32767; after so many the iterator ends.
-
-        Raises:
-            InvalidArgument: an argument is out of range. Nothing was sent.
-        """
-        check_range("seconds", seconds, 0, 3600, above=True)
-        check_range("count", count, 0, MOST)
-        return PhotoInterval(self._shutter, seconds, count)
-
-    def captures(self) -> list[Capture]:
-        """The pictures that were heard of, by their index; at most 20,000, the newest."""
-        return self._album.captures()
-
-    async def load_captures(self, *, timeout: float = 600.0) -> list[Capture]:
-        """All pictures in the camera's log, also those that were taken before: what is not known yet is asked for.
-
-        The newest 20,000 at most. A camera behind the autopilot tells of its newest one only. Where three on
-        end are not told, it ends.
-
-        Args:
-            timeout: seconds until all must have come; :meth:`captures` has those that came in time.
-
-        Raises:
-            OperationTimeout: the camera does not say how many there are, or what it is, or it took too long.
-        """
-        count: int | None = None
-        with anyio.move_on_after(timeout):
-            await self._line.find()
-            status = await self._shutter.status()
-            if status is None:
-                raise self._line.timed_out("does not say how many pictures it has taken")
-            count = status.image_count
-            missing = 0
-            for index in range(max(0, count - (1 if self._line.is_behind else LONGEST)), count):
-                missing = 0 if await self._album.ask_for(index) else missing + 1
-                if missing == MOST_MISSING:
-                    break
-            return self.captures()
-        told = (
-            "did not say how many it has taken"
-            if count is None
-            else f"did not tell of all of its {count} pictures"
-        )
-        raise self._line.timed_out(f"{told} within {timeout:g} s")
-
-    async def read_picture(self, capture: Capture) -> bytes:
-        """The file of a picture, by MAVFTP: for a ``file_url`` that begins with ``mftp:`` or ``/``, at most 16 MB.
-
-        Raises:
-            NotSupported: its URL is another one, or it has none. Nothing was sent.
-            FileError: the camera has no such file.
-            OperationTimeout: nothing came any more, or no camera was heard.
-        """
-        url = capture.file_url
-        if not MAVFTP.match(url):
-            raise NotSupported(
-                f"read_picture: {shown(url) if url else 'no URL'} is none of MAVFTP; nothing was sent"
+    async def take(self, timeout: float) -> Capture:
+        async with self._lock:
+            series = self.link.latest_order("series")
+            before = await self.baseline_status()
+            known = {capture.index for capture in self.log.captures()}
+            error: CommandTimeout | None = None
+            with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
+                sent, error = 1, await self.order_photo(before)
+                while True:
+                    while capture := new_captures.take():
+                        # The index of a failed picture may be used again.
+                        is_old = before is not None and capture.index < before.image_count
+                        if not is_old or capture.index not in known:
+                            return self._done(capture)
+                    round_trip_s = self.link.round_trip_s or 0.0
+                    if await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s)):
+                        continue
+                    now = await self.status()
+                    if now is None:
+                        continue
+                    if before is None:
+                        # An accepted order has made the newest picture.
+                        newest = now.image_count - 1
+                        is_missed = error is None and not now.is_capturing and newest >= 0 and newest not in known
+                        missed = await self.log.fetch(newest) if is_missed else None
+                    elif now.image_count > before.image_count:
+                        missed = await self.log.fetch(before.image_count)
+                    elif self.link.latest_order("series") is not series:
+                        continue  # A series was started or stopped since, so the count proves nothing.
+                    elif error is not None and sent < MAX_ORDER_ATTEMPTS and not now.is_capturing:
+                        # The camera reports, after the order, that nothing was taken: the order was lost.
+                        sent, error = sent + 1, await self.order_photo(before, again=True)
+                        continue
+                    else:
+                        continue
+                    if missed is not None:
+                        return self._done(missed)
+            raise error or self.link.timeout_error(
+                f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
-        await self._line.find()
+
+    def _done(self, capture: Capture) -> Capture:
+        if capture.success is False:
+            raise OperationRejected(f"{self.link.describe()} could not take the picture")
+        return capture
+
+    async def order_photo(self, before: CameraStatus | None, *, again: bool = False) -> CommandTimeout | None:
+        """Order a picture, once; return the time-out if it was not acknowledged.
+
+        A repeated order has the same sequence number, so that a camera does not execute it twice.
+        """
+        if not again:
+            count = 0 if before is None else before.image_count
+            self._number = max(count + 1, self._number + 1)
         try:
-            return await self._line.component.fetch(f"mftp://{url}" if url.startswith("/") else url)
-        except FileFormatError:
+            if self.link.is_trigger:
+                await self._send_digicam_control()
+            else:
+                await self.link.command(START, self.link.device, 0, 1, self._number, attempts=1)
+        except CommandTimeout as error:
+            return error
+        except CommandRejected as error:
+            if error.result != MavResult.UNSUPPORTED or self.link.is_trigger:
+                raise
+            try:
+                await self._send_digicam_control()
+            except CommandRejected:
+                raise error from None
+        return None
+
+    async def _send_digicam_control(self) -> None:
+        # The older command, for PX4's trigger and for cameras that do not support MAV_CMD_IMAGE_START_CAPTURE.
+        await self.link.command(CONTROL, 0, 0, 0, 0, 1, 0, 0, attempts=1)
+
+    async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
+        """Start a series; repeat the order only if the camera reports that it has not started."""
+        if self.link.is_trigger:
+            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, -1)
+            await self.link.command(TRIGGER, 1, -1, 0, 0, order=order)
+            return
+
+        async def has_begun() -> bool | None:
+            now = await self.baseline_status()
+            if now is None or before is None:
+                return None
+            return now.is_in_series or now.is_capturing or now.image_count > before.image_count
+
+        command = (START, self.link.device, seconds, count, 0)
+        await self.link.order_once(order, lambda: self.link.command(*command, order=order, attempts=1), has_begun)
+
+    @property
+    def stop_command(self) -> tuple[float, ...]:
+        return (TRIGGER, 0, -1, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
+
+
+class PhotoInterval:
+    """A series of photos for the duration of an ``async with`` block; an async iterator over its captures, in order.
+
+    Returned by :meth:`Camera.photo_interval`. Missed captures are requested again; ``missed`` counts those that the
+    camera did not send (ArduPilot and PX4 keep only the last one of their own cameras).
+    """
+
+    def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
+        self._shutter, self._seconds, self._count = shutter, seconds, count
+        self._link, self._log = shutter.link, shutter.log
+        self._new_captures = CaptureQueue(self._log.cell)
+        self._next: int | None = None
+        self._began_at = self._log.reset_at
+        self._possible_first: Capture | None = None
+        # True if no status was available: the index of the first capture is taken as the start.
+        self._is_start_guessed = False
+        # Highest plausible index so far, and when it was received.
+        self._newest_at = 0.0
+        self._newest = 0
+        self._unanswered = 0
+        self._waiting: dict[int, Capture] = {}
+        self._failed: list[Capture] = []
+        self._delivered = 0
+        self._missed = 0
+        self._operation: ActiveOperation | None = None
+
+    @property
+    def missed(self) -> int:
+        """Number of pictures that were taken, but whose captures are not available."""
+        return self._missed
+
+    async def __aenter__(self) -> Self:
+        await self._link.require_capability("photo_interval", "capture_image")
+        operation = self._operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
+        try:
+            await self._begin(operation)
+        except BaseException as error:
+            self._new_captures.__exit__()
+            if operation.commit(error):
+                await operation.stop(is_awaited=False)
             raise
-        except InvalidArgument as error:
-            raise NotSupported(f"read_picture: {error}; nothing was sent") from None
+        operation.commit()
+        return self
+
+    async def _begin(self, operation: ActiveOperation) -> None:
+        before = await self._shutter.baseline_status()
+        self._next = None if before is None else before.image_count
+        self._newest, self._newest_at = (self._next or 0) - 1, self._link.now()
+        self._began_at = self._log.reset_at
+        self._new_captures.__enter__()
+        await self._shutter.start_series(operation.order, self._seconds, self._count, before)
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._new_captures.__exit__()
+        has_ended = 0 < self._count <= self._delivered and not self._link.is_trigger
+        if self._operation is not None and has_ended:
+            self._operation.discard()
+        elif self._operation is not None:
+            await self._operation.stop(is_awaited=exc is None)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Capture:
+        """Return the next capture.
+
+        Raises:
+            OperationRejected: the camera ended the series early.
+            OperationTimeout: the camera reports no more pictures.
+        """
+        silent = 0
+        while True:
+            if self._count and self._delivered + self._missed >= self._count:
+                raise StopAsyncIteration
+            self._collect()
+            if self._failed:
+                self._delivered += 1
+                return self._failed.pop(0)
+            if self._next is not None and self._next in self._waiting:
+                capture = self._waiting.pop(self._next)
+                self._unanswered = 0
+                self._next += 1
+                self._delivered += 1
+                return capture
+            if self._waiting and self._next is not None:
+                await self._fetch_missing()
+                continue
+            if await self._new_captures.wait(max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S):
+                silent = 0
+                continue
+            silent += 1
+            await self._check_silence(silent)
+
+    def _first_after_reset(self, capture: Capture) -> Capture | None:
+        # The camera has counted from 0 again if two successive indices say so: a single one could be corrupt.
+        before, self._possible_first = self._possible_first, None
+        if self._log.reset_at > self._began_at and self._next is not None and capture.index < self._next:
+            self._possible_first = capture
+            if before is not None and capture.index == before.index + 1:
+                return before
+        return None
+
+    def _collect(self) -> None:
+        while capture := self._new_captures.take():
+            first = self._first_after_reset(capture)
+            if first is not None:
+                self._began_at = self._log.reset_at
+                self._next, self._is_start_guessed = first.index, False
+                self._newest, self._newest_at = first.index, self._link.now()
+                self._waiting = {first.index: first}
+            if self._next is None or self._contradicts_guess(capture.index):
+                self._next, self._is_start_guessed = capture.index, self._next is None
+                self._newest = capture.index - 1
+            if not self._is_plausible(capture.index):
+                continue
+            if capture.success is False:  # A later picture may have the same index.
+                self._failed.append(capture)
+            elif capture.index >= self._next:
+                self._waiting[capture.index] = capture
+                if capture.index > self._newest:
+                    self._is_start_guessed = self._is_start_guessed and not self._delivered
+                    self._newest, self._newest_at = capture.index, self._link.now()
+
+    def _max_new_captures(self) -> float:
+        """Upper limit of pictures taken since the newest one."""
+        return 2.0 * (self._link.now() - self._newest_at) / self._seconds + MAX_EXTRA_CAPTURES
+
+    def _is_plausible(self, index: int) -> bool:
+        """Return True if the series can have this index by now; one far ahead is corrupt."""
+        return index <= self._newest + self._max_new_captures()
+
+    def _contradicts_guess(self, index: int) -> bool:
+        """Return True if an index far below the first one shows that the first one was corrupt."""
+        return self._is_start_guessed and self._next is not None and index < self._next - self._max_new_captures()
+
+    async def _fetch_missing(self) -> None:
+        assert self._next is not None
+        found = None
+        if not self._link.is_trigger and self._unanswered < MAX_UNANSWERED:
+            found = await self._log.fetch(self._next)
+        self._collect()
+        if found is not None:
+            self._unanswered = 0
+        if found is not None and found.success is False:
+            self._next += 1
+        elif found is not None:
+            self._waiting[self._next] = found
+        elif self._next not in self._waiting:
+            self._unanswered += 1
+            can_fetch = not self._link.is_trigger and self._unanswered <= MAX_UNANSWERED
+            following = self._next + 1 if can_fetch or not self._waiting else min(self._waiting)
+            self._missed += following - self._next
+            self._next = following
+
+    async def _check_silence(self, silent: int) -> None:
+        now = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
+        self._collect()
+        is_ahead = now is not None and self._next is not None and now.image_count > self._next
+        if now is not None and is_ahead and self._is_plausible(now.image_count - 1):
+            await self._fetch_missing()
+        elif now is not None and not (now.is_in_series or now.is_capturing or self._waiting or self._failed):
+            raise OperationRejected(
+                f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
+            )
+        elif silent >= MAX_SILENT_CHECKS:
+            raise self._link.timeout_error("takes pictures, but reports no more of them")

@@ -1,9 +1,9 @@
-"""What cameras tell, as values: information, status, storage, streams, tracking, temperatures."""
+"""Values that cameras report: information, status, storage, streams, tracking, temperatures."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from aerokit._internal.values import Snapshot
 from aerokit.mavlink.enums import (
@@ -25,26 +25,14 @@ if TYPE_CHECKING:
     from aerokit.mavlink import messages as m
 
 __all__ = [
-    "MODES",
     "CameraInformation",
     "CameraStatus",
+    "CameraStorage",
+    "CameraStream",
     "ModeName",
-    "Storage",
     "ThermalRange",
     "TrackedPlace",
     "TrackingStatus",
-    "VideoStream",
-    "information_of",
-    "known",
-    "mode_of",
-    "place_of",
-    "status_of",
-    "storage_of",
-    "stream_of",
-    "thermal_range_of",
-    "tracked_place_of",
-    "tracking_of",
-    "with_status",
 ]
 
 ModeName = Literal["photo", "video", "survey"]
@@ -57,12 +45,12 @@ MODES: dict[str, int] = {
 
 
 class CameraInformation(Snapshot):
-    """What a camera is (CAMERA_INFORMATION); texts are empty and numbers None where it tells nothing.
+    """Identity and capabilities of a camera (CAMERA_INFORMATION); unknown texts are empty, unknown numbers None.
 
-    ``number``: 1 to 6 for a camera behind the autopilot, otherwise its component id. ``firmware`` is
-    ``"major.minor.patch.dev"``. ``capabilities`` are CAMERA_CAP_FLAGS in small letters (``"capture_image"``,
-    ``"has_basic_zoom"`` …); an empty set tells nothing. ``definition_uri`` is where its settings are described,
-    ``gimbal_device_id`` the gimbal that it hangs on. Lengths in mm, resolution in pixels.
+    ``number``: 1 to 6 for a camera attached to the autopilot, otherwise its component id. ``firmware`` is
+    ``"major.minor.patch.dev"``. ``capabilities`` are CAMERA_CAP_FLAGS in lower case (``"capture_image"``,
+    ``"has_basic_zoom"`` …); an empty set means unknown. ``definition_uri`` is the address of the camera definition
+    file, ``gimbal_device_id`` the gimbal that carries the camera. Lengths in mm, resolution in pixels.
     """
 
     number: int
@@ -81,16 +69,16 @@ class CameraInformation(Snapshot):
     gimbal_device_id: int | None
 
     def can(self, *capabilities: str) -> bool:
-        """Whether it says that it has one of these, or says nothing about what it can."""
+        """Return True if it has one of these capabilities, or reports none at all."""
         return not self.capabilities or not self.capabilities.isdisjoint(capabilities)
 
 
 class CameraStatus(Snapshot):
-    """What a camera does (CAMERA_CAPTURE_STATUS).
+    """Activity of a camera (CAMERA_CAPTURE_STATUS).
 
-    ``is_capturing``: a picture is being taken; ``is_in_series``: one follows the other, every ``interval_s`` seconds.
-    ``recording_s`` is how long the video has been recorded for, None where that is not told. ``image_count`` counts
-    pictures until the log of them is cleared. ``available_mib`` is what is left of the storage, None if not told.
+    ``is_capturing``: it is taking a picture; ``is_in_series``: it takes one every ``interval_s`` seconds.
+    ``recording_s`` is the duration of the video so far, None if unknown. ``image_count`` counts pictures until the
+    camera's log is cleared. ``available_mib`` is the free storage, None if unknown.
     """
 
     is_capturing: bool
@@ -102,11 +90,11 @@ class CameraStatus(Snapshot):
     available_mib: float | None
 
 
-class Storage(Snapshot):
+class CameraStorage(Snapshot):
     """One storage medium of a camera (STORAGE_INFORMATION).
 
     ``status`` is ``"ready"``, ``"empty"`` (no medium), ``"unformatted"`` or ``"not_supported"``; sizes in MiB are None
-    unless it is ready, speeds in MiB/s where they are not told. ``kind`` is ``"sd"``, ``"microsd"`` …
+    unless it is ready, speeds in MiB/s are None if unknown. ``kind`` is ``"sd"``, ``"microsd"`` …
     """
 
     number: int
@@ -121,12 +109,12 @@ class Storage(Snapshot):
     write_mib_s: float | None
 
 
-class VideoStream(Snapshot):
+class CameraStream(Snapshot):
     """One video stream of a camera (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS).
 
-    ``number`` counts from 1. ``uri`` is where to fetch it, or for RTP over UDP the port to listen at. ``kind`` is
+    ``number`` counts from 1. ``uri`` is its address, or for RTP over UDP the port to listen on. ``kind`` is
     ``"rtsp"``, ``"rtpudp"``, ``"tcp_mpeg"``, ``"mpeg_ts"`` or ``"whep"``, ``encoding`` ``"h264"``, ``"h265"`` or
-    ``"unknown"``. ``bitrate`` in bits per second, ``rotation_deg`` clockwise, ``horizontal_fov_deg`` None if not told.
+    ``"unknown"``. ``bitrate`` in bits per second, ``rotation_deg`` clockwise, ``horizontal_fov_deg`` None if unknown.
     """
 
     number: int
@@ -147,10 +135,10 @@ class VideoStream(Snapshot):
 
 
 class TrackingStatus(Snapshot):
-    """What a camera tracks in its picture (CAMERA_TRACKING_IMAGE_STATUS); places 0 to 1 from the left and the top.
+    """Tracking in the image (CAMERA_TRACKING_IMAGE_STATUS); coordinates are 0 to 1 from the left and the top.
 
-    ``mode`` is ``"none"``, ``"point"`` or ``"rectangle"``; ``point`` is (x, y) and ``radius`` a part of the picture's
-    width, ``rectangle`` (left, top, right, bottom). ``has_failed``: it has lost what it tracked.
+    ``mode`` is ``"none"``, ``"point"`` or ``"rectangle"``; ``point`` is (x, y) and ``radius`` a part of the image
+    width, ``rectangle`` (left, top, right, bottom). ``has_failed``: the tracked object was lost.
     """
 
     is_active: bool
@@ -163,9 +151,9 @@ class TrackingStatus(Snapshot):
 
 
 class TrackedPlace(Snapshot):
-    """Where on earth it is that a camera tracks (CAMERA_TRACKING_GEO_STATUS); None is not known.
+    """Position on earth of the object that a camera tracks (CAMERA_TRACKING_GEO_STATUS); unknown values are None.
 
-    Velocities to the north, east and down; ``distance_m`` from the camera; ``heading_deg`` 0 to 360 from north.
+    Velocities to north, east and down; ``distance_m`` from the camera; ``heading_deg`` 0 to 360 from north.
     """
 
     is_active: bool
@@ -180,7 +168,7 @@ class TrackedPlace(Snapshot):
 
 
 class ThermalRange(Snapshot):
-    """The coldest and the hottest point of a thermal picture (CAMERA_THERMAL_RANGE): °C, places 0 to 1."""
+    """Coldest and hottest point of a thermal image (CAMERA_THERMAL_RANGE): °C, coordinates 0 to 1."""
 
     stream: int
     max_celsius: float
@@ -189,33 +177,33 @@ class ThermalRange(Snapshot):
     min_at: tuple[float, float] | None
 
 
-NOWHERE_DEG = 0.01
+# Positions this close to 0, 0 mean that the vehicle did not know where it was.
+MIN_COORDINATE_DEG = 0.01
 
+# Values of CAMERA_CAPTURE_STATUS.image_status.
 CAPTURING, SERIES = (1, 3), (2, 3)
-"""Values of CAMERA_CAPTURE_STATUS.image_status."""
 
 T = TypeVar("T", float, int)
 
 
-def known(value: T) -> T | None:
-    """None for NaN and other numbers that are none."""
+def finite_or_none(value: T) -> T | None:
+    """Return the value, or None for NaN and infinities."""
     return value if math.isfinite(value) else None
 
 
 def place_of(
     latitude_e7: int, longitude_e7: int, altitude_amsl_m: float, altitude_relative_m: float | None
 ) -> Position | None:
-    """None near 0, 0, or where it is no place on earth: the vehicle did not know."""
+    """Decode a position; None if it is invalid, or so close to 0, 0 that the sender did not know it."""
     latitude, longitude = latitude_e7 * 1e-7, longitude_e7 * 1e-7
-    is_somewhere = abs(latitude) > NOWHERE_DEG or abs(longitude) > NOWHERE_DEG
+    is_somewhere = abs(latitude) > MIN_COORDINATE_DEG or abs(longitude) > MIN_COORDINATE_DEG
     if not is_somewhere or abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return None
-    relative = None if altitude_relative_m is None else known(altitude_relative_m)
-    return Position(latitude, longitude, known(altitude_amsl_m), relative)
+    relative = None if altitude_relative_m is None else finite_or_none(altitude_relative_m)
+    return Position(latitude, longitude, finite_or_none(altitude_amsl_m), relative)
 
 
 def information_of(message: m.CameraInformation, number: int) -> CameraInformation:
-    """In words."""
     version = message.firmware_version
     return CameraInformation(
         number=number,
@@ -228,7 +216,7 @@ def information_of(message: m.CameraInformation, number: int) -> CameraInformati
         width_px=message.resolution_h or None,
         height_px=message.resolution_v or None,
         lens_id=message.lens_id,
-        capabilities=frozenset(each.name.lower() for each in CameraCapFlags if each & message.flags),  # type: ignore[union-attr]
+        capabilities=frozenset(flag.name.lower() for flag in CameraCapFlags if flag & message.flags),  # type: ignore[union-attr]
         definition_uri=message.cam_definition_uri,
         definition_version=message.cam_definition_version,
         gimbal_device_id=message.gimbal_device_id or None,
@@ -236,12 +224,10 @@ def information_of(message: m.CameraInformation, number: int) -> CameraInformati
 
 
 def mode_of(message: m.CameraSettings) -> str:
-    """``"unknown"`` for one that the standard does not have."""
     return next((name for name, number in MODES.items() if number == message.mode_id), "unknown")
 
 
 def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
-    """In words."""
     is_recording = message.video_status == 1
     return CameraStatus(
         is_capturing=message.image_status in CAPTURING,
@@ -250,18 +236,17 @@ def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
         is_recording=is_recording,
         recording_s=message.recording_time_ms / 1000 if is_recording else None,
         image_count=message.image_count,
-        available_mib=known(message.available_capacity),
+        available_mib=finite_or_none(message.available_capacity),
     )
 
 
-def storage_of(message: m.StorageInformation) -> Storage:
-    """In words."""
+def storage_of(message: m.StorageInformation) -> CameraStorage:
     is_ready = message.status == StorageStatus.READY
     total, used, available = (
-        known(each) if is_ready else None
-        for each in (message.total_capacity, message.used_capacity, message.available_capacity)
+        finite_or_none(size) if is_ready else None
+        for size in (message.total_capacity, message.used_capacity, message.available_capacity)
     )
-    return Storage(
+    return CameraStorage(
         message.storage_id,
         message.storage_count,
         message.name,
@@ -275,40 +260,34 @@ def storage_of(message: m.StorageInformation) -> Storage:
     )
 
 
-def stream_of(message: m.VideoStreamInformation) -> VideoStream:
-    """In words."""
-    return VideoStream(
-        number=message.stream_id or 1,  # MAVSDK's server says 0
+def stream_of(message: m.VideoStreamInformation) -> CameraStream:
+    return CameraStream(
+        number=message.stream_id or 1,  # MAVSDK's camera server sends 0.
         count=message.count,
         name=message.name,
         uri=message.uri,
         kind=_name(VideoStreamType, message.type),
         encoding=_name(VideoStreamEncoding, message.encoding),
-        width_px=message.resolution_h,
-        height_px=message.resolution_v,
-        frames_per_s=message.framerate,
-        bitrate=message.bitrate,
-        rotation_deg=message.rotation,
-        horizontal_fov_deg=message.hfov or None,
-        **_flags(message.flags),
+        **stream_state(message),
     )
 
 
-def with_status(stream: VideoStream, message: m.VideoStreamStatus) -> VideoStream:
-    """The stream as it is now."""
-    return stream.replace(
-        width_px=message.resolution_h,
-        height_px=message.resolution_v,
-        frames_per_s=message.framerate,
-        bitrate=message.bitrate,
-        rotation_deg=message.rotation,
-        horizontal_fov_deg=message.hfov or None,
-        **_flags(message.flags),
-    )
+def stream_state(message: m.VideoStreamInformation | m.VideoStreamStatus) -> dict[str, Any]:
+    """Return the fields of a CameraStream that change."""
+    return {
+        "width_px": message.resolution_h,
+        "height_px": message.resolution_v,
+        "frames_per_s": message.framerate,
+        "bitrate": message.bitrate,
+        "rotation_deg": message.rotation,
+        "horizontal_fov_deg": message.hfov or None,
+        "is_running": bool(message.flags & StreamFlags.RUNNING),
+        "is_thermal": bool(message.flags & StreamFlags.THERMAL),
+        "has_thermal_range": bool(message.flags & StreamFlags.THERMAL_RANGE_ENABLED),
+    }
 
 
 def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
-    """In words."""
     corners = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
     is_point, is_rectangle = (
         message.tracking_mode == Tracking.POINT,
@@ -320,29 +299,27 @@ def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
         is_coasting=bool(message.tracking_status & TrackingFlags.COASTING),
         mode=_name(Tracking, message.tracking_mode),
         point=_point(message.point_x, message.point_y) if is_point else None,
-        radius=known(message.radius) if is_point else None,
+        radius=finite_or_none(message.radius) if is_point else None,
         rectangle=corners if is_rectangle and all(map(math.isfinite, corners)) else None,
     )
 
 
 def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
-    """In words."""
-    heading = known(message.hdg)
+    heading = finite_or_none(message.hdg)
     return TrackedPlace(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
         place=place_of(message.lat, message.lon, message.alt, None),
-        horizontal_accuracy_m=known(message.h_acc),
-        vertical_accuracy_m=known(message.v_acc),
-        north_m_s=known(message.vel_n),
-        east_m_s=known(message.vel_e),
-        down_m_s=known(message.vel_d),
-        distance_m=known(message.dist),
+        horizontal_accuracy_m=finite_or_none(message.h_acc),
+        vertical_accuracy_m=finite_or_none(message.v_acc),
+        north_m_s=finite_or_none(message.vel_n),
+        east_m_s=finite_or_none(message.vel_e),
+        down_m_s=finite_or_none(message.vel_d),
+        distance_m=finite_or_none(message.dist),
         heading_deg=None if heading is None else math.degrees(heading) % 360.0,
     )
 
 
 def thermal_range_of(message: m.CameraThermalRange) -> ThermalRange:
-    """In words."""
     return ThermalRange(
         message.stream_id,
         message.max,
@@ -350,14 +327,6 @@ def thermal_range_of(message: m.CameraThermalRange) -> ThermalRange:
         message.min,
         _point(message.min_point_x, message.min_point_y),
     )
-
-
-def _flags(flags: int) -> dict[str, bool]:
-    return {
-        "is_running": bool(flags & StreamFlags.RUNNING),
-        "is_thermal": bool(flags & StreamFlags.THERMAL),
-        "has_thermal_range": bool(flags & StreamFlags.THERMAL_RANGE_ENABLED),
-    }
 
 
 def _point(x: float, y: float) -> tuple[float, float] | None:

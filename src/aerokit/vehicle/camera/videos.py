@@ -1,4 +1,4 @@
-"""Video: recording it, and the streams of it."""
+"""``VideoMixin``: recording and streaming video."""
 
 from __future__ import annotations
 
@@ -9,101 +9,102 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CameraSource, MavCmd
-from aerokit.vehicle.camera.part import CameraBlock, CameraPart
+from aerokit.vehicle.camera.link import CameraBlock, CameraMixin
 from aerokit.vehicle.camera.values import (
     CameraStatus,
+    CameraStream,
     ThermalRange,
-    VideoStream,
     status_of,
     stream_of,
+    stream_state,
     thermal_range_of,
-    with_status,
 )
 
 if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
-    from aerokit.vehicle.camera.link import CameraLine
+    from aerokit.vehicle.camera.link import CameraLink
     from aerokit.vehicle.commanding.order import Order
 
 START, STOP = MavCmd.VIDEO_START_CAPTURE, MavCmd.VIDEO_STOP_CAPTURE
-START_S = 5.0
-STATUS_S, STREAMS_S, THERMAL_S = 2.0, 5.0, 1.0
+START_TIMEOUT_S = 5.0
+STATUS_POLL_INTERVAL_S, STREAMS_POLL_INTERVAL_S, THERMAL_POLL_INTERVAL_S = 2.0, 5.0, 1.0
 SourceName = Literal["default", "rgb", "ir", "ndvi"]
-SOURCES = {each.name.lower(): int(each) for each in CameraSource}
+SOURCES = {source.name.lower(): int(source) for source in CameraSource}
 
 
 @checks_arguments
-class VideoCalls(CameraPart):
-    """Recording, streaming, and what the camera says it does."""
+class VideoMixin(CameraMixin):
+    """Recording, streaming and status of a camera."""
 
-    def __init__(self, line: CameraLine) -> None:
-        super().__init__(line)
-        self.status: StateCell[CameraStatus] = line.asked_cell(
-            "camera.status", m.CameraCaptureStatus, STATUS_S
+    def __init__(self, link: CameraLink) -> None:
+        super().__init__(link)
+        self.status: StateCell[CameraStatus] = link.polled_cell(
+            "camera.status", m.CameraCaptureStatus, STATUS_POLL_INTERVAL_S
         )
-        """What it does: recording and for how long, pictures taken, storage left (CAMERA_CAPTURE_STATUS). It is asked
-        every 2 s while somebody looks at this cell, as far as it does not tell by itself."""
-        self.streams: StateCell[tuple[VideoStream, ...]] = line.asked_cell(
-            "camera.streams", m.VideoStreamInformation, STREAMS_S
+        """Recording and its duration, pictures taken, free storage (CAMERA_CAPTURE_STATUS). Polled every 2 s while your
+        program uses this cell, unless the camera sends it by itself."""
+        self.streams: StateCell[tuple[CameraStream, ...]] = link.polled_cell(
+            "camera.streams", m.VideoStreamInformation, STREAMS_POLL_INTERVAL_S
         )
-        """Its video streams by their numbers; asked for every 5 s while somebody looks at this cell."""
-        self.thermal_range: StateCell[ThermalRange] = line.asked_cell(
-            "camera.thermal_range", m.CameraThermalRange, THERMAL_S
+        """Video streams by number; polled every 5 s while your program uses this cell."""
+        self.thermal_range: StateCell[ThermalRange] = link.polled_cell(
+            "camera.thermal_range", m.CameraThermalRange, THERMAL_POLL_INTERVAL_S
         )
-        """The coldest and hottest point of the last thermal picture; asked for once a second while somebody looks."""
-        self._streams: dict[int, VideoStream] = {}
-        line.listen(m.CameraCaptureStatus, self._on_status)
-        line.listen(m.VideoStreamInformation, self._on_stream)
-        line.listen(m.VideoStreamStatus, self._on_stream_status)
-        line.listen(
-            m.CameraThermalRange, lambda each: line.tell(self.thermal_range, thermal_range_of(each), each)
+        """Coldest and hottest point of the thermal image; polled every second while your program uses this cell."""
+        self._streams: dict[int, CameraStream] = {}
+        link.listen(m.CameraCaptureStatus, lambda message: link.set_cell(self.status, status_of(message), message))
+        link.listen(m.VideoStreamInformation, self._on_stream)
+        link.listen(m.VideoStreamStatus, self._on_stream_status)
+        link.listen(
+            m.CameraThermalRange,
+            lambda message: link.set_cell(self.thermal_range, thermal_range_of(message), message),
         )
 
     async def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
-        """Begin to record (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera says that it records.
+        """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        A camera that does not tell what it does (such as those behind an autopilot) is believed when it accepts.
+        If the camera does not report its status (e.g. one attached to an autopilot), returns when it has accepted.
 
         Args:
-            status_hz: how often it tells its status meanwhile, 0 to 10.
-            timeout: seconds until it must be recording.
+            status_hz: rate at which the camera sends its status while recording, 0 to 10.
+            timeout: seconds to wait until it records.
 
         Raises:
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: it did not answer; it may be recording.
-            OperationTimeout: it accepted and does not record, or no camera was heard.
+            OperationTimeout: it accepted but does not record, or no camera was found.
         """
         check_range("status_hz", status_hz, 0, 10)
-        await self._line.able("start_video", "capture_video")
-        with self._line.giving("video") as given:
-            await self._start(given, status_hz, timeout)
+        await self._link.require_capability("start_video", "capture_video")
+        with self._link.new_order("video") as order:
+            await self._start(order, status_hz, timeout)
 
-    async def _start(self, given: Order, status_hz: float, timeout: float) -> None:
-        order = (START, self._line.video_stream, status_hz, self._line.device)
-        await self._line.order_once(
-            given, lambda: self._line.order(*order, given=given, attempts=1), self._is_recording
+    async def _start(self, order: Order, status_hz: float, timeout: float) -> None:
+        command = (START, self._link.video_stream, status_hz, self._link.device)
+        await self._link.order_once(
+            order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
         )
-        await self._until_recording(True, timeout)
+        await self._wait_recording(True, timeout)
 
     async def stop_video(self, *, timeout: float = 5.0) -> None:
-        """End the recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera says that it has.
+        """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
 
         Raises:
             NotSupported: the camera records no video. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: it did not answer.
-            OperationTimeout: it accepted and goes on recording, or no camera was heard.
+            OperationTimeout: it accepted but still records, or no camera was found.
         """
-        await self._line.able("stop_video", "capture_video")
-        command, *params = self._stop_order()
-        with self._line.giving("video") as given:
-            await self._line.order(int(command), *params, given=given)
-            await self._until_recording(False, timeout)
+        await self._link.require_capability("stop_video", "capture_video")
+        command, *params = self._stop_command()
+        with self._link.new_order("video") as order:
+            await self._link.command(int(command), *params, order=order)
+            await self._wait_recording(False, timeout)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the time of an ``async with`` block; it ends with it, also under cancellation.
+        """Record for the duration of an ``async with`` block; its end stops recording, also under cancellation.
 
         Entering raises what :meth:`start_video` does.
 
@@ -112,128 +113,122 @@ class VideoCalls(CameraPart):
         """
         check_range("status_hz", status_hz, 0, 10)
         return CameraBlock(
-            self._line,
+            self._link,
             "video",
-            lambda: self._line.able("video", "capture_video"),
-            lambda given: self._start(given, status_hz, START_S),
-            self._stop_order,
+            lambda: self._link.require_capability("video", "capture_video"),
+            lambda order: self._start(order, status_hz, START_TIMEOUT_S),
+            self._stop_command,
         )
 
-    def _stop_order(self) -> tuple[float, ...]:
-        return (STOP, self._line.video_stream, self._line.device)
+    def _stop_command(self) -> tuple[float, ...]:
+        return (STOP, self._link.video_stream, self._link.device)
 
     async def _is_recording(self) -> bool | None:
-        if self._line.is_behind:  # ArduPilot always says that it does not
+        if self._link.is_autopilot_attached:  # ArduPilot always reports that it does not record.
             return None
-        message = await self._line.ask(m.CameraCaptureStatus, timeout=1.0)
+        message = await self._link.request(m.CameraCaptureStatus, timeout=1.0)
         return None if message is None else message.video_status == 1
 
-    async def _until_recording(self, wanted: bool, timeout: float) -> None:
+    async def _wait_recording(self, wanted: bool, timeout: float) -> None:
         with anyio.move_on_after(timeout):
             now = await self._is_recording()
             if now is not None and now is not wanted:
-                await self.status.wait_until(lambda told: told.is_recording is wanted)
+                await self.status.wait_until(lambda status: status.is_recording is wanted)
             return
-        does = "does not record" if wanted else "goes on recording"
-        raise self._line.timed_out(f"accepted the order, and {does} after {timeout:g} s")
+        outcome = "does not record" if wanted else "still records"
+        raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 
-    # ----------------------------------------------------------------------------------------- streams
-
-    async def load_streams(self) -> tuple[VideoStream, ...]:
-        """Ask for the video streams (VIDEO_STREAM_INFORMATION), each by its number where they do not all come at once.
+    async def load_streams(self) -> tuple[CameraStream, ...]:
+        """Request the video streams (VIDEO_STREAM_INFORMATION), one by one if the camera does not send all at once.
 
         Raises:
-            NotSupported: the camera has none. Nothing was sent.
-            OperationTimeout: they did not come, or no camera was heard.
+            NotSupported: the camera has no video streams. Nothing was sent.
+            OperationTimeout: not all of them arrived, or no camera was found.
         """
-        await self._line.able("load_streams", "has_video_stream")
-        first = await self._line.ask(m.VideoStreamInformation, 0)
+        await self._link.require_capability("load_streams", "has_video_stream")
+        first = await self._link.request(m.VideoStreamInformation, 0)
         if first is None:
-            first = await self._line.ask(m.VideoStreamInformation, 1)
+            first = await self._link.request(m.VideoStreamInformation, 1)
         if first is None or not self._streams:
-            raise self._line.timed_out("told of no video stream")
+            raise self._link.timeout_error("reported no video stream")
         for number in range(1, first.count + 1):
-            if number not in self._streams and not await self._ask_stream(number):
-                raise self._line.timed_out(f"did not tell of its video stream {number}")
+            if number not in self._streams and not await self._request_stream(number):
+                raise self._link.timeout_error(f"did not report its video stream {number}")
         return self.streams.value
 
-    async def _ask_stream(self, number: int) -> bool:
-        found = await self._line.ask(
-            m.VideoStreamInformation, number, where=lambda each: each.stream_id == number
+    async def _request_stream(self, number: int) -> bool:
+        found = await self._link.request(
+            m.VideoStreamInformation, number, where=lambda message: message.stream_id == number
         )
         return found is not None
 
     async def start_streaming(self, stream: int = 0) -> None:
-        """Have a stream sent (MAV_CMD_VIDEO_START_STREAMING).
+        """Start a video stream (MAV_CMD_VIDEO_START_STREAMING).
 
         Args:
-            stream: its number, 0 (all of them) to 255.
+            stream: number of the stream, 1 to 255, or 0 for all.
 
         Raises:
-            InvalidArgument: there can be no such stream. Nothing was sent.
+            InvalidArgument: the number is out of range. Nothing was sent.
             NotSupported: the camera has no streams. Nothing was sent.
-            CommandRejected: the camera refused; there is no such stream.
+            CommandRejected: the camera refused, or has no such stream.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
-        await self._stream("start_streaming", MavCmd.VIDEO_START_STREAMING, stream)
+        await self._send_stream_command("start_streaming", MavCmd.VIDEO_START_STREAMING, stream)
 
     async def stop_streaming(self, stream: int = 0) -> None:
-        """Have a stream end (MAV_CMD_VIDEO_STOP_STREAMING); errors are those of :meth:`start_streaming`."""
-        await self._stream("stop_streaming", MavCmd.VIDEO_STOP_STREAMING, stream)
+        """Stop a video stream (MAV_CMD_VIDEO_STOP_STREAMING); errors as for :meth:`start_streaming`."""
+        await self._send_stream_command("stop_streaming", MavCmd.VIDEO_STOP_STREAMING, stream)
 
     async def select_stream(self, stream: int) -> None:
-        """Have this stream sent, and the others that run ended; errors are those of :meth:`start_streaming`.
+        """Start one stream and stop the others; errors as for :meth:`start_streaming`.
 
         Args:
-            stream: its number, 1 to 255.
+            stream: number of the stream, 1 to 255.
         """
         check_range("stream", stream, 1, 255)
-        for each in await self.load_streams():
-            if each.number != stream and each.is_running:
-                await self.stop_streaming(each.number)
+        for other in await self.load_streams():
+            if other.number != stream and other.is_running:
+                await self.stop_streaming(other.number)
         await self.start_streaming(stream)
 
-    async def _stream(self, action: str, command: int, stream: int) -> None:
+    async def _send_stream_command(self, action: str, command: int, stream: int) -> None:
         check_range("stream", stream, 0, 255)
-        await self._line.able(action, "has_video_stream")
-        with self._line.giving("streams") as given:
-            await self._line.order(command, stream, self._line.device, given=given)
-        await self._line.ask(m.VideoStreamStatus, stream, timeout=1.0)
+        await self._link.require_capability(action, "has_video_stream")
+        with self._link.new_order("streams") as order:
+            await self._link.command(command, stream, self._link.device, order=order)
+        await self._link.request(m.VideoStreamStatus, stream, timeout=1.0)
 
     async def select_source(self, primary: SourceName, secondary: SourceName = "default") -> None:
-        """Choose the sensor that is shown (MAV_CMD_SET_CAMERA_SOURCE), and one that is shown within its picture.
+        """Select the sensor to show (MAV_CMD_SET_CAMERA_SOURCE), and one to show as picture-in-picture.
 
         Args:
             primary: ``"default"``, ``"rgb"``, ``"ir"`` or ``"ndvi"``.
-            secondary: the same; ``"default"``: no picture within the picture.
+            secondary: the same; ``"default"`` shows no second picture.
 
         Raises:
-            CommandRejected: the camera refused; it has no such sensor.
+            CommandRejected: the camera refused, or has no such sensor.
             CommandTimeout: it did not answer.
-            OperationTimeout: no camera was heard.
+            OperationTimeout: no camera was found.
         """
-        await self._line.find()
-        order = (MavCmd.SET_CAMERA_SOURCE, self._line.number or 0, SOURCES[primary], SOURCES[secondary])
-        with self._line.giving("source") as given:
-            await self._line.order(*order, given=given)
-
-    # --------------------------------------------------------------------------------------- receiving
-
-    def _on_status(self, message: m.CameraCaptureStatus) -> None:
-        self._line.tell(self.status, status_of(message), message)
+        await self._link.identify()
+        command = (MavCmd.SET_CAMERA_SOURCE, self._link.number or 0, SOURCES[primary], SOURCES[secondary])
+        with self._link.new_order("source") as order:
+            await self._link.command(*command, order=order)
 
     def _on_stream(self, message: m.VideoStreamInformation) -> None:
-        if message.stream_id or message.uri:  # ArduPilot tells of one that is none
+        if message.stream_id or message.uri:  # ArduPilot also sends an empty one.
             stream = stream_of(message)
             self._streams[stream.number] = stream
-            self._tell_streams(message)
+            self._publish_streams(message)
 
     def _on_stream_status(self, message: m.VideoStreamStatus) -> None:
         before = self._streams.get(message.stream_id)
         if before is not None:
-            self._streams[message.stream_id] = with_status(before, message)
-            self._tell_streams(message)
+            self._streams[message.stream_id] = before.replace(**stream_state(message))
+            self._publish_streams(message)
 
-    def _tell_streams(self, message: m.VideoStreamInformation | m.VideoStreamStatus) -> None:
-        self._line.tell(self.streams, tuple(self._streams[each] for each in sorted(self._streams)), message)
+    def _publish_streams(self, message: m.VideoStreamInformation | m.VideoStreamStatus) -> None:
+        streams = tuple(self._streams[number] for number in sorted(self._streams))
+        self._link.set_cell(self.streams, streams, message)

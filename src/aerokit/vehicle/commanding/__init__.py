@@ -1,1 +1,1 @@
-"""Orders: who steers, what may be sent again, and every action that moves a vehicle or keeps it."""
+"""Orders: their validity, what may be sent again, and every action that moves a vehicle or stops it."""

@@ -1,4 +1,4 @@
-"""Getting ready, arming, disarming, rebooting."""
+"""Readiness checks, arming, disarming and rebooting."""
 
 from __future__ import annotations
 
@@ -18,71 +18,71 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.enums import MavCmd
-from aerokit.vehicle.commanding.cleanup import LATE_S
-from aerokit.vehicle.commanding.context import Part
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, Arrivals, await_progress
+from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
+from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.commanding.order import Order
 
 FORCE_REBOOT = 20190226
-SAID_AGAIN_S = 35.0
-"""ArduPilot says every 30 s why it would not arm."""
-LOOK_S = 0.1
-"""So often it is looked whether a vehicle is back."""
+PREARM_REPORT_INTERVAL_S = 35.0
+"""Seconds in which ArduPilot repeats its pre-arm failures (every 30 s)."""
+POLL_INTERVAL_S = 0.1
+"""Poll interval in seconds while waiting for a reboot."""
+# MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
 BOOTING = (1, 2)
-"""MAV_STATE: booting, calibrating."""
 REBOOT_ANSWER_S = 3.0
-READY_IN_MODE_S = 3.0
-"""How long a vehicle that was put into another mode may take to be ready in it."""
+MODE_READY_TIMEOUT_S = 3.0
+"""Seconds that a vehicle may need to become armable after a mode change."""
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
 
 @checks_arguments
-class ArmingActions(Part):
-    """From standing there to running motors, and back."""
+class ArmingActions(VehicleBase):
+    """Arming, disarming and rebooting."""
 
     def missing_for_flight(self) -> list[str]:
-        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
+        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
         return self._health.missing_for_flight()
 
     async def why_not_armable(self) -> list[str]:
         """Return the reasons why arming would be refused now; an empty list means that none is known.
 
-        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it can do so on request and listens to
-        what it says; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS).
-        Takes about a second. The vehicle is not armed by it.
+        Asks the vehicle to run its checks (MAV_CMD_RUN_PREARM_CHECKS) where it supports that, and collects its status
+        texts; reads SYS_STATUS and the estimator's flags (ArduPilot EKF_STATUS_REPORT, PX4 ESTIMATOR_STATUS). Takes
+        about a second and does not arm the vehicle.
         """
         return await self._health.why_not_armable()
 
     async def wait_ready(self, *, timeout: float = 90.0) -> None:
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
-        The mode does not count: :meth:`arm` leaves one in which the vehicle does not arm. :meth:`why_not_armable`
-        names it.
+        The mode is not considered, because :meth:`arm` leaves a mode in which the vehicle cannot arm;
+        :meth:`why_not_armable` reports it.
 
         Raises:
-            OperationTimeout: not within ``timeout`` seconds; the text says what is still missing, and what the vehicle
-                said of it lately.
+            OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
+                texts.
         """
         told = self.telemetry
         cells = (told.sensors, told.estimator, told.position, told.home, told.armed)
         with (
-            self._talk.streaming("sensors", "estimator", "position"),
-            Arrivals(self._talk, *cells, every_arrival=True) as news,
+            self._session.streaming("sensors", "estimator", "position"),
+            ChangeSignal(self._session, *cells, every_arrival=True) as news,
             anyio.move_on_after(timeout),
         ):
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
                 await news.next(timeout)
             return
-        said = dict.fromkeys(self._health.arming_texts(self.connection.now() - SAID_AGAIN_S))
-        still = [*self._health.missing_for_flight(), *said] or ["nothing any more"]
+        said = dict.fromkeys(self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S))
+        still = [*self._health.missing_for_flight(), *said] or ["nothing"]
         missing = "\n  - ".join([*still, *self._health.unarmable_mode()])
         raise OperationTimeout(
-            f"the vehicle was not ready within {timeout:g} s ({self._talk.describe_link()}); still missing:\n"
+            f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:\n"
             f"  - {missing}"
         )
 
@@ -92,50 +92,51 @@ class ArmingActions(Part):
         mode: str | int | None = None,
         force: bool = False,
         timeout: float = 10.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Arm the motors and wait until HEARTBEAT says armed: **propellers may start to turn**.
+        """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
-        A vehicle that stands in a mode in which it does not arm (RTL or LAND after a flight, OFFBOARD) is put into
-        another one first. The order is sent once: a HEARTBEAT that says disarmed does not tell whether a pilot has
-        disarmed it since. Cancelled, or ended by any error but a refusal, it may still be carried out: for 15 seconds
-        the vehicle is watched, and disarmed if this order arms it (the vehicle accepts it, or is armed at the next
-        HEARTBEAT and nobody else has taken it), as long as the connection is there. Logger "aerokit" warns of what
-        came of it, also of an arming that nothing shows to be this order's: that one is left alone.
+        If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
+        The command is sent once, because a HEARTBEAT that reports disarmed may mean that a pilot has disarmed since.
+        After a cancellation, or an error other than a refusal, the command may still be executed. The vehicle is
+        therefore monitored for 15 seconds and disarmed if this command arms it (it accepts the command, or is armed
+        at the next HEARTBEAT and there was no takeover), as long as the connection is open. Logger "aerokit" warns
+        about the outcome, and about an arming that cannot be attributed to this command, which is left alone.
 
         Args:
-            mode: where to arm; None: the present mode, or one that ``take_off`` begins in if it cannot be armed there.
+            mode: the mode to arm in; None: the present mode, or one that ``take_off`` starts in if that does not
+                allow it.
             force: skip the vehicle's own arming checks. Dangerous.
-            timeout: seconds for HEARTBEAT to say so after the command was accepted.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
+            timeout: seconds for HEARTBEAT to report armed after the command was accepted.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            InvalidArgument: there is no such mode, or the vehicle does not arm in it. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and what the
-                estimator lacks. They are asked for again where the vehicle can run its checks on request.
-            CommandTimeout: there was no answer, and it did not arm; the text says whether the order may still arrive.
-            OperationRejected: it is armed already, in another mode than ``mode``, and nothing was sent; or somebody
-                else has disarmed it, or changed its mode, meanwhile.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted and did not arm.
+            InvalidArgument: there is no such mode, or it does not allow arming. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its pre-arm texts, failing sensors and missing
+                estimates. Where the vehicle can run its checks on request, they are run again for this.
+            CommandTimeout: there was no acknowledgement, and it did not arm; the text says whether it may still arm.
+            OperationRejected: it is armed already in a mode other than ``mode`` (nothing was sent), or another party
+                disarmed it or changed its mode meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it accepted the command and did not arm.
         """
         wanted = self._mode_to_arm_in(mode)
         if wanted is not None:
-            await self._go_to_arming_mode(wanted)
-        self._late_arming.stop()
+            await self._change_to_arming_mode(wanted)
+        self._arm_cleanup.stop()
         started, was_armed = self.connection.now(), self.telemetry.is_armed
-        with self._arbiter.aside() as order:
+        with self._arbiter.auxiliary_order() as order:
             try:
-                await self._sender.give_arm(order, True, force=force)
+                await self._sender.send_arm(order, True, force=force)
                 await self._await_armed(True, order, started, timeout, max_silence_s)
             except CommandRejected as error:
                 reasons = await self._health.arming_reasons(started)
-                raise self._talk.explained(error, started, reasons) from None
+                raise self._session.with_reasons(error, started, reasons) from None
             except CommandTimeout as error:
-                self._late_arming.watch(order, was_armed)
-                raise CommandTimeout(f"{error}; {self._late_arming.text()}") from None
+                self._arm_cleanup.watch(order, was_armed)
+                raise CommandTimeout(f"{error}; {self._arm_cleanup.text()}") from None
             except (anyio.get_cancelled_exc_class(), AerokitError):
-                self._late_arming.watch(order, was_armed)
+                self._arm_cleanup.watch(order, was_armed)
                 raise
 
     async def disarm(
@@ -143,25 +144,25 @@ class ArmingActions(Part):
         *,
         force: bool = False,
         timeout: float = 10.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Stop the motors and wait until HEARTBEAT says disarmed.
+        """Stop the motors and wait until HEARTBEAT reports disarmed.
 
         Args:
-            force: also in the air: **the vehicle falls**.
-            timeout: seconds for HEARTBEAT to say so after the command was accepted.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on until ``timeout``.
+            force: disarm in flight as well: **the vehicle falls**.
+            timeout: seconds for HEARTBEAT to report disarmed after the command was accepted.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
-            CommandRejected: the vehicle refused, usually because it flies.
-            CommandTimeout: there was no answer.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it accepted and did not disarm.
+            CommandRejected: the vehicle refused, usually because it is flying.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it accepted the command and did not disarm.
         """
-        self._late_arming.stop()
+        self._arm_cleanup.stop()
         started = self.connection.now()
-        with self._arbiter.aside(ends_flight=True) as order:
-            await self._sender.give_arm(order, False, force=force)
+        with self._arbiter.auxiliary_order(ends_flight=True) as order:
+            await self._sender.send_arm(order, False, force=force)
             await self._await_armed(False, order, started, timeout, max_silence_s)
 
     async def _await_armed(
@@ -169,12 +170,12 @@ class ArmingActions(Part):
     ) -> None:
         cell = self.telemetry.armed
         await await_progress(
-            self._talk,
+            self._session,
             "arm()" if armed else "disarm()",
             is_done=lambda: cell.latest is armed and cell.updated_at > started,
-            trouble=lambda: order.taken_by if armed else None,
+            trouble=lambda: order.takeover_reason if armed else None,
             describe=lambda: (
-                "; ".join(self._talk.texts_since(started)) or "the vehicle said nothing about it"
+                "; ".join(self._session.texts_since(started)) or "the vehicle sent no status text about it"
             ),
             timeout=timeout,
             max_silence_s=max_silence_s,
@@ -183,13 +184,11 @@ class ArmingActions(Part):
     # ------------------------------------------------------------------------ where it arms
 
     def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
-        """The mode to change to before arming; None: the present one will do."""
+        """Return the mode to change to before arming; None if the present one allows it."""
         if mode is not None:
             wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if wanted.name in self.autopilot.unarmable_modes:
-                raise InvalidArgument(
-                    f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}"
-                )
+                raise InvalidArgument(f"mode = {mode!r} is not allowed: {self._health.unarmable_text(wanted)}")
             if self.telemetry.is_armed and wanted != self.telemetry.mode.latest:
                 raise OperationRejected(
                     f"arm: the vehicle is armed already, in {self.telemetry.mode_name}; nothing was sent"
@@ -197,84 +196,84 @@ class ArmingActions(Part):
             return wanted
         is_booting = self.telemetry.system_status.latest in BOOTING
         if (
-            self._holding.end_stream is not None
+            self._flight_cleanup.stop_stream is not None
             or is_booting
-            or not self.telemetry.is_surely_disarmed
+            or not self.telemetry.is_confirmed_disarmed
             or not self._health.unarmable_mode()
         ):
             return None
         return self.autopilot.mode_to_arm_in()
 
-    async def _go_to_arming_mode(self, wanted: Mode) -> None:
-        """Afterwards the order to arm is not meant any more, or not yet, if anything has come between."""
+    async def _change_to_arming_mode(self, wanted: Mode) -> None:
+        """Change the mode for arming; raise if the order to arm was superseded meanwhile."""
         order, count = self._arbiter.order(wanted), self._arbiter.arming_orders
         await self._sender.ensure_mode(wanted, order)
-        await self._settle_in_mode()
-        self._sender.raise_if_over(order)
+        await self._wait_until_armable()
+        self._sender.raise_if_ended(order)
         if self._arbiter.arming_orders != count:
-            raise OperationRejected("arm(): another order to arm or disarm was given; it was not told to arm")
+            raise OperationRejected("arm(): superseded by another arm or disarm command; nothing was sent")
         if not self._arbiter.is_known:
-            raise HeartbeatTimeout(f"arm(): {self._talk.describe_link()}; it was not told to arm")
+            raise HeartbeatTimeout(f"arm(): {self._session.describe_link()}; the arm command was not sent")
 
-    async def _settle_in_mode(self) -> None:
-        """PX4 tells by SYS_STATUS, some times a second, whether it could be armed in its new mode."""
+    async def _wait_until_armable(self) -> None:
+        """Wait until SYS_STATUS reports whether the vehicle can arm in its new mode; PX4 sends it a few times a
+        second.
+        """
         sensors = self.telemetry.sensors
-        with self._talk.streaming("sensors"), anyio.move_on_after(READY_IN_MODE_S):
+        with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()
-            await sensors.wait_until(
-                lambda each: sensors.updated_at > since and each.prearm_checks_pass is not False
-            )
+            await sensors.wait_until(lambda each: sensors.updated_at > since and each.prearm_checks_pass is not False)
 
     # ------------------------------------------------------------------------------ rebooting
 
     async def reboot(self, *, force: bool = False, timeout: float = 60.0) -> None:
-        """Reboot the autopilot and wait until it is back: its time since boot has started anew.
+        """Reboot the autopilot and wait until it is back: its time since boot has restarted.
 
         Args:
-            force: also while armed: **a flying vehicle falls**.
+            force: reboot while armed as well: **a flying vehicle falls**.
             timeout: seconds until it is back.
 
         Raises:
             OperationRejected: it is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: it refused.
-            CommandTimeout: there was no answer, and it did not reboot.
-            LinkLost: the link goes down with the vehicle (USB, TCP); connect again.
+            CommandTimeout: there was no acknowledgement, and it did not reboot.
+            LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: it did not come back.
         """
-        if not force and not self.telemetry.is_surely_disarmed:
+        if not force and not self.telemetry.is_confirmed_disarmed:
             state = "armed" if self.telemetry.is_armed else "not known to be disarmed"
             raise OperationRejected(f"reboot: the vehicle is {state}; nothing was sent")
-        reboots = self._talk.watch.reboots
-        self._talk.link_watch.ask()  # its time before
+        reboots = self._session.watch.reboots
+        self._session.link_watch.request_time()  # Request the time before the reboot, to compare with.
         unanswered: CommandTimeout | None = None
-        with self._talk.watch.expecting_reboot():
+        with self._session.watch.expecting_reboot():
             try:
                 await self._order_reboot(force)
             except CommandTimeout as error:
                 unanswered = error
-            with anyio.move_on_after(timeout if unanswered is None else min(timeout, LATE_S)):
+            with anyio.move_on_after(timeout if unanswered is None else min(timeout, ARM_WATCH_S)):
                 await self._await_reboot(reboots)
                 return
         if unanswered is not None:
-            raise CommandTimeout(f"{unanswered}; it is sent once only, and may still be carried out")
-        raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self._talk.describe_link()}")
+            raise CommandTimeout(f"{unanswered}; it is sent only once, and may still be executed")
+        raise OperationTimeout(f"reboot: not back within {timeout:g} s; {self._session.describe_link()}")
 
     async def _order_reboot(self, force: bool) -> None:
-        """Once: a vehicle that has rebooted, and whose answer was lost, would do it again."""
+        """Send the command once: if only the acknowledgement was lost, a second one would reboot the vehicle again."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
-        with self._arbiter.aside() as order:
-            await self._sender.give(
-                order, self._talk.commands.send_long, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
+        with self._arbiter.auxiliary_order() as order:
+            await self._sender.run_command(
+                order, self._session.commands.send_long, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options
             )
 
     async def _await_reboot(self, reboots: int) -> None:
-        """Asks for its time, often at first: a fast simulation is soon older than it was before."""
-        accepted_at = ask_at = self.connection.now()
-        while self._talk.watch.reboots == reboots:
+        """Poll the time since boot, frequently at first: a fast simulation soon exceeds its previous uptime."""
+        accepted_at = request_at = self.connection.now()
+        while self._session.watch.reboots == reboots:
             self.connection.raise_if_ended()
             now = self.connection.now()
-            if now >= ask_at:
-                self._talk.link_watch.ask()
-                ask_at = now + LOOK_S + (now - accepted_at) / 10
-            await anyio.sleep(LOOK_S)
+            if now >= request_at:
+                self._session.link_watch.request_time()
+                request_at = now + POLL_INTERVAL_S + (now - accepted_at) / 10
+            await anyio.sleep(POLL_INTERVAL_S)

@@ -1,4 +1,4 @@
-"""Taking off and coming back to the ground."""
+"""Take-off, landing, return to launch, mode changes and hold."""
 
 from __future__ import annotations
 
@@ -12,8 +12,13 @@ from aerokit.errors import CommandRejected, NotSupported, OperationRejected, Ope
 from aerokit.mavlink.enums import MavLandedState
 from aerokit.position import Position
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
-from aerokit.vehicle.commanding.context import Part
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, OLD_POSITION_S, Stillness, await_progress
+from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.progress import (
+    MAX_SILENCE_S,
+    POSITION_MAX_AGE_S,
+    StallDetector,
+    await_progress,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,66 +26,65 @@ if TYPE_CHECKING:
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.commanding.order import Order
 
+# MAV_LANDED_STATE.
 IN_THE_AIR: dict[int | None, str] = {
     MavLandedState.IN_AIR: "in the air",
     MavLandedState.TAKEOFF: "taking off",
     MavLandedState.LANDING: "landing",
 }
-"""MAV_LANDED_STATE."""
 
-FLYING_M = 2.0
-"""So far above home, who says nothing of it is taken to fly."""
+# Height above home from which a vehicle that sends no landed state is considered flying.
+MIN_FLYING_HEIGHT_M = 2.0
 
-RISEN_M = 0.5
-"""Who is so much higher than before has obeyed an order to take off."""
+# Climb that shows that a take-off command is being executed.
+CLIMB_DETECTED_M = 0.5
 
 MODE_TIMEOUT_S = 6.0
 
-SURFACE_M = 1.5
-"""Who is deeper below home has not surfaced, but was given another mode on the way: home is at the surface."""
+# Home is at the surface: a submarine below this depth has not surfaced, but left the mode on the way.
+MAX_SURFACE_DEPTH_M = 1.5
 
 
 @checks_arguments
-class FlightActions(Part):
-    """Take-off, landing, return."""
+class FlightActions(VehicleBase):
+    """Take-off, landing and return to launch."""
 
     async def take_off(
         self,
         altitude_m: float,
         *,
         timeout: float = 60.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
         """Take off and climb to ``altitude_m`` above home; returns at that altitude.
 
-        The vehicle must be armed. Where the autopilot needs its guided mode for this, it is put into it. Cancelled
-        half-way, or when it does not get there in time, the vehicle is told to hold where it is.
+        The vehicle must be armed. Its mode is changed if the autopilot needs that. After a cancellation or a time-out
+        the vehicle is told to hold where it is.
 
         Args:
             altitude_m: metres above home, above 0, at most 10,000.
             timeout: seconds until it is there.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: it is not armed or flies already, it refused, or its mode changed or it disarmed on the
-                way.
-            CommandTimeout: there was no answer.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not get there in time, or does not move.
+            OperationRejected: it is not armed or is flying already, or its mode changed or it disarmed meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it did not reach the altitude in time, or does not move.
             ValueUnknownError: home is not known, and PX4 needs its altitude.
         """
         check_range("altitude_m", altitude_m, 0, 10_000, above=True)
         plan = self._take_off_plan(altitude_m)
         if not self.telemetry.is_armed:
-            raise OperationRejected("take_off: the vehicle is not armed: arm() comes first; nothing was sent")
+            raise OperationRejected("take_off: the vehicle is not armed: call arm() first; nothing was sent")
         landed = self.telemetry.landed_state
         flies = landed.latest in (MavLandedState.IN_AIR, MavLandedState.LANDING)
-        if flies and landed.age <= OLD_POSITION_S:  # its mode alone would end a landing
+        if flies and landed.age <= POSITION_MAX_AGE_S:  # A mode change alone would abort a landing.
             raise OperationRejected(
-                f"take_off: the vehicle flies already ({IN_THE_AIR[landed.latest]}): go_to() climbs too;"
-                " nothing was sent"
+                f"take_off: the vehicle is already {IN_THE_AIR[landed.latest]}: use go_to() to climb; nothing was sent"
             )
         modes = (
             plan.mode,
@@ -90,27 +94,31 @@ class FlightActions(Part):
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
         try:
             await self._begin_take_off(plan, order)
-            with self._holding.flying(order):
+            with self._flight_cleanup.flying(order):
                 await self._await_altitude(altitude_m, timeout, max_silence_s, order)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
-            self._holding.hold_soon(order)
+        # The vehicle may have received the command.
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected as error:
             raise self._with_state(error) from error
 
     def _with_state(self, error: CommandRejected) -> CommandRejected:
-        """What the vehicle leaves unsaid when it is asked to take off in the air."""
-        state, altitude = IN_THE_AIR.get(self.telemetry.landed_state.latest), self._where.altitude_relative()
-        if state is None and not altitude > FLYING_M:
+        """Add the flight state to a refused take-off, because the vehicle does not report it as the reason."""
+        state, altitude = (
+            IN_THE_AIR.get(self.telemetry.landed_state.latest),
+            self._position.altitude_relative(),
+        )
+        if state is None and not altitude > MIN_FLYING_HEIGHT_M:
             return error
         height = f", {altitude:.1f} m above home" if altitude > -math.inf else ""
-        why = f"it is {state or 'in the air, it seems'}{height}: it takes off from the ground only; go_to() climbs, too"
+        why = f"it is {state or 'probably in the air'}{height} and takes off from the ground only; use go_to() to climb"
         explained = CommandRejected(f"{error}", command=error.command, result=error.result, reasons=(why,))
         explained.reasons = (*error.reasons, why)
         return explained
 
     def _take_off_plan(self, altitude_m: float) -> TakeOff:
-        home = self._where.home_altitude() if self.autopilot.take_off_needs_home() else None
+        home = self._position.home_altitude() if self.autopilot.take_off_needs_home() else None
         plan = self.autopilot.take_off(altitude_m, home, is_vtol=self.telemetry.is_vtol)
         if plan is None:
             raise NotSupported(f"take_off: {self.autopilot.firmware} cannot take off")
@@ -121,10 +129,10 @@ class FlightActions(Part):
             await self._sender.ensure_mode(plan.mode, order)
         if plan.command is not None:
             is_rising = self._rises_from_here()
-            with self._talk.streaming("position", "landed_state"):
-                await self._sender.give(
+            with self._session.streaming("position", "landed_state"):
+                await self._sender.run_command(
                     order,
-                    self._talk.commands.send_long,
+                    self._session.commands.send_long,
                     plan.command,
                     *plan.params,
                     modes=order.modes,
@@ -132,9 +140,9 @@ class FlightActions(Part):
                 )
 
     def _rises_from_here(self) -> Callable[[], bool]:
-        """Whether it rises, by what it tells from now on: what it told before may be of its last flight."""
+        """Return a function that is true once new messages show a climb; earlier ones may describe the last flight."""
         here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        begins_at = math.nan if here is None else self._where.altitude_relative()
+        begins_at = math.nan if here is None else self._position.altitude_relative()
         state_before = landed.latest
 
         def is_rising() -> bool:
@@ -142,115 +150,114 @@ class FlightActions(Part):
                 MavLandedState.IN_AIR,
                 MavLandedState.TAKEOFF,
             )
-            return is_told or self._where.altitude_relative() > begins_at + RISEN_M
+            return is_told or self._position.altitude_relative() > begins_at + CLIMB_DETECTED_M
 
         return is_rising
 
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        """The mode may become the take-off's own and the one after it; any other one is somebody else's doing."""
+        """Wait for the altitude. Only the take-off's own mode and the one after it are expected."""
         enough_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()
 
         def is_up() -> bool:
-            is_high = self._where.is_known_since(started) and self._where.altitude_relative() >= enough_m
+            is_high = self._position.is_known_since(started) and self._position.altitude_relative() >= enough_m
             return is_high and not order.end
 
-        with self._talk.streaming("position"):
+        with self._session.streaming("position"):
             await await_progress(
-                self._talk,
+                self._session,
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
                 trouble=self._sender.stays_in(order, *order.modes),
-                describe=lambda: f"it is at {self._where.altitude_relative():.1f} m",
+                describe=lambda: f"it is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stillness=Stillness(self._talk),
+                stillness=StallDetector(self._session),
             )
 
-    async def land(
-        self, *, timeout: float | None = 300.0, max_silence_s: float | None = LONGEST_SILENCE_S
-    ) -> None:
-        """Land where the vehicle is; returns on the ground, where the motors may still be turning.
+    async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
+        """Land at the present position; returns on the ground, where the motors may still be turning.
 
-        Follow ``vehicle.armed`` for the motors. Cancelled, the vehicle goes on landing.
+        Watch ``vehicle.armed`` for the motors. After a cancellation the vehicle continues to land.
 
         Args:
-            timeout: seconds until it is on the ground; None: as long as it takes.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            timeout: seconds until it is on the ground; None: no limit.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            NotSupported: this type of vehicle has no mode for it. Nothing was sent.
+            NotSupported: this type of vehicle has no landing mode. Nothing was sent.
             CommandRejected: the vehicle refused the mode.
-            CommandTimeout: there was no answer.
-            OperationRejected: the mode changed on the way.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: not on the ground in time.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: the mode changed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it was not on the ground in time.
         """
         mode = self._sender.mode_for("land", "land")
-        if self.autopilot.landing_ends_in is None:
+        if self.autopilot.mode_when_landed is None:
             order = self._arbiter.order(mode)
-            await self._sender.change_mode(mode, order, told_since=order.given_at)
+            await self._sender.change_mode(mode, order, reported_since=order.given_at)
         else:
-            order = self._arbiter.order(mode, self.autopilot.modes.find(self.autopilot.landing_ends_in))
+            order = self._arbiter.order(mode, self.autopilot.modes.find(self.autopilot.mode_when_landed))
             with self._arbiter.changing_mode():
-                # The landing may be over before HEARTBEAT tells its mode.
+                # The landing may be over before HEARTBEAT reports its mode.
                 await self._sender.request_mode(mode, order, attempt_timeout=min(1.0, MODE_TIMEOUT_S / 4))
         await self._await_ground("land", order, timeout, max_silence_s)
 
     async def return_to_launch(
-        self, *, timeout: float | None = 600.0, max_silence_s: float | None = LONGEST_SILENCE_S
+        self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S
     ) -> None:
-        """Return to the launch place; returns on the ground, or above it where the vehicle does not land by itself.
+        """Return to launch; returns on the ground, or above it if the autopilot does not land by itself.
 
-        Raises as :meth:`land`.
+        Raises the same errors as :meth:`land`.
         """
         mode = self._sender.mode_for("return_to_launch", "return")
         order = self._arbiter.order(mode)
-        await self._sender.change_mode(mode, order, told_since=order.given_at)
+        await self._sender.change_mode(mode, order, reported_since=order.given_at)
         if self.autopilot.lands_after_return:
             await self._await_ground("return_to_launch", order, timeout, max_silence_s)
         else:
             await self._await_home(order, timeout, max_silence_s)
 
-    async def _await_ground(
-        self, what: str, order: Order, timeout: float | None, max_silence_s: float | None
-    ) -> None:
-        """Only what was told after the order counts: a state that had gone stale would end a landing in the air."""
+    async def _await_ground(self, what: str, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
+        """Wait for the ground. Only messages received after the order count: a stale state would end a landing in the
+        air.
+        """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
 
         def is_down() -> bool:
-            is_disarmed = self.telemetry.is_surely_disarmed and armed.updated_at > order.given_at
+            is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = landed.latest == MavLandedState.ON_GROUND and landed.updated_at > order.given_at
             return is_disarmed or is_landed or (is_over() and not is_deep())
 
         def is_over() -> bool:
-            return (
-                self.telemetry.mode_name == self.autopilot.landing_ends_in and mode.updated_at > accepted_at
-            )
+            return self.telemetry.mode_name == self.autopilot.mode_when_landed and mode.updated_at > accepted_at
 
         def is_deep() -> bool:
-            return self._where.is_known_since(order.given_at) and self._where.altitude_relative() < -SURFACE_M
+            return (
+                self._position.is_known_since(order.given_at)
+                and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
+            )
 
         stays = self._sender.stays_in(order, *order.modes)
 
         def trouble() -> str | None:
             if is_over() and is_deep() and self.connection.now() > accepted_at + MODE_GRACE_S:
-                return f"the mode changed to {self.telemetry.mode_name} at {self._where.altitude_relative():.1f} m"
+                return f"the mode changed to {self.telemetry.mode_name} at {self._position.altitude_relative():.1f} m"
             if order.has_lost_mode and armed.updated_at < order.mode_lost_at:
-                return None  # the HEARTBEAT that comes next may tell that it has landed and disarmed
+                return None  # The next HEARTBEAT may report that it has landed and disarmed.
             return stays()
 
-        depth = () if self.autopilot.landing_ends_in is None else ("position",)
-        with self._talk.streaming("landed_state", *depth):
+        depth = () if self.autopilot.mode_when_landed is None else ("position",)
+        with self._session.streaming("landed_state", *depth):
             await await_progress(
-                self._talk,
+                self._session,
                 what,
                 is_done=is_down,
                 trouble=trouble,
-                describe=lambda: f"it is at {self._where.altitude_relative():.1f} m",
+                describe=lambda: f"it is at {self._position.altitude_relative():.1f} m",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -262,86 +269,84 @@ class FlightActions(Part):
         started = self.connection.now()
 
         def is_back() -> bool:
-            is_near = self._where.is_known_since(started) and self._where.distance_to(place) <= near_m
+            is_near = self._position.is_known_since(started) and self._position.distance_to(place) <= near_m
             return is_near and not order.end
 
-        with self._talk.streaming("position"):
+        with self._session.streaming("position"):
             await await_progress(
-                self._talk,
+                self._session,
                 "return_to_launch",
                 is_done=is_back,
                 trouble=self._sender.stays_in(order, *order.modes),
-                describe=lambda: f"it is {self._where.distance_to(place):.1f} m from home",
+                describe=lambda: f"it is {self._position.distance_to(place):.1f} m from home",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
 
 
 @checks_arguments
-class ModeActions(Part):
-    """Changing the flight mode; stopping."""
+class ModeActions(VehicleBase):
+    """Changing the flight mode, and holding."""
 
     async def set_mode(self, mode: str | int, *, timeout: float = 6.0) -> None:
-        """Change the flight mode and wait until HEARTBEAT tells it.
+        """Change the flight mode and wait until HEARTBEAT reports it.
 
-        Args:
-            mode: a name as the autopilot's own documentation spells it (``"GUIDED"``, ``"POSCTL"``; case does not
-                matter), or the number in HEARTBEAT.custom_mode.
-            timeout: seconds for the whole of it.
-
-        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it
         (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE).
 
+        Args:
+            mode: a name as spelled in the autopilot's documentation (``"GUIDED"``, ``"POSCTL"``; case is ignored), or
+                the number in HEARTBEAT.custom_mode.
+            timeout: seconds for the whole call.
+
         Raises:
-            InvalidArgument: this vehicle has no such mode; the text lists those it has. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            InvalidArgument: this vehicle has no such mode; the text lists its modes. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not answer.
+            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
         """
         wanted = self.autopilot.find_mode(mode, self.telemetry.mode_names)
         await self._sender.change_mode(wanted, self._arbiter.order(wanted), timeout)
 
     async def hold(self) -> None:
-        """Stop and stay (a fixed wing circles); returns when HEARTBEAT tells the autopilot's mode for that.
+        """Stop and stay (a fixed wing circles); returns when HEARTBEAT reports the autopilot's mode for that.
 
         Copter BRAKE, Plane LOITER, Rover HOLD (a boat LOITER), Sub POSHOLD; PX4 LOITER where it comes to a stop.
 
         Raises:
             NotSupported: this vehicle has no mode for it. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said meanwhile.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
-            OperationTimeout: it accepted and stayed in another mode, or did not answer.
+            OperationTimeout: it accepted and stayed in another mode, or did not acknowledge.
         """
-        await self._holding.hold()
+        await self._flight_cleanup.hold()
 
     @property
-    def is_told_to_hold(self) -> bool:
-        """Whether a flight was given up, and the order to hold that followed is not confirmed yet."""
-        return self._holding.is_told_to_hold
+    def is_hold_pending(self) -> bool:
+        """True while the hold that followed an abandoned flight is not confirmed."""
+        return self._flight_cleanup.is_hold_pending
 
     @property
     def is_flown_by_program(self) -> bool:
-        """Whether the vehicle is armed and does what this program has ordered.
+        """True while the vehicle is armed and executes orders of this program.
 
-        The program has armed it, or has given an order that steers since somebody else did; and no pilot, failsafe or
-        other program has taken it from that. False for a vehicle that others fly and that this program only watches.
+        This program armed it, or has given a steering order since another party armed it, and no pilot, failsafe or
+        other program took over since. False for a vehicle that this program only observes.
         """
         return self.telemetry.is_armed and self._arbiter.is_flown_by_program
 
     @property
     def taken_over(self) -> str:
-        """What somebody else has made of the program's last action, as a clause; empty: nothing that was told.
+        """The takeover that ended the program's last action, as a clause; empty if there was none.
 
-        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not tell apart; or
-        "a failsafe became active (MAV_STATE_CRITICAL)", which may come some seconds before the mode changes.
-        A vehicle that only disarmed, as after a landing, was not taken over. The program's next action begins anew.
+        "the mode changed to LOITER": by a pilot, a failsafe or another program, which HEARTBEAT does not distinguish;
+        or "a failsafe became active (MAV_STATE_CRITICAL)", which may be reported seconds before the mode changes.
+        Disarming alone, as after a landing, is no takeover. The program's next action resets it.
         """
         order = self._arbiter.current or self._arbiter.newest
         if order is None or not order.has_lost_mode:
             return "" if order is None else order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
-            return (
-                ""  # PX4 leaves LAND when it disarms: CURRENT_MODE tells that a moment before HEARTBEAT does
-            )
-        return order.taken_by
+            return ""  # PX4 leaves LAND when it disarms: CURRENT_MODE reports that before HEARTBEAT does.
+        return order.takeover_reason

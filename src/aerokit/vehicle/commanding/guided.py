@@ -1,8 +1,9 @@
-"""Guided set-points, streamed at a rate and bound to the life of the code that feeds them.
+"""Guided set-points, streamed at a fixed rate while a program supplies them.
 
-An autopilot stops by itself when set-points stop coming (ArduCopter after 3 s, PX4 after 0.5 s). A library that
-resends the last set-point for ever defeats that. Here the stream ends, and the vehicle is told to hold, when the code
-that feeds it ends, raises, is cancelled, goes silent or blocks the event loop, and when the vehicle falls silent.
+An autopilot stops by itself when set-points stop arriving (ArduCopter after 3 s, PX4 after 0.5 s). Resending the last
+set-point without limit would defeat that. Here the stream ends, and the vehicle is told to hold, when the code that
+supplies set-points ends, raises, is cancelled, stops supplying them or blocks the event loop, and when the vehicle
+falls silent.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
-from aerokit.vehicle.commanding.progress import Stillness
+from aerokit.vehicle.commanding.progress import StallDetector
 from aerokit.vehicle.commanding.setpoints import (
     AccelerationSetpoint,
     AttitudeSetpoint,
@@ -40,32 +41,34 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
 
 __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-AT_FIRST, AGAIN_S = 3, 5.0
-"""A place that must not be sent without need is sent so often at once, lest one is lost, and again after so long."""
-ENTRY_S = 1.0
-"""How long the initial set-point is streamed before PX4 is asked for OFFBOARD: it wants to see a stream first."""
+# Number of immediate transmissions of a position set-point that must not be repeated needlessly, as
+# protection against loss, and the interval of later ones.
+INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
+# Seconds for which the initial set-point is streamed before OFFBOARD is requested: PX4 requires a running
+# stream.
+OFFBOARD_LEAD_TIME_S = 1.0
 
 
 @checks_arguments
 class Guided:
     """Opens set-point streams: ``async with vehicle.guided.velocity() as stream: stream.set(...)``.
 
-    Every stream takes ``rate_hz`` (how often the latest set-point is sent, 2 to 100), ``valid_for_s`` (how long a
+    Every stream takes ``rate_hz`` (transmission rate of the latest set-point, 2 to 100), ``valid_for_s`` (how long a
     set-point may be resent without a new one) and ``max_lag_s`` (how late the event loop may be). NotSupported is
-    raised for a kind that this type of vehicle does not obey. Rates and seconds are ours: a simulation that runs ten
-    times as fast, and does not wait longer for it, wants ten times as many set-points.
+    raised for a kind that this type of vehicle does not obey. Rates and seconds are in real time: a simulation at ten
+    times the speed needs ten times the rate.
     """
 
-    def __init__(self, bridge: Bridge) -> None:
-        self._bridge = bridge
-        self._encode = SetpointEncoder(bridge)
+    def __init__(self, context: VehicleContext) -> None:
+        self._context = context
+        self._encode = SetpointEncoder(context)
 
     def velocity(
         self,
@@ -86,7 +89,7 @@ class Guided:
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[BodyVelocitySetpoint]:
-        """Stream velocities as seen from the vehicle (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
+        """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
         return self._stream("velocity", self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
 
     def acceleration(
@@ -98,9 +101,7 @@ class Guided:
         max_lag_s: float = 0.5,
     ) -> SetpointStream[AccelerationSetpoint]:
         """Stream accelerations (SET_POSITION_TARGET_LOCAL_NED)."""
-        return self._stream(
-            "acceleration", self._encode.acceleration, initial, rate_hz, valid_for_s, max_lag_s
-        )
+        return self._stream("acceleration", self._encode.acceleration, initial, rate_hz, valid_for_s, max_lag_s)
 
     def local_position(
         self,
@@ -110,10 +111,8 @@ class Guided:
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[LocalPositionSetpoint]:
-        """Stream places in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
-        return self._stream(
-            "local position", self._encode.local_position, initial, rate_hz, valid_for_s, max_lag_s
-        )
+        """Stream positions in the local frame (SET_POSITION_TARGET_LOCAL_NED)."""
+        return self._stream("local position", self._encode.local_position, initial, rate_hz, valid_for_s, max_lag_s)
 
     def position(
         self,
@@ -123,10 +122,8 @@ class Guided:
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[PositionSetpoint]:
-        """Stream places on the globe (SET_POSITION_TARGET_GLOBAL_INT)."""
-        return self._stream(
-            "global position", self._encode.position, initial, rate_hz, valid_for_s, max_lag_s
-        )
+        """Stream global positions (SET_POSITION_TARGET_GLOBAL_INT)."""
+        return self._stream("global position", self._encode.position, initial, rate_hz, valid_for_s, max_lag_s)
 
     def attitude(
         self,
@@ -142,28 +139,26 @@ class Guided:
     def _stream(
         self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *limits: float
     ) -> SetpointStream[SetpointT]:
-        autopilot = self._bridge.talk.autopilot
+        autopilot = self._context.session.autopilot
         if kind not in autopilot.setpoints.names:
             obeyed = ", ".join(autopilot.setpoints.names) or "none"
-            raise NotSupported(
-                f"{autopilot.firmware} does not obey {kind} set-points; those it obeys: {obeyed}"
-            )
-        return SetpointStream(self._bridge, encode, initial, *limits)
+            raise NotSupported(f"{autopilot.firmware} does not obey {kind} set-points; those it obeys: {obeyed}")
+        return SetpointStream(self._context, encode, initial, *limits)
 
 
 @checks_arguments
 class SetpointStream(Generic[SetpointT]):
-    """Sends the latest set-point at a rate for as long as the ``async with`` block feeds it.
+    """Sends the latest set-point at a fixed rate while the ``async with`` block supplies set-points.
 
-    Entering puts the vehicle into its mode for set-points (GUIDED, OFFBOARD) with the initial set-point. Leaving, in
-    any way, tells it to hold. When the stream has stopped by itself, ``set`` and leaving the block raise
-    :class:`SetpointStreamStopped`; a vehicle that should move and does not for twelve seconds stops it, too. When it
-    stopped because the mode changed (a pilot, a failsafe), the vehicle is left to whoever changed it.
+    Entering the block changes to the set-point mode (GUIDED, OFFBOARD) with the initial set-point. Leaving it in any
+    way tells the vehicle to hold. If the stream stops by itself, ``set`` and leaving the block raise
+    :class:`SetpointStreamStopped`; a vehicle that does not move for twelve seconds although it should stops it as
+    well. If it stopped because a pilot or a failsafe changed the mode, nothing more is sent to the vehicle.
     """
 
     def __init__(
         self,
-        bridge: Bridge,
+        context: VehicleContext,
         encode: Callable[[SetpointT], Message],
         initial: SetpointT,
         rate_hz: float,
@@ -173,7 +168,11 @@ class SetpointStream(Generic[SetpointT]):
         check_range("rate_hz", rate_hz, 2, 100)
         check_range("valid_for_s", valid_for_s, 0, 60, above=True)
         check_range("max_lag_s", max_lag_s, 0, 60, above=True)
-        self._bridge, self._talk, self._holding = bridge, bridge.talk, bridge.holding
+        self._context, self._session, self._flight_cleanup = (
+            context,
+            context.session,
+            context.flight_cleanup,
+        )
         self._encode = encode
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
         self._setpoint = initial
@@ -183,35 +182,33 @@ class SetpointStream(Generic[SetpointT]):
         self._mode: Mode | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: SetpointStreamStopped | None = None
-        self._was_told = self._was_entered = False
+        self._is_reported = self._was_entered = False
         self._is_entering = False
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
-        self._is_costly = is_place and bridge.talk.autopilot.setpoints.place_restarts_path
-        self._left, self._sent_at = AT_FIRST, -math.inf
-        self._stillness = Stillness(bridge.talk)
+        self._is_costly = is_place and context.session.autopilot.setpoints.position_restarts_path
+        self._left, self._sent_at = INITIAL_REPEATS, -math.inf
+        self._stillness = StallDetector(context.session)
 
     @property
     def is_running(self) -> bool:
-        """Whether set-points are being sent."""
+        """True while set-points are being sent."""
         return self._timer is not None
 
     def set(self, setpoint: SetpointT) -> None:
-        """Take a new set-point; it is sent at the next tick, and resent until ``valid_for_s`` has passed.
+        """Replace the set-point; it is sent at the next tick and resent until ``valid_for_s`` has passed.
 
         Raises:
-            InvalidArgument: a value is out of range; the one before stays in force until it is too old.
+            InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
             SetpointStreamStopped: the stream has ended by itself, or the block was left.
         """
         check_kind("setpoint", setpoint, type(self._setpoint))
         self._raise_if_stopped()
         if self._timer is None:
-            raise SetpointStreamStopped(
-                "this set-point stream is not running: use it inside its `async with`"
-            )
+            raise SetpointStreamStopped("this set-point stream is not running: use it inside its `async with` block")
         self._take(setpoint)
 
     async def fly(self, setpoint: SetpointT, duration_s: float) -> None:
-        """Feed one set-point for ``duration_s`` seconds.
+        """Send one set-point for ``duration_s`` seconds.
 
         Raises:
             SetpointStreamStopped: the stream ended meanwhile.
@@ -225,18 +222,18 @@ class SetpointStream(Generic[SetpointT]):
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
-            raise SetpointStreamStopped("a set-point stream is entered once: open another one")
-        self._take(self._setpoint)  # refuse nonsense before anything is sent
-        if self._holding.end_stream is not None:
+            raise SetpointStreamStopped("a set-point stream can be entered only once: open another one")
+        self._take(self._setpoint)  # Raises for an invalid set-point before anything is sent.
+        if self._flight_cleanup.stop_stream is not None:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
-        mode = self._bridge.sender.mode_for("a set-point stream", "setpoint")
+        mode = self._context.sender.mode_for("a set-point stream", "setpoint")
         self._was_entered = True
-        self._holding.end_stream = self._stop
-        order = self._order = self._bridge.arbiter.order(mode)
-        order.is_given = order.is_given or self._talk.telemetry.is_in(mode)
+        self._flight_cleanup.stop_stream = self._stop
+        order = self._order = self._context.arbiter.order(mode)
+        order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
             await self._enter(mode, order)
-        except OperationRejected:  # the vehicle stays with whoever steers it
+        except OperationRejected:  # The pilot or failsafe that took over keeps the vehicle.
             self._end()
             raise
         except BaseException:
@@ -258,30 +255,35 @@ class SetpointStream(Generic[SetpointT]):
             self._stopped = SetpointStreamStopped("the block of this set-point stream was left")
             if exc is not None:
                 self._hold()
-            elif not self._bridge.arbiter.is_known:  # whoever steers by then is left alone
-                self._stop(f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s")
+            # There may have been a takeover that was not received yet.
+            elif not self._context.arbiter.is_known:
+                self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
                 raise self._stopped
-            elif not self._talk.telemetry.is_surely_disarmed:
-                await self._holding.hold()
-        elif exc is None and not self._was_told:
+            elif not self._session.telemetry.is_confirmed_disarmed:
+                await self._flight_cleanup.hold()
+        elif exc is None and not self._is_reported:
             raise self._stopped
 
     async def _enter(self, mode: Mode, order: Order) -> None:
-        """ArduPilot takes set-points once it is in GUIDED; PX4 goes to OFFBOARD once it sees set-points."""
-        if self._talk.autopilot.setpoints.before_mode:
-            self._begin()
-            await self.fly(self._setpoint, ENTRY_S)
+        """Change the mode. ArduPilot takes set-points once it is in GUIDED; PX4 enters OFFBOARD once it receives
+        set-points.
+        """
+        if self._session.autopilot.setpoints.stream_before_mode:
+            self._prepare()
+            await self.fly(self._setpoint, OFFBOARD_LEAD_TIME_S)
             await self._feeding_initial(mode, order)
         else:
-            await self._bridge.sender.ensure_mode(mode, order)
-            self._begin()
+            await self._context.sender.ensure_mode(mode, order)
+            self._prepare()
         self._mode = mode
 
     async def _feeding_initial(self, mode: Mode, order: Order) -> None:
-        """Not in a task group: what is raised here reaches the user as it is."""
+        """Stream the initial set-point during the mode change. Not a task group, so that exceptions reach the user
+        unchanged.
+        """
         self._is_entering = True
         try:
-            await self._bridge.sender.ensure_mode(mode, order)
+            await self._context.sender.ensure_mode(mode, order)
         finally:
             self._is_entering = False
             self._set_at = self._now()
@@ -290,19 +292,19 @@ class SetpointStream(Generic[SetpointT]):
     # ---------------------------------------------------------------------------- the stream
 
     def _take(self, setpoint: SetpointT) -> None:
-        """Turn it into the message to send, whole: what cannot be sent is refused here."""
+        """Encode the set-point completely, so that an invalid one is refused here."""
         message = self._encode(setpoint)
         message.encode()
         if setpoint != self._setpoint:
-            self._left = AT_FIRST
+            self._left = INITIAL_REPEATS
         self._setpoint, self._message, self._set_at = setpoint, message, self._now()
 
-    def _begin(self) -> None:
+    def _prepare(self) -> None:
         self._take(self._setpoint)
         self._tick(self._now())
 
     def _tick(self, due: float) -> None:
-        """Send once more, unless something says that nobody steers any more."""
+        """Send the set-point once more, or stop the stream."""
         self._timer = None
         if reason := self._why_leave_alone():
             self._stop(reason, hold=False)
@@ -320,8 +322,8 @@ class SetpointStream(Generic[SetpointT]):
 
     def _send(self) -> None:
         assert self._message is not None
-        if not self._is_costly or self._left > 0 or self._now() - self._sent_at >= AGAIN_S:
-            self._talk.connection.send(self._message)
+        if not self._is_costly or self._left > 0 or self._now() - self._sent_at >= REPEAT_INTERVAL_S:
+            self._session.connection.send(self._message)
             self._left, self._sent_at = self._left - 1, self._now()
 
     def _why_stop(self, lag: float) -> str | None:
@@ -329,18 +331,18 @@ class SetpointStream(Generic[SetpointT]):
         if lag > self._max_lag_s:
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
-            return f"no new set-point came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
-        # on a connection that has ended, sending tells why
-        if self._talk.watch.is_silent and self._talk.connection.is_open:
-            return f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s"
-        if self._mode is None or not wants_motion(self._setpoint, self._bridge):
-            self._stillness = Stillness(self._talk)
+            return f"no new set-point was supplied for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
+        # On a connection that has ended, sending raises the reason.
+        if self._session.watch.is_silent and self._session.connection.is_open:
+            return f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s"
+        if self._mode is None or not wants_motion(self._setpoint, self._context):
+            self._stillness = StallDetector(self._session)
             return None
         return self._stillness()
 
     def _why_leave_alone(self) -> str | None:
-        """Somebody else has taken over: a pilot, a failsafe, another program."""
-        mode = self._talk.telemetry.mode.latest
+        """Return the reason if a pilot, a failsafe or another program took over, else None."""
+        mode = self._session.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"
         if self._order is not None and self._order.end:
@@ -348,21 +350,20 @@ class SetpointStream(Generic[SetpointT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """End it by itself. The vehicle is told to hold, unless somebody else steers it by now."""
+        """Stop the stream from inside; tell the vehicle to hold unless there was a takeover."""
         self._end()
-        is_told = hold and self._hold()
+        is_confirmed = hold and self._hold()
         self._stopped = SetpointStreamStopped(
-            f"the set-point stream has stopped: {reason}"
-            + ("; the vehicle was told to hold" if is_told else "")
+            f"the set-point stream has stopped: {reason}" + ("; the vehicle was told to hold" if is_confirmed else "")
         )
 
     def _hold(self) -> bool:
-        return self._order is not None and self._holding.hold_soon(self._order)
+        return self._order is not None and self._flight_cleanup.hold_in_background(self._order)
 
     def _end(self) -> None:
         self._cancel_timer()
-        if self._holding.end_stream == self._stop:
-            self._holding.end_stream = None
+        if self._flight_cleanup.stop_stream == self._stop:
+            self._flight_cleanup.stop_stream = None
 
     def _cancel_timer(self) -> None:
         if self._timer is not None:
@@ -371,8 +372,8 @@ class SetpointStream(Generic[SetpointT]):
 
     def _raise_if_stopped(self) -> None:
         if self._stopped is not None:
-            self._was_told = True
+            self._is_reported = True
             raise self._stopped
 
     def _now(self) -> float:
-        return self._talk.connection.now()
+        return self._session.connection.now()

@@ -1,4 +1,4 @@
-"""What keeps a vehicle from flying, in words: beforehand, and after it has refused."""
+"""Reasons why a vehicle cannot arm or fly, as texts."""
 
 from __future__ import annotations
 
@@ -13,112 +13,112 @@ from aerokit.mavlink.enums import MavCmd
 
 if TYPE_CHECKING:
     from aerokit.autopilots import Mode
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
+# Seconds in which status texts are collected after the vehicle was asked to run its checks.
 TEXTS_S = 1.0
-"""How long texts are collected after the vehicle was asked to run its checks."""
-FRESH_S = 5.0
-"""What is older says nothing about now."""
+# Older values do not describe the present state.
+HEALTH_MAX_AGE_S = 5.0
 
 
 class Health:
-    """Pre-arm checks, failing sensors and what the estimator lacks."""
+    """Pre-arm checks, failing sensors and missing estimates."""
 
-    def __init__(self, talk: Talk) -> None:
-        self._talk, self._telemetry, self._autopilot = talk, talk.telemetry, talk.autopilot
+    def __init__(self, session: VehicleSession) -> None:
+        self._session, self._telemetry, self._autopilot = session, session.telemetry, session.autopilot
         self._restored_at = -math.inf
-        talk.at_close(talk.connection.bus.attach_event(LinkRestored, self._on_restored))
+        session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
-        """The vehicle may have rebooted meanwhile: only what it tells from now on counts."""
+        """Discard states received before a silence, because the vehicle may have rebooted."""
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
-        """What is still missing before the vehicle can fly, as far as it is known already; talks to nobody."""
+        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing."""
         telemetry = self._telemetry
         missing = [
-            f"{cell.name} ({cell.waits_for} has not come)"
+            f"{cell.name} ({cell.waits_for} not received)"
             for cell in (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home)
             if not cell.is_known
         ]
         return [*missing, *self._out_of_date(), *self._failing()]
 
     def _out_of_date(self) -> list[str]:
-        """What has been told, but too long ago to say anything about now."""
+        """Return the states that are too old to describe the present."""
         telemetry = self._telemetry
-        is_lost = self._talk.watch.link_state.latest is LinkState.LOST
-        why = f"the last one {self._talk.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
-        heartbeats = [f"heartbeats ({why})"] if is_lost or self._talk.watch.is_silent else []
+        is_lost = self._session.watch.link_state.latest is LinkState.LOST
+        why = f"the last one {self._session.heartbeat_age:.1f} s ago{', the link is lost' if is_lost else ''}"
+        heartbeats = [f"heartbeats ({why})"] if is_lost or self._session.watch.is_silent else []
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position)
         old = [
             f"{cell.name} (no {cell.waits_for} for {cell.age:.0f} s)"
             for cell in cells
-            if FRESH_S < cell.age < math.inf
+            if HEALTH_MAX_AGE_S < cell.age < math.inf
         ]
         before = [
             f"{cell.name} (no {cell.waits_for} since the link was restored)"
             for cell in cells
-            if cell.is_known and cell.updated_at < self._restored_at and cell.age <= FRESH_S
+            if cell.is_known and cell.updated_at < self._restored_at and cell.age <= HEALTH_MAX_AGE_S
         ]
         return [*heartbeats, *old, *before]
 
     async def why_not_armable(self) -> list[str]:
-        """Why arming would be refused now; the vehicle is asked to run its checks where it can do so on request."""
+        """Return why arming would be refused now; the vehicle runs its checks where it supports that."""
         if self._telemetry.is_armed:
             return []
-        return list(await self.arming_reasons(self._talk.connection.now()))
+        return list(await self.arming_reasons(self._session.connection.now()))
 
     async def arming_reasons(self, since: float) -> tuple[str, ...]:
-        """Texts about arming since then; those asked for again where there are none; then failing bits and flags."""
-        with self._talk.streaming("sensors", "estimator"):
-            await self._talk.settle()
+        """Return status texts about arming since then, requested again if there are none, then failing bits and
+        flags.
+        """
+        with self._session.streaming("sensors", "estimator"):
+            await self._session.wait_for_status_texts()
             if not self.arming_texts(since) and self._autopilot.runs_prearm_checks:
                 await self._run_prearm_checks()
-            await self._hear_of_health()
+            await self._refresh()
         found = (self.arming_texts(since), self.unarmable_mode(), self._out_of_date(), self._failing())
-        return self._talk.each_reason_once(*(reason for reasons in found for reason in reasons))
+        return self._session.deduplicate_reasons(*(reason for reasons in found for reason in reasons))
 
     def unarmable_mode(self) -> list[str]:
-        """That it does not arm in its present mode, if it does not."""
+        """Return that the present mode does not allow arming, if so."""
         mode = self._telemetry.mode.latest
         is_unarmable = mode is not None and mode.name in self._autopilot.unarmable_modes
         return [self.unarmable_text(mode)] if mode is not None and is_unarmable else []
 
     def unarmable_text(self, mode: Mode) -> str:
-        """Where it does arm instead."""
+        """Return a sentence that names the modes that allow arming."""
         others = sorted({*self._autopilot.modes.names} - self._autopilot.unarmable_modes)
-        text = f"{self._autopilot.firmware} does not arm in {mode.name}, but in {', '.join(others)}"
+        text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {', '.join(others)}"
         better = self._autopilot.mode_to_arm_in()
-        return text if better is None else f"{text}; arm() goes to {better.name} first"
+        return text if better is None else f"{text}; arm() changes to {better.name} first"
 
-    async def _hear_of_health(self) -> None:
-        """Give the vehicle a moment to tell what it has not told lately."""
+    async def _refresh(self) -> None:
+        """Wait briefly for states that are missing or too old."""
         with anyio.move_on_after(TEXTS_S):
-            await self._telemetry.sensors.wait_until(lambda _: self._telemetry.sensors.age <= FRESH_S)
-            await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= FRESH_S)
+            await self._telemetry.sensors.wait_until(lambda _: self._telemetry.sensors.age <= HEALTH_MAX_AGE_S)
+            await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
     async def _run_prearm_checks(self) -> None:
         try:
-            await self._talk.commands.send_long(MavCmd.RUN_PREARM_CHECKS, attempts=2)
+            await self._session.commands.send_long(MavCmd.RUN_PREARM_CHECKS, attempts=2)
         except (CommandRejected, CommandTimeout):
             return
         await anyio.sleep(TEXTS_S)
 
     def arming_texts(self, since: float) -> list[str]:
-        """What it has said about arming since then."""
-        return [
-            text for text in self._talk.texts_since(since) if self._autopilot.arming_reason(text) is not None
-        ]
+        """Return the status texts about arming since then."""
+        return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _failing(self) -> list[str]:
-        """Failing sensors, failing pre-arm checks, missing estimates.
+        """Return failing sensors, failing pre-arm checks and missing estimates.
 
-        When the vehicle says that it could be armed, a failing sensor is one it can do without (PX4: no RC receiver).
-        In a mode in which it does not arm, PX4 judges what that mode needs: that says nothing.
+        If the vehicle reports that it can be armed, a failing sensor is not required (PX4: no RC receiver). In a mode
+        that does not allow arming, PX4 evaluates the requirements of that mode, which say nothing about arming.
         """
         failing: list[str] = []
         sensors, estimator = self._telemetry.sensors.latest, self._telemetry.estimator.latest
-        says_nothing = self._autopilot.judges_by_mode and self.unarmable_mode()
+        says_nothing = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         if sensors is not None and sensors.prearm_checks_pass is not True and not says_nothing:
             failing += [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing]
             if sensors.prearm_checks_pass is False:

@@ -1,4 +1,4 @@
-"""Talking to a vehicle past its actions: any command, any message, and how well it is heard."""
+"""Commands, messages and subscriptions beyond the vehicle's actions, and the quality of its link."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.autopilots.modes import CUSTOM_MODE_ENABLED
 from aerokit.connection.bus import Overflow, Subscription
 from aerokit.connection.cells import StateCell
-from aerokit.connection.tasks import Background
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import InvalidArgument
-from aerokit.events import Event, LinkChosen, LinkRestored, VehicleBack, VehicleRebooted
+from aerokit.events import Event, LinkRestored, LinkSelected, VehicleRebooted, VehicleRecovered
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import CommandAck, CommandInt, CommandLong, SetMode
-from aerokit.vehicle.commanding.context import Part
+from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.order import ARM_ALONE, Subject, subjects_of
 from aerokit.vehicle.commanding.posted import PostedOrder
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots import Mode
     from aerokit.events import LinkState
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
-EVERY_GROUP = EVERY_COMPONENT = 0
+ALL_GROUPS = ALL_COMPONENTS = 0
 
 COMES_WITHIN_S = 3.0
 
-LONGEST_S = 60.0
+MAX_RETRY_INTERVAL_S = 60.0
 
 REQUESTED_STREAMS: tuple[type[Message], ...] = (
     m.Attitude,
@@ -44,6 +44,7 @@ REQUESTED_STREAMS: tuple[type[Message], ...] = (
     m.GpsRawInt,
 )
 
+# States that every vehicle should stream.
 NEEDED = (
     "attitude",
     "position",
@@ -54,76 +55,75 @@ NEEDED = (
     "estimator",
     "rc_channels",
 )
-"""States that every vehicle should stream."""
 
 
 @contextmanager
-def every_stream(talk: Talk, rate_hz: float) -> Iterator[None]:
-    """See ``Vehicle.streams``."""
+def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
+    """Implement ``Vehicle.streams``."""
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
-    tasks = Background(talk.connection.fail)
+    tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as ends:
-        if talk.autopilot.stream_groups:
-            heard = _Heard(talk, ends)
-            tasks.start(lambda: _keep_asking(talk, rate_hz, heard), "aerokit streams")
+        if session.autopilot.stream_groups:
+            heard = _StreamMonitor(session, ends)
+            tasks.start(lambda: _keep_asking(session, rate_hz, heard), "aerokit streams")
         else:
-            tasks.start(lambda: _want_missing(talk, rate_hz, ends), "aerokit streams")
+            tasks.start(lambda: _want_missing(session, rate_hz, ends), "aerokit streams")
         try:
             yield
         finally:
             tasks.cancel()
 
 
-async def _keep_asking(talk: Talk, rate_hz: float, heard: _Heard) -> None:
-    patience_s = COMES_WITHIN_S
+async def _keep_asking(session: VehicleSession, rate_hz: float, heard: _StreamMonitor) -> None:
+    retry_interval_s = COMES_WITHIN_S
     rate = max(1, round(rate_hz))
     while True:
-        talk.send(m.RequestDataStream(talk.system_id, EVERY_COMPONENT, EVERY_GROUP, rate, 1))
+        session.send(m.RequestDataStream(session.system_id, ALL_COMPONENTS, ALL_GROUPS, rate, 1))
         heard.forget()
-        with anyio.move_on_after(patience_s):
-            await heard.is_to_be_asked.wait()
-            patience_s = COMES_WITHIN_S
+        with anyio.move_on_after(retry_interval_s):
+            await heard.must_request.wait()
+            retry_interval_s = COMES_WITHIN_S
             continue
-        patience_s = min(2 * patience_s, LONGEST_S)
+        retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
         if heard.something:
-            await heard.is_to_be_asked.wait()
-            patience_s = COMES_WITHIN_S
+            await heard.must_request.wait()
+            retry_interval_s = COMES_WITHIN_S
 
 
-async def _want_missing(talk: Talk, rate_hz: float, ends: ExitStack) -> None:
+async def _want_missing(session: VehicleSession, rate_hz: float, ends: ExitStack) -> None:
     await anyio.sleep(COMES_WITHIN_S)
-    telemetry = talk.telemetry
+    telemetry = session.telemetry
     missing = [name for name in NEEDED if not telemetry.cells[name].is_known]
     for message_type in dict.fromkeys(each for name in missing for each in telemetry.required_messages(name)):
-        ends.callback(talk.rates.want(message_type, rate_hz))
+        ends.callback(session.rates.request(message_type, rate_hz))
 
 
-class _Heard:
-    """Whether streamed messages have come, and whether streams are to be asked for again."""
+class _StreamMonitor:
+    """Tracks whether streamed messages arrive, and whether the streams must be requested again."""
 
-    def __init__(self, talk: Talk, ends: ExitStack) -> None:
+    def __init__(self, session: VehicleSession, ends: ExitStack) -> None:
         self.something = False
-        self.is_to_be_asked = asyncio.Event()
-        self._system_id = talk.system_id
-        bus = talk.connection.bus
+        self.must_request = asyncio.Event()
+        self._system_id = session.system_id
+        bus = session.connection.bus
         for message_type in REQUESTED_STREAMS:
-            ends.callback(bus.attach(message_type, self._on_message, system_id=talk.system_id))
-        for event_type in (LinkChosen, LinkRestored, VehicleBack, VehicleRebooted):
+            ends.callback(bus.attach(message_type, self._on_message, system_id=session.system_id))
+        for event_type in (LinkSelected, LinkRestored, VehicleRecovered, VehicleRebooted):
             ends.callback(bus.attach_event(event_type, self._on_event))
 
     def forget(self) -> None:
-        self.something, self.is_to_be_asked = False, asyncio.Event()
+        self.something, self.must_request = False, asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
         self.something = True
 
     def _on_event(self, event: Event) -> None:
         if event.system_id in (0, self._system_id):
-            self.is_to_be_asked.set()
+            self.must_request.set()
 
 
+# ``target_system`` of a message to all systems.
 EVERYBODY = 0
-"""``target_system`` of a message to all systems."""
 
 ItemT = TypeVar("ItemT", bound="Message | Event")
 
@@ -131,8 +131,8 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 @checks_arguments
-class TalkActions(Part):
-    """Commands, messages, subscriptions; what is known of the vehicle beside its cells."""
+class MessagingActions(VehicleBase):
+    """Commands, messages, subscriptions, and information about the vehicle besides its cells."""
 
     # ---------------------------------------------------------------------------- commands
 
@@ -148,28 +148,29 @@ class TalkActions(Part):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack.
 
-        Args:
-            command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, NaN where the command says so.
-            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
-            retries: how often it is sent again while it is not answered, from 0; ``confirmation`` rises with each. An
-                order is sent again only right after a HEARTBEAT that tells of no other mode, no failsafe, and no newer
-                order (docs/reliability.md). None: 3 for a request that changes nothing but streams, 0 for all others,
-                because what they do would be done twice if only the answer was lost.
-            attempt_timeout: seconds to wait for an ack after each, above 0, and at least two measured round trips;
-                None: 1, or 4 if it is sent once.
-            progress_timeout: seconds to wait after each IN_PROGRESS for the next answer; calibrations can take long.
-            on_progress: called with 0–100, or None, for each IN_PROGRESS.
-
         See https://mavlink.io/en/services/command.html.
 
+        Args:
+            command: the number, or a member of ``enums.MavCmd``.
+            params: param1 to param7; missing ones are 0, NaN where the command allows it.
+            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
+                counts.
+            retries: how often it is sent again without an ack, from 0; ``confirmation`` increments each time. A
+                command that changes something is sent again only right after a HEARTBEAT that shows no other mode, no
+                failsafe, and no newer order (docs/reliability.md). None: 3 for a request that changes nothing but
+                streams, 0 for all others, because they would be executed twice if only the ack was lost.
+            attempt_timeout: seconds to wait for an ack after each transmission, above 0, and at least two measured
+                round trips; None: 1, or 4 if it is sent once.
+            progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
+            on_progress: called with 0–100, or None, for each IN_PROGRESS.
+
         Raises:
-            InvalidArgument: a parameter is no number or does not fit. Nothing was sent.
-            CommandRejected: any other result; ``reasons`` has the status texts seen meanwhile.
-            CommandTimeout: no ack; the text names attempts, seconds, the last heartbeat and the loss.
+            InvalidArgument: a parameter is not a number or does not fit. Nothing was sent.
+            CommandRejected: any other result; ``reasons`` has the status texts received meanwhile.
+            CommandTimeout: no ack; the text has attempts, seconds, the age of the last heartbeat and the packet loss.
         """
         return await self._sender.answered(
-            self._talk.commands.send_long,
+            self._session.commands.send_long,
             command,
             *params,
             component_id=component_id,
@@ -196,15 +197,15 @@ class TalkActions(Part):
     ) -> CommandAck:
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` metres. With
-        ``or_long``, firmware that does not know it so is sent a COMMAND_LONG with degrees, in frame 0 only. The
-        rest is as for :meth:`command`.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
+        With ``or_long``, firmware that does not support it as COMMAND_INT gets a COMMAND_LONG with degrees, in frame
+        0 only. All else as for :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: MAV_FRAME_GLOBAL (0)")
         kind = {} if or_long else {"frame": frame}
         return await self._sender.answered(
-            self._talk.commands.send_place if or_long else self._talk.commands.send_int,
+            self._session.commands.send_place if or_long else self._session.commands.send_int,
             command,
             *params,
             **kind,
@@ -219,20 +220,22 @@ class TalkActions(Part):
         )
 
     def send(self, message: Message) -> None:
-        """Send one message as it is, once; never blocks. Its ``target_system`` is yours to set.
+        """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A command that steers (as by :meth:`command`) and SET_MODE are newer orders: those of the actions end. A
-        set-point is newer than what was :meth:`posted` about motion. Neither is, to another system than this vehicle.
+        A steering command (as by :meth:`command`) and SET_MODE are newer orders and end those of actions. A set-point
+        supersedes what was :meth:`posted` about motion. Messages to another system do neither.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
             ConnectionClosed, LinkLost: the connection has ended, or the block of this vehicle was left.
         """
-        self._talk.send(message)
+        self._session.send(message)
         self.note_sent(message)
 
     def note_sent(self, message: Message) -> None:
-        """The program has sent this to the vehicle past it (``connection.send``): it counts as by :meth:`send`."""
+        """Register a message that the program sent to the vehicle by ``connection.send``; it counts as sent by
+        :meth:`send`.
+        """
         target = getattr(message, "target_system", self.system_id)
         subjects = subjects_of(message) if target in (EVERYBODY, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
@@ -245,38 +248,37 @@ class TalkActions(Part):
                 modes = self.autopilot.modes_of_command(message.command, params, names)
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
-            self._arbiter.order_of_the_programs_own(subjects, modes=modes)
+            self._arbiter.raw_order(subjects, modes=modes)
         elif subjects:
-            self._arbiter.overrule(subjects)
+            self._arbiter.supersede(subjects)
 
     @contextmanager
     def posted(
         self, *subjects: Subject, modes: tuple[Mode, ...] = (), armed: bool | None = None
     ) -> Iterator[PostedOrder]:
-        """An order that the next one need not wait for: mode, arming and take-off go out one after another.
+        """Open an order that need not be waited for: mode, arming and take-off can be sent one after another.
 
-        Within the block, its commands are sent again right after a HEARTBEAT until they are answered, or their effect
-        is told; not when an order about the same subject has followed, nor when HEARTBEAT tells a mode that neither
-        this order nor one of the ten seconds before it brings about, or, if it is about motion first of all, that the
-        vehicle has disarmed. Nothing is held when it is given up, and nobody watches for an order to arm that comes
-        late: the actions do that.
+        Within the block its commands are sent again right after a HEARTBEAT until they are acknowledged or their
+        effect is reported. They are not sent again after a newer order about the same subject, after a mode that
+        neither this order nor one of the last ten seconds explains, or, for orders about motion, after disarming. An
+        abandoned order does not make the vehicle hold, and late arming is not monitored; use the actions for that.
 
         Args:
-            subjects: what it is about, ``"mode"``, ``"motion"`` or ``"arm"``; orders about any more that are named are
-                ended by it, too. One about mode or motion ends the action under way.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``; the first one is what the order is about, and it also
+                ends orders about the others. An order about mode or motion ends the action in progress.
             modes: the modes that it brings about.
-            armed: whether it arms or disarms; one about ``"arm"`` has to say.
+            armed: True if it arms, False if it disarms; required for ``"arm"``.
 
         Raises:
-            InvalidArgument: no subject, or one about ``"arm"`` without ``armed``. Nothing was sent.
+            InvalidArgument: no subject, or ``"arm"`` without ``armed``. Nothing was sent.
         """
         if not subjects:
-            raise InvalidArgument("posted: no subject is named: mode, motion or arm")
+            raise InvalidArgument("posted: no subject is given: mode, motion or arm")
         if "arm" in subjects and armed is None:
-            raise InvalidArgument("posted: an order about arm needs armed=True or armed=False")
+            raise InvalidArgument("posted: subject 'arm' requires armed=True or armed=False")
         with (
             self._arbiter.post(subjects, modes=modes, armed=armed) as order,
-            PostedOrder(self._talk, self._arbiter, self._sender, order) as posted,
+            PostedOrder(self._session, self._arbiter, self._sender, order) as posted,
         ):
             yield posted
 
@@ -291,22 +293,21 @@ class TalkActions(Part):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` gives the latest only, ``missed`` counts the others.
-
-        Subscribing is the rate request: while the block lasts, the autopilot is asked to send these messages at
-        ``rate_hz`` (above 0, at most 1000), or faster if others want it. None means the default rate of a message that
-        comes in a stream; one that is sent when there is need (HEARTBEAT, STATUSTEXT, acks) is not asked for. What a
-        camera or another component is to be asked for: ``vehicle.component(100).subscribe(...)``.
+        ``capacity=1`` keeps the latest only; ``missed`` counts the others. Subscribing also requests the rate: while
+        the block lasts, the autopilot is asked to send these messages at ``rate_hz`` (above 0, at most 1000), or
+        faster if another subscriber needs it. None requests the default rate of streamed messages; messages sent on
+        demand (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        ``vehicle.component(100).subscribe(...)``.
 
         Raises:
-            InvalidArgument: no type, a rate out of range, or a message that the dialect does not hold.
+            InvalidArgument: no type, a rate out of range, or a message that the dialect does not contain.
         """
-        return self._talk.hearing.subscribe(types, capacity, overflow, rate_hz, whole_system=True)
+        return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz, entire_system=True)
 
     @contextmanager
     def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
-        """Have the vehicle send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
-        release = self._talk.rates.want(message_type, rate_hz)
+        """Request ``message_type`` at ``rate_hz`` or faster for the duration of the ``with`` block."""
+        release = self._session.rates.request(message_type, rate_hz)
         try:
             yield
         finally:
@@ -314,33 +315,32 @@ class TalkActions(Part):
 
     @contextmanager
     def streams(self, rate_hz: float) -> Iterator[None]:
-        """Have the vehicle send all that it streams at ``rate_hz`` for the time of the ``with`` block: for recordings,
-        ground stations and firmware that knows no rates of single messages.
+        """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        ArduPilot is asked by REQUEST_DATA_STREAM (whole Hz, 1 at least), again after a reboot or a silence and while
-        nothing comes; it goes on streaming afterwards. Others stream by themselves: of them, what is missing of the
-        common states is asked for as by :meth:`rate`.
+        For recordings, ground stations, and firmware without rates of single messages. ArduPilot is asked by
+        REQUEST_DATA_STREAM (whole Hz, at least 1), again after a reboot or a silence and while nothing arrives; it
+        continues to stream afterwards. Other autopilots stream by themselves; missing common states are requested as
+        by :meth:`rate`.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
         """
-        with every_stream(self._talk, rate_hz):
+        with every_stream(self._session, rate_hz):
             yield
 
     # ------------------------------------------------------------------------------- state
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """The latest message of a kind as it came, in a cell: ``vehicle.message(messages.RawImu).value.xacc``.
+        """Return the cell with the latest message of a type: ``vehicle.message(messages.RawImu).value.xacc``.
 
-        The first call registers it, and has the vehicle send it at ``rate_hz`` (None: the default rate of a message
-        that comes in a stream) for as long as the vehicle object lives; later calls give the same cell, and may change
-        the rate. Only messages of the autopilot count; those of a camera or another component are in
-        ``vehicle.component(100).message(...)``.
+        The first call requests it at ``rate_hz`` (None: the default rate of a streamed message) for the lifetime of
+        the vehicle object; later calls return the same cell and may change the rate. Only messages of the autopilot
+        count; use ``vehicle.component(100).message(...)`` for a camera or another component.
 
         Raises:
-            InvalidArgument: the rate is out of range, or the dialect does not hold the message.
+            InvalidArgument: the rate is out of range, or the dialect does not contain the message.
         """
-        return self._talk.hearing.cell(message_type, rate_hz)
+        return self._session.subscriber.cell(message_type, rate_hz)
 
     @property
     def mode_name(self) -> str:
@@ -349,42 +349,46 @@ class TalkActions(Part):
 
     @property
     def is_armed(self) -> bool:
-        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
+        one.
+        """
         return self.telemetry.is_armed
 
     @property
-    def is_surely_disarmed(self) -> bool:
-        """Whether the last heartbeat says disarmed; False while it is not known."""
-        return self.telemetry.is_surely_disarmed
+    def is_confirmed_disarmed(self) -> bool:
+        """True if the last heartbeat reports disarmed; False while the state is unknown."""
+        return self.telemetry.is_confirmed_disarmed
 
     @property
     def is_vtol(self) -> bool:
-        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        """True for a VTOL vehicle, which can hover and cruise on wings (EXTENDED_SYS_STATE reports a VTOL state)."""
         return self.telemetry.is_vtol
 
     @property
     def heartbeat_age(self) -> float:
         """Seconds since the last heartbeat of the autopilot."""
-        return self._talk.heartbeat_age
+        return self._session.heartbeat_age
 
     @property
     def is_silent(self) -> bool:
-        """Whether no heartbeat comes: none for more than 3.5 seconds, or the link has gone."""
-        return self._talk.watch.is_silent
+        """True if no heartbeat was received for more than 3.5 seconds, or the link is lost."""
+        return self._session.watch.is_silent
 
     @property
     def link_state(self) -> StateCell[LinkState]:
-        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link has gone)."""
-        return self._talk.watch.link_state
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link is lost)."""
+        return self._session.watch.link_state
 
     def describe_link(self) -> str:
-        """One line on how well the vehicle is heard, for error texts."""
-        return self._talk.describe_link()
+        """Return one line about the link's quality, for error texts."""
+        return self._session.describe_link()
 
     def describe_now(self) -> str:
-        """What it does, as far as it was heard: ``holding in BRAKE, still armed, 9 m above home, heard 0.3 s ago``."""
-        return self._bridge.describe_now()
+        """Return a clause about the reported state: ``holding in BRAKE, still armed, 9 m above home, last heartbeat
+        0.3 s ago``.
+        """
+        return self._context.describe_now()
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
-        return self._talk.texts_since(at)
+        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
+        return self._session.texts_since(at)

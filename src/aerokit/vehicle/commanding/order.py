@@ -1,6 +1,6 @@
-"""Orders of the program to one vehicle: whether each is still the newest, and whether it may be sent again.
+"""Orders of this program to one vehicle: their validity, and whether their commands may be sent again.
 
-docs/reliability.md has the table of all orders; nothing is sent again that is not in it.
+docs/reliability.md has the table of all orders. Only commands listed there are sent again.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
 
 Subject = Literal["mode", "motion", "arm"]
-"""What an order to the vehicle itself is about."""
+"""The part of the vehicle that an order controls."""
 Topic: TypeAlias = Hashable
-"""What an order is about: a subject of the vehicle, or any key for a device: a camera's video, a gimbal."""
+"""The thing that an order controls: a subject of the vehicle, or any key for a device such as a camera or a gimbal."""
 
-LOOKING: Topic = "region of interest"
-"""What the autopilot's gimbal, or the nose, looks at."""
+ROI: Topic = "region of interest"
+"""Topic of orders that point the autopilot's gimbal, or the nose, at a place."""
 
-OVERRULED = "another order was given"
-"""Why an older order ends."""
+SUPERSEDED = "another order was given"
+"""End reason of an order that a newer one replaced."""
 
 _MODE: tuple[Subject, ...] = ("mode", "motion")
 _MOTION: tuple[Subject, ...] = ("motion",)
@@ -51,7 +51,7 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_PAUSE_CONTINUE: _MOTION,
     MavCmd.COMPONENT_ARM_DISARM: ARM_ALONE,
 }
-"""MAV_CMD → what a program changes that sends it by itself: what an action left to be done must not come after it."""
+"""MAV_CMD → the subjects that a command sent by the program itself changes. It supersedes actions about them."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_MODE": _MODE,
     "SET_ATTITUDE_TARGET": _MOTION,
@@ -60,10 +60,11 @@ CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "MISSION_SET_CURRENT": _MOTION,
 }
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
-"""HEARTBEAT.system_status while a failsafe is active. PX4 tells it seconds before the failsafe changes the mode
-(COM_FAIL_ACT_T), and an order that arrives in that time cancels the failsafe."""
+"""HEARTBEAT.system_status values while a failsafe is active. PX4 reports them seconds before the failsafe changes the
+mode (COM_FAIL_ACT_T), and an order that arrives in that time cancels the failsafe.
+"""
+# MISSION_ITEM.current of an item that the vehicle flies to at once.
 GUIDED_ITEM = (2, 3)
-"""MISSION_ITEM.current of one that is flown to at once."""
 QUESTIONS = frozenset(
     (
         MavCmd.RUN_PREARM_CHECKS,
@@ -79,11 +80,11 @@ QUESTIONS = frozenset(
         MavCmd.REQUEST_FLIGHT_INFORMATION,
     )
 )
-"""MAV_CMDs that ask for something and change nothing but streams: they are sent again until they are answered."""
+"""MAV_CMDs that only request data. They change nothing but streams, so they are sent again until acknowledged."""
 
 
 def subjects_of(message: Message) -> tuple[Subject, ...]:
-    """What a program changes that sends this message by itself."""
+    """Return the subjects that this message changes when the program sends it itself."""
     fields: Any = message
     if message.NAME in ("COMMAND_LONG", "COMMAND_INT"):
         return CHANGED_BY_COMMAND.get(fields.command, ())
@@ -93,29 +94,29 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 
 def is_worse(state: int, before: int | None) -> bool:
-    """Whether a failsafe is active in this MAV_STATE that was not in the one before, or a worse one."""
+    """Return True if this MAV_STATE reports a failsafe that the previous one did not, or a more severe one."""
     is_first = before is None or before not in FAILSAFE_STATES
     return state in FAILSAFE_STATES and (is_first or state > (before or 0))
 
 
 def failsafe_text(state: int) -> str:
-    """A clause for error texts."""
+    """Return a clause about the failsafe, for error texts."""
     name = MavState(state).name
-    return f"a failsafe became active (MAV_STATE_{name}): the vehicle is left to it, and not told to hold"
+    return f"a failsafe became active (MAV_STATE_{name}): it keeps the vehicle, which is not told to hold"
 
 
 class Order:
-    """One order of the program, from when it is given until it is done, overruled or taken over.
+    """One order of this program, from its creation until it is done, superseded or taken over.
 
-    A newer order about any of the topics in ``ended_by`` overrules it. If the arbiter has it watch the vehicle,
-    somebody else's doing ends it, too: a mode that it does not explain, a failsafe, disarming, a reboot. That is for
-    good, also if the mode comes back.
+    A newer order about any topic in ``ended_by`` supersedes it. An order that the arbiter updates with the vehicle's
+    HEARTBEATs also ends when another party acts: an unexpected mode, a failsafe, disarming, a reboot. It does not
+    become valid again, even if the mode comes back.
 
-    ``mode_before`` is the mode that it was given in, ``modes`` are those that it may bring about, ``expected`` others
-    that may still be told because the program had ordered them just before, and until ``settles_at`` in any order;
-    until ``any_until`` every mode may, since the program had sent an order of its own making. Any other mode is a
-    pilot's or a failsafe's doing. ``settles_by_change``: being in one of its modes already does not say that the
-    expected ones are over, only a change to it does.
+    Modes are classified as follows. ``mode_before`` was active when the order was given, ``modes`` are the order's
+    own, ``expected`` modes may still appear because the program ordered them shortly before, in any sequence until
+    ``settles_at``. Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown
+    effect. Any other mode is attributed to the pilot or a failsafe. With ``requires_mode_change`` only a change to an
+    own mode ends the validity of the expected ones; being in it already does not.
     """
 
     def __init__(
@@ -134,96 +135,100 @@ class Order:
         settles_at: float = -math.inf,
         any_until: float = -math.inf,
         ends_flight: bool = False,
-        minds_mode: bool = True,
-        minds_disarming: bool = True,
-        settles_by_change: bool = False,
+        ends_on_mode_change: bool = True,
+        ends_on_disarm: bool = True,
+        requires_mode_change: bool = False,
     ) -> None:
         self.given_at: float = given_at
         self.number: int = number
         self.ended_by: tuple[Topic, ...] = tuple(ended_by)
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed
-        """Whether it arms or disarms; None: neither."""
-        self.is_given = False
-        """Whether the vehicle may move by it, or moves by what the program had ordered before: given up, it is held."""
+        """True if it arms, False if it disarms, None if it does neither."""
+        self.may_move = False
+        """True once the vehicle may move because of it, or because of an earlier order: if abandoned, the vehicle
+        must hold.
+        """
         self.was_refused: bool = False
-        """Whether the vehicle has said no to it: it does what it did before."""
+        """True if the vehicle refused it, and therefore continues its previous task."""
         self.was_flown_before: bool = False
-        """Whether the vehicle did what this program had ordered before."""
+        """True if the vehicle was executing an order of this program before this one."""
         self.before: Order | None = None
-        """The one about the same device that counts again when this one is withdrawn."""
+        """The previous order about the same device, which becomes valid again if this one is withdrawn."""
         self.is_withdrawn: bool = False
-        self.taken_by: str = ""
-        """What somebody else has done, as a clause; empty: nothing that was told."""
+        self.takeover_reason: str = ""
+        """The action of another party that ended it, as a clause; empty if there was none."""
         self.failsafe: str = ""
-        """Which failsafe has become active since, as a clause; empty: none."""
+        """The failsafe that became active since, as a clause; empty if none did."""
         self.unexplained: str = ""
-        """A change of mode, as a clause: the effect of a command of the program, or a pilot's doing."""
+        """A mode change that may be the effect of a raw command or a pilot's action, as a clause; empty if there was
+        none.
+        """
         self.has_lost_mode: bool = False
-        """Whether that was another mode."""
+        """True if the mode was changed to one that the order does not explain."""
         self.mode_lost_at: float = -math.inf
-        """When that was told: by CURRENT_MODE sooner than by the HEARTBEAT that may say that it has disarmed, too."""
-        self.has_worked: bool = False
-        """Whether a change to one of its modes, or to armed or disarmed as it orders, has been told since."""
+        """Time of that change. CURRENT_MODE reports it before the HEARTBEAT that may also report disarming."""
+        self.is_confirmed: bool = False
+        """True once a change to one of its modes, or to its armed state, was reported."""
         self._before = set() if mode_before is None else {mode_before.custom_mode} - set(expected)
         self._mode_now = None if mode_before is None else mode_before.custom_mode
-        self._late = set(expected)
-        self._allowed = self._before | self._late
+        self._expected = set(expected)
+        self._allowed = self._before | self._expected
         self._own = {mode.custom_mode for mode in modes}
         self._armed_now = armed_before
         self._state_before, self._ends_flight = state_before, ends_flight
-        self._minds_mode, self._minds_disarming = minds_mode, minds_disarming
+        self._minds_mode, self._minds_disarming = ends_on_mode_change, ends_on_disarm
         self._is_newest = is_newest
         self._settles_at, self._any_until = settles_at, any_until
-        self._settles_by_change = settles_by_change
+        self._settles_by_change = requires_mode_change
 
     @property
     def is_newest(self) -> bool:
-        """Whether no newer order overrules it."""
+        """Return True while no newer order supersedes it."""
         return self._is_newest(self)
 
     @property
     def end(self) -> str:
-        """Why nothing of it may be sent any more, as a clause; empty while it may."""
+        """The reason why none of its commands may be sent, as a clause; empty while they may."""
         if not self.is_newest:
-            return OVERRULED
-        return self.taken_by or ("" if self._ends_flight else self.failsafe)
+            return SUPERSEDED
+        return self.takeover_reason or ("" if self._ends_flight else self.failsafe)
 
     def is_own(self, mode: Mode) -> bool:
-        """Whether this mode is one that the order may bring about."""
+        """Return True if the order itself may bring about this mode."""
         return mode.custom_mode in self._own
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """The program has given an order beside it that brings these about."""
+        """Accept these modes as well, because another order of the program brings them about."""
         self._own |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """It was refused, or never accepted: the one before about the same device counts again."""
+        """Cancel the order after a refusal or a missing ack: the previous order about the device is valid again."""
         self.is_withdrawn = True
 
-    def settle(self) -> None:
-        """It was accepted, or is told to end: there is no way back to the one before."""
+    def commit(self) -> None:
+        """Make the order final: it can no longer be withdrawn."""
         self.before = None
 
     def close(self) -> None:
-        """The block in which it was given is left."""
-        self.taken_by = self.taken_by or "its block was left"
+        """End the order because its block was left."""
+        self.takeover_reason = self.takeover_reason or "its block was left"
 
-    def forgive_failsafe(self) -> None:
-        """The program orders the vehicle again, which is still in a mode of this order."""
+    def clear_failsafe(self) -> None:
+        """Ignore the reported failsafe, because the program has given a new order since."""
         self.failsafe = ""
 
-    # ------------------------------------------------------------------- what the vehicle tells
+    # -------------------------------------------------------------------- vehicle reports
 
-    def note_mode(self, mode: Mode, at: float) -> None:
-        """The vehicle tells its mode. Once it was in one of the order's, the mode before is somebody else's, too."""
+    def on_mode(self, mode: Mode, at: float) -> None:
+        """Process the mode reported at this time. Once in an own mode, a return to the previous mode is a takeover."""
         number, is_known = mode.custom_mode, self._mode_now is not None
         is_change = is_known and number != self._mode_now
-        self.has_worked = self.has_worked or (is_change and number in self._own)
+        self.is_confirmed = self.is_confirmed or (is_change and number in self._own)
         if number in self._own:
             if is_change or not self._settles_by_change:
                 self._allowed -= self._allowed if at >= self._settles_at else self._before
-        elif number in self._late & self._allowed and at >= self._settles_at:
+        elif number in self._expected & self._allowed and at >= self._settles_at:
             self._allowed -= self._before
         elif not is_known or at < self._any_until:
             if is_known and number not in self._allowed:
@@ -233,36 +238,36 @@ class Order:
             if not self.has_lost_mode:
                 self.mode_lost_at = at
             self.has_lost_mode = True
-            self.taken_by = self.taken_by or f"the mode changed to {mode}"
+            self.takeover_reason = self.takeover_reason or f"the mode changed to {mode}"
         self._mode_now = number
 
-    def note_state(self, state: int) -> None:
-        """Take MAV_STATE. A failsafe that was active when the order was given does not end it: the program knew it.
+    def on_system_status(self, state: int) -> None:
+        """Process MAV_STATE. A failsafe that was active before the order does not end it: the program knew about it.
 
-        Nor does any end an order to land, to return or to disarm: it is sent again if need be.
+        No failsafe ends an order to land, to return or to disarm.
         """
         if is_worse(state, self._state_before):
             self.failsafe = self.failsafe or failsafe_text(state)
         self._state_before = state
 
-    def note_armed(self, armed: bool, at: float) -> None:
-        """The vehicle tells whether it is armed."""
+    def on_armed(self, armed: bool, at: float) -> None:
+        """Process the armed state reported by HEARTBEAT."""
         before, self._armed_now = self._armed_now, armed
         if before is not None and before is not armed and armed is self.armed:
-            self.has_worked = True
+            self.is_confirmed = True
         elif before and not armed and self._minds_disarming:
-            self.taken_by = self.taken_by or "the vehicle disarmed"
+            self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
 
-    def note_reboot(self) -> None:
-        """The vehicle has rebooted: nothing that was ordered before is meant any more."""
-        self.taken_by = self.taken_by or "the vehicle rebooted"
+    def on_reboot(self) -> None:
+        """End the order, because the vehicle has rebooted."""
+        self.takeover_reason = self.takeover_reason or "the vehicle rebooted"
 
 
 class SentCommand:
-    """One command of an order, from its first sending on: whether it may be sent again.
+    """One command of an order after its first transmission. Decides whether it may be sent again.
 
-    It may while what was heard since speaks neither of its effect nor of somebody else's doing. A change to one of
-    ``modes``, or to ``armed``, is an effect that HEARTBEAT tells; ``is_done`` tells any other one.
+    It may as long as the vehicle reports neither its effect nor an action of another party. A change to one of
+    ``modes``, or to ``armed``, is an effect; ``is_done`` reports any other one.
     """
 
     def __init__(
@@ -276,42 +281,42 @@ class SentCommand:
         is_done: Callable[[], bool] = lambda: False,
     ) -> None:
         self.order = order
-        self.told_at: float = -math.inf
-        """When HEARTBEAT came last."""
-        self._was_told = False
+        self.heartbeat_at: float = -math.inf
+        """Time of the last HEARTBEAT."""
+        self._is_reported = False
         self._mode_now = None if mode_now is None else mode_now.custom_mode
         self._modes = {mode.custom_mode for mode in modes}
         self._armed_now = armed_now
         self.arms = armed
-        """Whether it arms, or disarms; None: neither."""
+        """True if it arms, False if it disarms, None if it does neither."""
         self._is_overruled = False
         self._is_done = is_done
 
     @property
-    def has_worked(self) -> bool:
-        """Whether its effect has been told, whatever came after it."""
-        self._was_told = self._was_told or self._is_done()
-        return self._was_told
+    def is_confirmed(self) -> bool:
+        """True once its effect was reported."""
+        self._is_reported = self._is_reported or self._is_done()
+        return self._is_reported
 
     @property
     def end(self) -> str:
-        """Why it must not be sent again, as a clause; empty while it may."""
-        if self.has_worked:
-            return "its effect was told"
-        return self.order.end or (OVERRULED if self._is_overruled else "") or self.order.unexplained
+        """The reason why it must not be sent again, as a clause; empty while it may."""
+        if self.is_confirmed:
+            return "its effect was reported"
+        return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 
-    def note_newer(self, armed: bool | None) -> None:
-        """Another command is given: one to disarm ends one to arm, and the other way round."""
+    def on_newer_command(self, armed: bool | None) -> None:
+        """Process a newer command: arming supersedes disarming and vice versa."""
         if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 
-    def note_mode(self, mode: Mode, at: float) -> None:
-        """The vehicle tells its mode."""
+    def on_mode(self, mode: Mode, at: float) -> None:
+        """Process the reported mode."""
         before, self._mode_now = self._mode_now, mode.custom_mode
-        self._was_told = self._was_told or (self._mode_now != before and self._mode_now in self._modes)
+        self._is_reported = self._is_reported or (self._mode_now != before and self._mode_now in self._modes)
 
-    def note_armed(self, armed: bool, at: float) -> None:
-        """The vehicle tells whether it is armed, which ends a HEARTBEAT."""
+    def on_armed(self, armed: bool, at: float) -> None:
+        """Process the reported armed state."""
         before, self._armed_now = self._armed_now, armed
-        self._was_told = self._was_told or (armed is not before and armed is self.arms)
-        self.told_at = at
+        self._is_reported = self._is_reported or (armed is not before and armed is self.arms)
+        self.heartbeat_at = at

@@ -1,4 +1,4 @@
-"""`PostedOrder`: what a program gives of an order that others may follow before it is answered."""
+"""`PostedOrder`: an order that need not be waited for before the next one is given."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import command_name
-from aerokit.vehicle.commanding.progress import Arrivals
+from aerokit.vehicle.commanding.progress import ChangeSignal
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from aerokit.vehicle.commanding.arbiter import CommandArbiter
     from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.commanding.sender import OrderSender
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
 __all__ = ["PostedOrder"]
 
-LOOK_S = 0.05
-MODE_ATTEMPTS, ASK_AGAIN_S = 4, 0.5
+POLL_INTERVAL_S = 0.05
+MAX_MODE_ATTEMPTS, ASK_AGAIN_S = 4, 0.5
 
 
 @checks_arguments
 class PostedOrder:
-    """An order that others may follow before it is answered; made by :meth:`aerokit.Vehicle.posted`."""
+    """An order that need not be waited for; created by :meth:`aerokit.Vehicle.posted`."""
 
-    def __init__(self, talk: Talk, arbiter: CommandArbiter, sender: OrderSender, order: Order) -> None:
-        self._talk, self._arbiter, self._sender, self._order = talk, arbiter, sender, order
+    def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender, order: Order) -> None:
+        self._session, self._arbiter, self._sender, self._order = session, arbiter, sender, order
         self._ends = ExitStack()
         self._refusals: list[CommandAck] = []
         self._is_over = False
@@ -50,26 +50,27 @@ class PostedOrder:
 
     @property
     def end(self) -> str:
-        """Why nothing of it is sent again, as a clause; empty while it may be."""
-        return "its effect was told" if self._order.has_worked else self._order.end or self._order.unexplained
+        """The reason why none of its commands is sent again, as a clause; empty while they may be."""
+        return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG of this order; return when it is answered, or the order's effect is told.
+        """Send a COMMAND_LONG of this order; returns when it is acknowledged or the order's effect is reported.
 
-        A second one is not sent when a newer order is about its subject, or somebody else has changed the mode, since.
+        It is not sent again after a newer order about the same subject, or after another party changed the mode.
 
         Args:
             command: the MAV_CMD.
             params: param1 to param7; missing ones are 0.
-            component_id: to another component than the autopilot; 0: to all, and the autopilot's answer counts.
+            component_id: the target component instead of the autopilot; 0: all components, and the autopilot's ack
+                counts.
 
         Raises:
-            InvalidArgument: a parameter is no number or does not fit, or the block was left. Nothing was sent.
-            OperationRejected: the order has ended: a newer one was given, or somebody else steers.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+            InvalidArgument: a parameter is not a number or does not fit, or the block was left. Nothing was sent.
+            OperationRejected: the order has ended: it was superseded or taken over.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
-        await self._give(self._talk.commands.send_long, command, *params, component_id=component_id)
+        await self._give(self._session.commands.send_long, command, *params, component_id=component_id)
 
     async def command_int(
         self,
@@ -81,42 +82,40 @@ class PostedOrder:
         z: float = 0.0,
         component_id: int | None = None,
     ) -> None:
-        """The same as COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` metres in ``frame``.
+        """Send a COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` in metres in ``frame``.
 
-        The rest is as for :meth:`command`.
+        All else as for :meth:`command`.
         """
         place: dict[str, Any] = {"frame": frame, "x": x, "y": y, "z": z}
-        await self._give(self._talk.commands.send_int, command, *params, component_id=component_id, **place)
+        await self._give(self._session.commands.send_int, command, *params, component_id=component_id, **place)
 
     async def set_mode(self, mode: Mode, *, timeout: float = 5.0, component_id: int | None = None) -> None:
-        """Order a mode, and wait until HEARTBEAT tells the order's effect.
+        """Order a mode and wait until HEARTBEAT reports the order's effect.
 
-        Sends MAV_CMD_DO_SET_MODE, and SET_MODE to a vehicle that does not know that command. Where the vehicle says
-        that it is too early, as PX4 does while it checks a mission, it is asked again when a HEARTBEAT that has come
-        since says that the order still stands.
+        Sends MAV_CMD_DO_SET_MODE, or SET_MODE to a vehicle that does not support it. If the vehicle answers
+        TEMPORARILY_REJECTED, as PX4 does while it checks a mission, the command is sent again after a HEARTBEAT that
+        confirms that the order is still valid.
 
         Args:
-            mode: one of those that the order was posted with; its ``base_mode`` is sent with it.
-            timeout: seconds for HEARTBEAT to tell it after each answer.
+            mode: one of the modes of the order; its ``base_mode`` is sent with it.
+            timeout: seconds for HEARTBEAT to report the effect after each ack.
             component_id: as for :meth:`command`.
 
         Raises:
-            InvalidArgument: the order was not posted with it, or the block was left. Nothing was sent.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer.
-            OperationTimeout: it accepted, and stays in another mode.
+            InvalidArgument: the mode is not one of the order's, or the block was left. Nothing was sent.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: it accepted and stayed in another mode.
         """
         if mode not in self._order.modes:
-            raise InvalidArgument(f"mode = {mode} is not allowed: the order was not posted with it")
-        for attempts_left in reversed(range(MODE_ATTEMPTS)):
+            raise InvalidArgument(f"mode = {mode} is not allowed: it is not a mode of this order")
+        for attempts_left in reversed(range(MAX_MODE_ATTEMPTS)):
             try:
-                self._begin(MavCmd.DO_SET_MODE)
-                await self._sender.request_mode(
-                    mode, self._order, base_mode=mode.base_mode, component_id=component_id
-                )
-                await self.until_told(timeout)
+                self._prepare(MavCmd.DO_SET_MODE)
+                await self._sender.request_mode(mode, self._order, base_mode=mode.base_mode, component_id=component_id)
+                await self.wait_confirmed(timeout)
             except CommandRejected as error:
-                if self._order.has_worked:
+                if self._order.is_confirmed:
                     return
                 if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
                     raise
@@ -126,24 +125,24 @@ class PostedOrder:
                 return
 
     async def _stands(self, timeout: float) -> bool:
-        """Whether HEARTBEAT comes, and tells that the order still stands: nothing is sent again before that."""
-        answered_at, told = self._talk.connection.now(), self._talk.telemetry.armed
+        """Wait for the next HEARTBEAT; return True if the order is still valid after it."""
+        answered_at, told = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(ASK_AGAIN_S)
         with (
-            Arrivals(self._talk, told, every_arrival=True) as news,
+            ChangeSignal(self._session, told, every_arrival=True) as news,
             anyio.move_on_after(timeout),
         ):
             while told.updated_at <= answered_at or not self._arbiter.is_known:
-                await news.next(LOOK_S)
+                await news.next(POLL_INTERVAL_S)
             return not self.end
         return False
 
-    async def until_told(self, timeout: float) -> None:
-        """Wait until HEARTBEAT tells the order's effect, or that it was there before.
+    async def wait_confirmed(self, timeout: float) -> None:
+        """Wait until HEARTBEAT reports the order's effect, or that it was in effect before.
 
         Raises:
-            CommandRejected: the vehicle took its acceptance back, as PX4 does.
-            OperationTimeout: it was not told within ``timeout`` seconds.
+            CommandRejected: the vehicle accepted first and refused then, as PX4 may do.
+            OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         await self._sender.await_effect(
             "the order was accepted",
@@ -155,24 +154,22 @@ class PostedOrder:
         )
 
     def _is_done(self) -> bool:
-        telemetry, order = self._talk.telemetry, self._order
+        telemetry, order = self._session.telemetry, self._order
         is_there = any(map(telemetry.is_in, order.modes)) or (
             order.armed is not None and telemetry.armed.latest is order.armed
         )
-        return is_there or order.has_worked
+        return is_there or order.is_confirmed
 
     async def _give(
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> None:
-        self._begin(command)
+        self._prepare(command)
         order = self._order
-        await self._sender.give(
-            order, send, command, *params, modes=order.modes, armed=order.armed, **options
-        )
+        await self._sender.run_command(order, send, command, *params, modes=order.modes, armed=order.armed, **options)
 
-    def _begin(self, command: int) -> None:
-        """Hear what the vehicle says later about this command, too."""
+    def _prepare(self, command: int) -> None:
+        """Prepare to send: collect later refusals of this command as well."""
         if self._is_over:
             raise InvalidArgument(f"the block of this order was left: {command_name(command)} was not sent")
         self._ends.close()
-        self._refusals = self._ends.enter_context(self._talk.refusals_of(command))
+        self._refusals = self._ends.enter_context(self._session.refusals_of(command))

@@ -1,4 +1,4 @@
-"""Waits for something that takes a while, and gives up as soon as it cannot happen any more."""
+"""Waiting for an operation in progress, and failing as soon as it cannot succeed any more."""
 
 from __future__ import annotations
 
@@ -18,77 +18,76 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.connection.cells import StateCell
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
-TICK_S = 0.25
-"""Silence brings no message, so it is looked for this often."""
+POLL_INTERVAL_S = 0.25
+"""Poll interval in seconds, because a silence brings no message."""
 
-LONGEST_SILENCE_S = 10.0
+MAX_SILENCE_S = 10.0
 
-OLD_POSITION_S = 2.0
+POSITION_MAX_AGE_S = 2.0
 
-STILL_S, MOVED_M = 12.0, 0.3
+STALL_TIMEOUT_S, STALL_DISTANCE_M = 12.0, 0.3
 
 
 async def await_progress(
-    talk: Talk,
+    session: VehicleSession,
     what: str,
     *,
     is_done: Callable[[], bool],
     trouble: Callable[[], str | None],
     describe: Callable[[], str],
     timeout: float | None,
-    max_silence_s: float | None = LONGEST_SILENCE_S,
+    max_silence_s: float | None = MAX_SILENCE_S,
     held_for: float = 0.0,
     stillness: Callable[[], str | None] | None = None,
 ) -> None:
-    """Return when ``is_done()`` has been true for ``held_for`` seconds; looked at whenever the vehicle's state changes.
+    """Return when ``is_done()`` has been true for ``held_for`` seconds; evaluated whenever the vehicle's state
+    changes.
 
     Raises:
-        OperationRejected: ``trouble()`` gave a reason: it cannot happen any more.
-        HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds (None: that is survived).
-        OperationTimeout: ``timeout`` seconds have passed, or ``stillness()`` says that it does not move; ``describe()``
-            tells how far it came.
+        OperationRejected: ``trouble()`` returned a reason why it cannot succeed.
+        HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds (None: silence is ignored).
+        OperationTimeout: ``timeout`` seconds have passed, or ``stillness()`` reports that it does not move; the text
+            includes ``describe()``.
         ConnectionClosed, LinkLost: the connection ended.
     """
-    started = reasons_from = talk.connection.now()
-    telemetry = talk.telemetry
+    started = reasons_from = session.connection.now()
+    telemetry = session.telemetry
     cells = (telemetry.mode, telemetry.armed, telemetry.position, telemetry.landed_state)
     done_since: float | None = None
-    with Arrivals(talk, *cells) as news:
+    with ChangeSignal(session, *cells) as news:
         while True:
-            now = talk.connection.now()
-            talk.connection.raise_if_ended()
+            now = session.connection.now()
+            session.connection.raise_if_ended()
             done_since = (now if done_since is None else done_since) if is_done() else None
             if done_since is not None and now - done_since >= held_for:
                 return
             if done_since is None and (reason := trouble()):
-                raise OperationRejected(f"{what}: {reason}", reasons=talk.texts_since(reasons_from))
-            if max_silence_s is not None and talk.watch.silent_for_s > max_silence_s:
-                raise HeartbeatTimeout(f"{what}: {talk.describe_link()}")
+                raise OperationRejected(f"{what}: {reason}", reasons=session.texts_since(reasons_from))
+            if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
+                raise HeartbeatTimeout(f"{what}: {session.describe_link()}")
             if timeout is not None and now - started >= timeout:
                 raise OperationTimeout(
-                    f"{what}: not done within {timeout:g} s; {describe()}; {talk.describe_link()}"
+                    f"{what}: not done within {timeout:g} s; {describe()}; {session.describe_link()}"
                 )
             if stillness is not None and (still := stillness()):
-                raise OperationTimeout(f"{what}: {still}; {describe()}; {talk.describe_link()}")
-            await news.next(TICK_S)
+                raise OperationTimeout(f"{what}: {still}; {describe()}; {session.describe_link()}")
+            await news.next(POLL_INTERVAL_S)
 
 
-class Arrivals:
-    """In its block: what is heard in any of these cells, and the end of the connection."""
+class ChangeSignal:
+    """Wakes a waiter when any of these cells changes, or the connection ends."""
 
-    def __init__(self, talk: Talk, *cells: StateCell[Any], every_arrival: bool = False) -> None:
-        self._talk, self._cells, self._every_arrival = talk, cells, every_arrival
-        self._news = asyncio.Event()
+    def __init__(self, session: VehicleSession, *cells: StateCell[Any], every_arrival: bool = False) -> None:
+        self._session, self._cells, self._every_arrival = session, cells, every_arrival
+        self._changed = asyncio.Event()
         self._ends: list[Callable[[], None]] = []
 
     def __enter__(self) -> Self:
-        hear = self._news.set
-        self._ends = [
-            cell.observe(lambda *_: hear(), every_arrival=self._every_arrival) for cell in self._cells
-        ]
-        self._ends.append(self._talk.connection.on_end(lambda _: hear()))
+        hear = self._changed.set
+        self._ends = [cell.observe(lambda *_: hear(), every_arrival=self._every_arrival) for cell in self._cells]
+        self._ends.append(self._session.connection.on_end(lambda _: hear()))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -96,39 +95,40 @@ class Arrivals:
             end()
 
     async def next(self, at_most_s: float) -> None:
-        """Wait for news, or for so many seconds: silence brings none."""
-        self._news.clear()
-        # no cancel scope: on Python 3.10 one that runs out swallows a cancellation of the same turn of the loop
-        tick = asyncio.get_running_loop().call_later(at_most_s, self._news.set)
+        """Wait for the next change, at most this many seconds."""
+        self._changed.clear()
+        # No cancel scope: on Python 3.10 an expiring one swallows a cancellation of the same loop iteration.
+        tick = asyncio.get_running_loop().call_later(at_most_s, self._changed.set)
         try:
-            await self._news.wait()
+            await self._changed.wait()
         finally:
             tick.cancel()
 
 
-class Stillness:
-    """Notices a vehicle that has accepted an order to go somewhere and stays where it is.
+class StallDetector:
+    """Detects a vehicle that has accepted an order to move and stays where it is.
 
-    Nothing is said while its position is not heard, nor before ``STILL_S`` seconds: it turns first, or spools up.
+    It reports nothing without positions, nor before ``STALL_TIMEOUT_S`` seconds, because a vehicle may turn or spool
+    up.
     """
 
-    # together with _from
+    # Set together with _from.
     _since: float
 
-    def __init__(self, talk: Talk) -> None:
-        self._talk = talk
+    def __init__(self, session: VehicleSession) -> None:
+        self._session = session
         self._from: Position | None = None
 
     def __call__(self) -> str | None:
-        """How long it has not moved, in words; None: it moves, or that is not known."""
-        now, cell = self._talk.connection.now(), self._talk.telemetry.position
+        """Return how long it has not moved, as a clause; None if it moves or its position is unknown."""
+        now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
-        if here is None or cell.age > OLD_POSITION_S:
+        if here is None or cell.age > POSITION_MAX_AGE_S:
             self._from = None
-        elif self._from is None or _metres(here, self._from) > MOVED_M:
+        elif self._from is None or _metres(here, self._from) > STALL_DISTANCE_M:
             self._from, self._since = here, now
-        elif now - self._since >= STILL_S:
-            return f"it has accepted the order and not moved for {now - self._since:.0f} s"
+        elif now - self._since >= STALL_TIMEOUT_S:
+            return f"it accepted the order and has not moved for {now - self._since:.0f} s"
         return None
 
 
@@ -139,54 +139,51 @@ def _metres(one: Position, other: Position) -> float:
 
 
 METRES_PER_DEGREE = 112_000
-"""Of latitude, or of longitude at the equator, at most."""
+"""Upper limit for one degree of latitude, or of longitude at the equator."""
 
 MAX_DISTANCE_M = 100_000.0
-"""Farther away, a place is taken for a mistake (coordinates exchanged, a sign lost) unless the call says so."""
+"""A place farther away is treated as a mistake (swapped coordinates, a lost sign) unless the caller raises the limit.
+"""
 
 
-class Whereabouts:
-    """By what the vehicle has told."""
+class VehiclePosition:
+    """Distances and altitudes from the vehicle's reported position."""
 
-    def __init__(self, talk: Talk) -> None:
-        self._telemetry, self._autopilot = talk.telemetry, talk.autopilot
+    def __init__(self, session: VehicleSession) -> None:
+        self._telemetry, self._autopilot = session.telemetry, session.autopilot
 
     def distance_to(self, target: Position) -> float:
-        """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.
+        """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.
         """
         here = self._telemetry.position.latest
         if here is None:
             return math.inf
-        along = geo.distance_m(
-            here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg
-        )
+        along = geo.distance_m(here.latitude_deg, here.longitude_deg, target.latitude_deg, target.longitude_deg)
         return math.hypot(along, self._altitude_difference(here, target))
 
     def check_reach(self, name: str, places: Iterable[Position], max_distance_m: float) -> None:
-        """Raise InvalidArgument for a place that is farther away; none is while the position is unknown."""
+        """Raise InvalidArgument for a place farther away than this; accept all while the position is unknown."""
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
         if here is None:
             return
         for place in places:
-            degrees = abs(place.latitude_deg - here.latitude_deg) + abs(
-                place.longitude_deg - here.longitude_deg
-            )
-            if degrees * METRES_PER_DEGREE < max_distance_m:  # missions have thousands of places nearby
+            degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
+            if degrees * METRES_PER_DEGREE < max_distance_m:  # Missions have thousands of nearby places.
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
                 raise InvalidArgument(
                     f"{name} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: it is"
                     f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
-                    " sent. Pass a greater max_distance_m if that is meant"
+                    " sent. Pass a greater max_distance_m to allow it"
                 )
 
-    def way_left(self, target: Position) -> float:
-        """Along the ground for a vehicle that stays on it; the altitude it tells may count from anywhere."""
-        if self._autopilot.stays_on_the_ground:
+    def remaining_distance(self, target: Position) -> float:
+        """Return the remaining distance. Only horizontal for ground vehicles, whose altitude has no fixed origin."""
+        if self._autopilot.is_surface_vehicle:
             return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
         return self.distance_to(target)
 
@@ -201,28 +198,28 @@ class Whereabouts:
         return 0.0
 
     def is_known_since(self, started: float) -> bool:
-        """Whether a position has come since then and is not old: nobody arrives by an old one."""
+        """Return True if a position was received since then and is recent."""
         position = self._telemetry.position
-        return position.updated_at >= started and position.age <= OLD_POSITION_S
+        return position.updated_at >= started and position.age <= POSITION_MAX_AGE_S
 
     def altitude_relative(self) -> float:
-        """Metres above home; −inf while that is not known."""
+        """Return metres above home; −inf while unknown."""
         here = self._telemetry.position.latest
         altitude = None if here is None else here.altitude_relative_m
         return -math.inf if altitude is None else altitude
 
     def home_altitude(self) -> float:
-        """Metres above the sea; ValueUnknownError while home is not known."""
+        """Return metres above mean sea level; raise ValueUnknownError while home is not known."""
         return self._telemetry.home.value.altitude_amsl_m
 
     def global_target(self, target: Position) -> tuple[int, int, float, bool]:
-        """Latitude and longitude in 1e-7 degrees, altitude in metres, and whether it is above home.
+        """Return latitude and longitude in 1e-7 degrees, altitude in metres, and whether that is relative to home.
 
-        PX4 reads altitudes above mean sea level only, so home must be known there for one above home.
+        PX4 takes altitudes above mean sea level only, so an altitude relative to home requires a known home.
         """
         relative, amsl = target.altitude_relative_m, target.altitude_amsl_m
         if relative is None and amsl is None:
-            relative = self._telemetry.position.fresh(OLD_POSITION_S).altitude_relative_m
+            relative = self._telemetry.position.fresh(POSITION_MAX_AGE_S).altitude_relative_m
         is_relative = relative is not None
         altitude = relative if relative is not None else amsl
         if altitude is None:
@@ -232,13 +229,13 @@ class Whereabouts:
             altitude, is_relative = altitude + self.home_altitude(), False
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, is_relative
 
-    def stands_on_the_ground(self) -> bool:
-        """Whether it was told just now that a vehicle which flies is on the ground."""
+    def is_on_ground(self) -> bool:
+        """Return True if a vehicle that can fly was recently reported on the ground."""
         landed = self._telemetry.landed_state
         flies = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
-        return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= OLD_POSITION_S
+        return flies and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
 
     @property
     def takes_relative_altitude(self) -> bool:
-        """Whether it understands altitudes above home."""
+        """Return True if the autopilot takes altitudes relative to home."""
         return self._autopilot.reposition is None or self._autopilot.reposition.relative_altitude

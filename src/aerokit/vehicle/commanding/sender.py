@@ -1,4 +1,4 @@
-"""`OrderSender`: sends what orders consist of: commands, changes of mode, arming. Each choreography is here once."""
+"""`OrderSender`: the command sequences of all orders: single commands, mode changes, arming."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.arguments import check_range
 from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, ATTEMPTS, rejection
-from aerokit.vehicle.commanding.arbiter import KNOWN_S, MODE_GRACE_S
+from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, MAX_ATTEMPTS, rejection
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, QUESTIONS
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, await_progress
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterator
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import CommandAck
     from aerokit.vehicle.commanding.arbiter import CommandArbiter
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
 FORCE = 21196
-"""param2 of COMPONENT_ARM_DISARM: without the checks."""
-TAKEN_BACK = "the vehicle took its acceptance back"
+"""param2 of COMPONENT_ARM_DISARM that skips the pre-arm checks."""
+ACCEPTANCE_REVOKED = "the vehicle accepted it first and refused it then"
 
 
 class OrderSender:
-    """Sends what orders consist of, as far as docs/reliability.md allows, waited for or not."""
+    """Sends the commands of orders and repeats them only as docs/reliability.md allows."""
 
-    def __init__(self, talk: Talk, arbiter: CommandArbiter) -> None:
-        self._talk, self._arbiter = talk, arbiter
+    def __init__(self, session: VehicleSession, arbiter: CommandArbiter) -> None:
+        self._session, self._arbiter = session, arbiter
 
-    async def give(
+    async def run_command(
         self,
         order: Order,
         send: Callable[..., Awaitable[CommandAck]],
@@ -45,60 +45,62 @@ class OrderSender:
         is_done: Callable[[], bool] = lambda: False,
         **options: Any,
     ) -> None:
-        """Send a command of an order until it is answered or its effect was told (``modes``, ``armed``, ``is_done``).
+        """Send one command of an order until it is acknowledged or its effect is reported.
+
+        The effect is a change to one of ``modes``, to ``armed``, or ``is_done()``.
 
         Raises:
-            OperationRejected: the order has ended: a newer one was given, or somebody else steers.
-            CommandRejected: the vehicle refused; ``reasons`` has what it said.
-            CommandTimeout: there was no answer; the text says so when it was not sent again for a reason.
+            OperationRejected: the order has ended: it was superseded or taken over.
+            CommandRejected: the vehicle refused; ``reasons`` has its status texts.
+            CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
-        self.raise_if_over(order)
-        order.is_given = order.is_given or command in CHANGED_BY_COMMAND
-        started = self._talk.connection.now()
+        self.raise_if_ended(order)
+        order.may_move = order.may_move or command in CHANGED_BY_COMMAND
+        started = self._session.connection.now()
         with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sending:
             try:
-                await send(command, *params, standing=sending, **options)
+                await send(command, *params, order_status=sending, **options)
             except CommandRejected as error:
-                if not sending.has_worked:
+                if not sending.is_confirmed:
                     order.was_refused = True
-                    await self._talk.settle()
-                    raise self._talk.explained(error, started) from None
+                    await self._session.wait_for_status_texts()
+                    raise self._session.with_reasons(error, started) from None
             except CommandTimeout as error:
-                if not sending.has_worked:
+                if not sending.is_confirmed:
                     raise self._unanswered(error, order) from None
 
-    def raise_if_over(self, order: Order) -> None:
-        """What an order still has to send is not meant any more once it has ended."""
+    def raise_if_ended(self, order: Order) -> None:
+        """Raise OperationRejected if the order has ended, so that the rest of it is not sent."""
         if order.end:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
-        """Who has taken the vehicle is the better answer; an order that cannot be taken back may still arrive."""
-        if order.taken_by or (order.failsafe and order.end):
-            return OperationRejected(str(error), reasons=self._talk.texts_since(order.given_at))
+        """Prefer the takeover as the reason of a time-out."""
+        if order.takeover_reason or (order.failsafe and order.end):
+            return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         return error
 
-    async def give_arm(self, order: Order, armed: bool, *, force: bool = False) -> None:
-        """Order it to arm or disarm."""
-        self._talk.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
+    async def send_arm(self, order: Order, armed: bool, *, force: bool = False) -> None:
+        """Send the command to arm or disarm."""
+        self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
-        await self.give(
-            order, self._talk.commands.send_long, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed
+        await self.run_command(
+            order, self._session.commands.send_long, MavCmd.COMPONENT_ARM_DISARM, *params, armed=armed
         )
 
     # ----------------------------------------------------------------------------------- modes
 
     async def change_mode(
-        self, wanted: Mode, order: Order, timeout: float = 6.0, *, told_since: float = -math.inf
+        self, wanted: Mode, order: Order, timeout: float = 6.0, *, reported_since: float = -math.inf
     ) -> None:
-        """Order the mode and wait until it is told, by a message that came after ``told_since``."""
-        started = self._talk.connection.now()
+        """Order the mode and wait until a message received after ``reported_since`` reports it."""
+        started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
-        with self._talk.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
+        with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
             await self.request_mode(wanted, order, attempt_timeout=min(1.0, timeout / 4))
-            told_since = self._talk.connection.now() if was_in_doubt else told_since
-            left = timeout - (self._talk.connection.now() - started)
-            await self.await_mode(wanted, order, refusals, left, told_since)
+            reported_since = self._session.connection.now() if was_in_doubt else reported_since
+            left = timeout - (self._session.connection.now() - started)
+            await self.await_mode(wanted, order, refusals, left, reported_since)
             self._arbiter.mode_settles_at = -math.inf
 
     async def request_mode(
@@ -110,17 +112,17 @@ class OrderSender:
         base_mode: int | None = None,
         component_id: int | None = None,
     ) -> None:
-        """Order a mode, and do not wait for HEARTBEAT to tell it.
+        """Order a mode without waiting for HEARTBEAT to report it.
 
-        Firmware that does not know MAV_CMD_DO_SET_MODE is sent SET_MODE, once, if the order still stands then.
+        Firmware that does not support MAV_CMD_DO_SET_MODE gets one SET_MODE instead, if the order is still valid.
         """
-        request = self._talk.autopilot.mode_order(wanted)
+        request = self._session.autopilot.mode_order(wanted)
         if base_mode is not None:
             request = request.replace(base_mode=base_mode, params=(base_mode, *request.params[1:]))
         try:
-            await self.give(
+            await self.run_command(
                 order,
-                self._talk.commands.send_long,
+                self._session.commands.send_long,
                 MavCmd.DO_SET_MODE,
                 *request.params,
                 modes=(wanted,),
@@ -130,20 +132,20 @@ class OrderSender:
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
-            self.raise_if_over(order)
+            self.raise_if_ended(order)
             if not self._arbiter.is_known:
                 raise
-            self._talk.send(request.legacy(self._talk.system_id))
+            self._session.send(request.legacy(self._session.system_id))
 
     async def await_mode(
-        self, wanted: Mode, order: Order, refusals: list[CommandAck], timeout: float, told_since: float
+        self, wanted: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
     ) -> None:
-        """Wait until the mode is told by a message that came after ``told_since``."""
-        telemetry = self._talk.telemetry
+        """Wait until a message received after ``reported_since`` reports the mode."""
+        telemetry = self._session.telemetry
         await self.await_effect(
             f"set_mode({wanted.name})",
             refusals,
-            is_done=lambda: telemetry.is_in(wanted) and telemetry.mode.updated_at > told_since,
+            is_done=lambda: telemetry.is_in(wanted) and telemetry.mode.updated_at > reported_since,
             trouble=lambda: order.end or None,
             timeout=max(0.1, timeout),
         )
@@ -156,25 +158,26 @@ class OrderSender:
         is_done: Callable[[], bool],
         trouble: Callable[[], str | None],
         timeout: float,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Wait until HEARTBEAT tells what was accepted.
+        """Wait until HEARTBEAT reports the effect of an accepted command.
 
-        PX4 acks twice: the first ack is always ACCEPTED, the second one, in ``refusals``, may take it back.
+        PX4 acknowledges twice: the first ack is always ACCEPTED, the second one may be a refusal, collected in
+        ``refusals``.
 
         Raises:
-            CommandRejected: the vehicle took its acceptance back.
-            OperationRejected: ``trouble()`` gave a reason.
+            CommandRejected: the vehicle accepted first and refused then.
+            OperationRejected: ``trouble()`` returned a reason.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
-            OperationTimeout: it was not told within ``timeout`` seconds.
+            OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
-        telemetry, started = self._talk.telemetry, self._talk.connection.now()
+        telemetry, started = self._session.telemetry, self._session.connection.now()
         try:
             await await_progress(
-                self._talk,
+                self._session,
                 what,
                 is_done=is_done,
-                trouble=lambda: TAKEN_BACK if refusals else trouble(),
+                trouble=lambda: ACCEPTANCE_REVOKED if refusals else trouble(),
                 describe=lambda: (
                     f"the vehicle is in {telemetry.mode_name}, {'' if telemetry.is_armed else 'not '}armed"
                 ),
@@ -185,53 +188,55 @@ class OrderSender:
             if not refusals:
                 raise
             error = rejection(refusals[-1].command, refusals[-1].result)
-            error.args = (f"{what}: {TAKEN_BACK}: {error}",)
-            raise self._talk.explained(error, started) from None
+            error.args = (f"{what}: {ACCEPTANCE_REVOKED}: {error}",)
+            raise self._session.with_reasons(error, started) from None
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:
-        """Change the mode, unless it was told lately that the vehicle is in it: an older mode is no reason."""
-        is_told = self._talk.telemetry.is_in(mode) and self._talk.telemetry.mode.age <= KNOWN_S
+        """Change the mode unless a recent HEARTBEAT already reports it."""
+        is_told = self._session.telemetry.is_in(mode) and self._session.telemetry.mode.age <= MODE_MAX_AGE_S
         if self._arbiter.mode_is_in_doubt or not is_told:
             await self.change_mode(mode, order)
 
     def mode_for(self, action: str, purpose: Purpose) -> Mode:
-        """The autopilot's mode for this; NotSupported, which names the action, where it has none."""
-        mode = self._talk.autopilot.mode_for(purpose, is_vtol=self._talk.telemetry.is_vtol)
+        """Return the autopilot's mode for this purpose; raise NotSupported, naming the action, if it has none."""
+        mode = self._session.autopilot.mode_for(purpose, is_vtol=self._session.telemetry.is_vtol)
         if mode is None:
-            raise NotSupported(f"{action}: {self._talk.autopilot.firmware} has no mode for it")
+            raise NotSupported(f"{action}: {self._session.autopilot.firmware} has no mode for it")
         return mode
 
     def stays_in(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """What can go wrong on the way: another order, it disarms, or its mode becomes another one than these."""
-        grace_until, settles_at = self._talk.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
+        """Return a function that reports why the order cannot succeed: superseded, disarmed, or in a mode not listed
+        here.
+        """
+        grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
         arrived = False
 
         def trouble() -> str | None:
             nonlocal arrived
             if order.end:
                 return order.end
-            if self._talk.telemetry.is_surely_disarmed:
+            if self._session.telemetry.is_confirmed_disarmed:
                 return "the vehicle disarmed"
-            if self._talk.connection.now() < settles_at:
+            if self._session.connection.now() < settles_at:
                 return None
-            mode = self._talk.telemetry.mode.latest
+            mode = self._session.telemetry.mode.latest
             arrived = arrived or mode in modes
-            if mode not in modes and (arrived or self._talk.connection.now() > grace_until):
+            if mode not in modes and (arrived or self._session.connection.now() > grace_until):
                 return f"the mode changed to {mode}" if arrived else f"the vehicle stayed in {mode}"
             return None
 
         return trouble
 
-    async def command_of(self, order: Order, command: int, *params: float) -> None:
-        """One more command of an order that steers."""
-        await self.give(order, self._talk.commands.send_long, command, *params)
+    async def follow_up_command(self, order: Order, command: int, *params: float) -> None:
+        """Send a further command of a steering order."""
+        await self.run_command(order, self._session.commands.send_long, command, *params)
 
-    async def command_aside(self, command: int, *params: float) -> None:
-        """A command that changes something and does not steer."""
-        with self._arbiter.aside() as order:
-            await self.give(order, self._talk.commands.send_long, command, *params)
+    async def auxiliary_command(self, command: int, *params: float) -> None:
+        """Send a command that changes a setting and does not steer."""
+        with self._arbiter.auxiliary_order() as order:
+            await self.run_command(order, self._session.commands.send_long, command, *params)
 
-    # ------------------------------------------------------------------------ the program's own
+    # ---------------------------------------------------------------------------- raw commands
 
     async def answered(
         self,
@@ -241,34 +246,34 @@ class OrderSender:
         retries: int | None,
         **options: Any,
     ) -> CommandAck:
-        """Any command that the program itself sends; ``send`` is one of the command sender's."""
-        started = self._talk.connection.now()
+        """Send any command for the program itself; ``send`` is a method of the command sender."""
+        started = self._session.connection.now()
         if retries is None:
-            retries = ATTEMPTS - 1 if command in QUESTIONS else 0
+            retries = MAX_ATTEMPTS - 1 if command in QUESTIONS else 0
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
         if options["attempt_timeout"] is None and not retries:
-            options["attempt_timeout"] = ATTEMPTS * ATTEMPT_TIMEOUT_S
+            options["attempt_timeout"] = MAX_ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
             if command in QUESTIONS:
                 return await send(command, *params, **options)
-            names = self._talk.telemetry.mode_names
-            modes = self._talk.autopilot.modes_of_command(command, params, names)
+            names = self._session.telemetry.mode_names
+            modes = self._session.autopilot.modes_of_command(command, params, names)
             armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
             with (
                 self._own_order(command, modes) as order,
                 self._arbiter.sending(order, modes=modes, armed=armed) as sending,
             ):
-                return await send(command, *params, standing=sending, **options)
+                return await send(command, *params, order_status=sending, **options)
         except CommandRejected as error:
-            await self._talk.settle()
-            raise self._talk.explained(error, started) from None
+            await self._session.wait_for_status_texts()
+            raise self._session.with_reasons(error, started) from None
 
     @contextmanager
     def _own_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
-        """A program that steers past the actions gives a new order, which ends theirs."""
+        """Register a raw command as an order: it supersedes those of actions if it steers."""
         if CHANGED_BY_COMMAND.get(command, ARM_ALONE) != ARM_ALONE:
-            yield self._arbiter.order_of_the_programs_own(CHANGED_BY_COMMAND[command], modes=modes)
+            yield self._arbiter.raw_order(CHANGED_BY_COMMAND[command], modes=modes)
         else:
-            with self._arbiter.aside() as order:
+            with self._arbiter.auxiliary_order() as order:
                 yield order

@@ -1,4 +1,4 @@
-"""Guided set-points as values, and the messages that carry them.
+"""Guided set-points as values, and their encoding as messages.
 
 https://mavlink.io/en/services/offboard_control.html
 """
@@ -21,7 +21,7 @@ from aerokit.vehicle.state.movement import Attitude
 
 if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.context import VehicleContext
 
 __all__ = [
     "AccelerationSetpoint",
@@ -37,12 +37,12 @@ __all__ = [
 IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION = 0x007, 0x038, 0x1C0
 IGNORE_YAW, IGNORE_YAW_RATE = 0x400, 0x800
 IGNORE_BODY_RATES = 0x07
+# Below this speed, or within this many arrival radii, a vehicle that obeys may stand still.
 SLOW_M_S, FAR = 0.3, 2.0
-"""Slower, and nearer than so many arrival radii, a vehicle may well stand still."""
 
 
 class VelocitySetpoint(Snapshot):
-    """Velocity over ground in m/s, north, east, down; with a heading (degrees) or a turn rate (degrees/s)."""
+    """Velocity over ground in m/s (north, east, down), with a heading (degrees) or a turn rate (degrees/s)."""
 
     north_m_s: float = 0.0
     east_m_s: float = 0.0
@@ -52,7 +52,7 @@ class VelocitySetpoint(Snapshot):
 
 
 class BodyVelocitySetpoint(Snapshot):
-    """Velocity in m/s as seen from the vehicle: forward, right, down; with a heading (from north) or a turn rate."""
+    """Velocity in m/s in the body frame (forward, right, down), with a heading from north or a turn rate."""
 
     forward_m_s: float = 0.0
     right_m_s: float = 0.0
@@ -62,7 +62,7 @@ class BodyVelocitySetpoint(Snapshot):
 
 
 class AccelerationSetpoint(Snapshot):
-    """Acceleration in m/s², north, east, down; with a heading or a turn rate."""
+    """Acceleration in m/s² (north, east, down), with a heading or a turn rate."""
 
     north_m_s2: float = 0.0
     east_m_s2: float = 0.0
@@ -72,7 +72,7 @@ class AccelerationSetpoint(Snapshot):
 
 
 class LocalPositionSetpoint(Snapshot):
-    """A place in metres north, east and down of the estimator's origin (``vehicle.origin``)."""
+    """Position in metres north, east and down of the estimator's origin (``vehicle.origin``)."""
 
     north_m: float
     east_m: float
@@ -82,7 +82,7 @@ class LocalPositionSetpoint(Snapshot):
 
 
 class PositionSetpoint(Snapshot):
-    """A place on the globe; ``position`` with ``altitude_relative_m`` or ``altitude_amsl_m``."""
+    """Global position; ``position`` has ``altitude_relative_m`` or ``altitude_amsl_m``."""
 
     position: Position
     yaw_deg: float | None = None
@@ -102,16 +102,16 @@ class AttitudeSetpoint(Snapshot):
     thrust: float
 
 
-def wants_motion(setpoint: object, bridge: Bridge) -> bool:
-    """Whether a vehicle that obeys this set-point moves now; False where that is not known."""
+def wants_motion(setpoint: object, context: VehicleContext) -> bool:
+    """Return True if a vehicle that obeys this set-point must move now; False if unknown."""
     if isinstance(setpoint, VelocitySetpoint):
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
         return math.hypot(setpoint.forward_m_s, setpoint.right_m_s, setpoint.down_m_s) >= SLOW_M_S
-    far_m = FAR * bridge.talk.autopilot.arrival_radius_m
+    far_m = FAR * context.session.autopilot.arrival_radius_m
     if isinstance(setpoint, PositionSetpoint):
-        return far_m < bridge.where.distance_to(setpoint.position) < math.inf
-    here = bridge.talk.telemetry.local_position.latest
+        return far_m < context.vehicle_position.distance_to(setpoint.position) < math.inf
+    here = context.session.telemetry.local_position.latest
     if isinstance(setpoint, LocalPositionSetpoint) and here is not None:
         to_go = (
             setpoint.north_m - here.north_m,
@@ -123,38 +123,39 @@ def wants_motion(setpoint: object, bridge: Bridge) -> bool:
 
 
 class SetpointEncoder:
-    """Turns set-points into messages for one vehicle; raises InvalidArgument for what is no set-point."""
+    """Encodes set-points for one vehicle; raises InvalidArgument for invalid ones."""
 
-    def __init__(self, bridge: Bridge) -> None:
-        self._talk, self._where = bridge.talk, bridge.where
+    def __init__(self, context: VehicleContext) -> None:
+        self._session, self._position = context.session, context.vehicle_position
 
     def velocity(self, s: VelocitySetpoint) -> Message:
-        """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_LOCAL_NED."""
+        """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_LOCAL_NED."""
         vector = (s.north_m_s, s.east_m_s, s.down_m_s)
         return self._local(MavFrame.LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def body_velocity(self, s: BodyVelocitySetpoint) -> Message:
-        """SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
+        """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
-        With a heading for ArduPilot it is turned into MAV_FRAME_LOCAL_NED by the heading of now: in MAV_FRAME_BODY_NED
-        ArduPilot adds each yaw to the one it commanded before, and correcting that by telemetry swings to and fro.
+        With a heading for ArduPilot it is converted to MAV_FRAME_LOCAL_NED by the present heading: in
+        MAV_FRAME_BODY_NED ArduPilot adds each yaw to the previous target, and correcting that by telemetry
+        oscillates.
         """
         vector = (s.forward_m_s, s.right_m_s, s.down_m_s)
-        if s.yaw_deg is None or not self._talk.autopilot.setpoints.body_yaw_is_relative:
+        if s.yaw_deg is None or not self._session.autopilot.setpoints.body_yaw_is_relative:
             return self._local(MavFrame.BODY_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
-        heading = math.radians(self._talk.telemetry.heading_deg.value)
+        heading = math.radians(self._session.telemetry.heading_deg.value)
         north = s.forward_m_s * math.cos(heading) - s.right_m_s * math.sin(heading)
         east = s.forward_m_s * math.sin(heading) + s.right_m_s * math.cos(heading)
         vector = (north, east, s.down_m_s)
         return self._local(MavFrame.LOCAL_NED, IGNORE_VELOCITY, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def acceleration(self, s: AccelerationSetpoint) -> Message:
-        """SET_POSITION_TARGET_LOCAL_NED with an acceleration in MAV_FRAME_LOCAL_NED."""
+        """Return SET_POSITION_TARGET_LOCAL_NED with an acceleration in MAV_FRAME_LOCAL_NED."""
         vector = (s.north_m_s2, s.east_m_s2, s.down_m_s2)
         return self._local(MavFrame.LOCAL_NED, IGNORE_ACCELERATION, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
     def local_position(self, s: LocalPositionSetpoint) -> Message:
-        """SET_POSITION_TARGET_LOCAL_NED with a place in MAV_FRAME_LOCAL_NED."""
+        """Return SET_POSITION_TARGET_LOCAL_NED with a position in MAV_FRAME_LOCAL_NED."""
         vector = (s.north_m, s.east_m, s.down_m)
         return self._local(MavFrame.LOCAL_NED, IGNORE_POSITION, vector, s.yaw_deg, s.yaw_rate_deg_s)
 
@@ -166,7 +167,7 @@ class SetpointEncoder:
         yaw_deg: float | None,
         yaw_rate_deg_s: float | None,
     ) -> Message:
-        """One SET_POSITION_TARGET_LOCAL_NED whose only vector is the one of ``group``."""
+        """Return SET_POSITION_TARGET_LOCAL_NED whose only vector is the one of ``group``."""
         _check_finite("set-point", *vector)
         everything = IGNORE_POSITION | IGNORE_VELOCITY | IGNORE_ACCELERATION
         mask, yaw, yaw_rate = _yaw(yaw_deg, yaw_rate_deg_s)
@@ -174,8 +175,8 @@ class SetpointEncoder:
         vectors = [vector if group == each else none for each in _GROUPS]
         return SetPositionTargetLocalNed(
             self._time_ms(),
-            self._talk.system_id,
-            self._talk.component_id,
+            self._session.system_id,
+            self._session.component_id,
             frame,
             (everything & ~group) | mask,
             *vectors[0],
@@ -186,13 +187,13 @@ class SetpointEncoder:
         )
 
     def position(self, s: PositionSetpoint) -> Message:
-        """SET_POSITION_TARGET_GLOBAL_INT with a place, above home or above the sea."""
+        """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level."""
         mask, yaw, yaw_rate = _yaw(s.yaw_deg, s.yaw_rate_deg_s)
-        latitude, longitude, altitude, is_relative = self._where.global_target(s.position)
+        latitude, longitude, altitude, is_relative = self._position.global_target(s.position)
         return SetPositionTargetGlobalInt(
             self._time_ms(),
-            self._talk.system_id,
-            self._talk.component_id,
+            self._session.system_id,
+            self._session.component_id,
             MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT,
             IGNORE_VELOCITY | IGNORE_ACCELERATION | mask,
             latitude,
@@ -205,14 +206,14 @@ class SetpointEncoder:
         )
 
     def attitude(self, s: AttitudeSetpoint) -> Message:
-        """SET_ATTITUDE_TARGET with attitude and thrust."""
+        """Return SET_ATTITUDE_TARGET with attitude and thrust."""
         _check_finite("attitude", s.roll_deg, s.pitch_deg, s.yaw_deg, s.thrust)
         if not 0 <= s.thrust <= 1:
             raise InvalidArgument(f"thrust = {s.thrust} is not allowed: 0 to 1")
         return SetAttitudeTarget(
             self._time_ms(),
-            self._talk.system_id,
-            self._talk.component_id,
+            self._session.system_id,
+            self._session.component_id,
             IGNORE_BODY_RATES,
             Attitude(s.roll_deg, s.pitch_deg, s.yaw_deg).quaternion,
             0.0,
@@ -222,14 +223,14 @@ class SetpointEncoder:
         )
 
     def _time_ms(self) -> int:
-        return int(self._talk.connection.now() * 1000) & 0xFFFFFFFF
+        return int(self._session.connection.now() * 1000) & 0xFFFFFFFF
 
 
 _GROUPS = (IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_ACCELERATION)
 
 
 def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
-    """Type-mask bits, yaw in radians and yaw rate in radians per second."""
+    """Return type-mask bits, yaw in radians and yaw rate in radians per second."""
     if yaw_deg is not None and yaw_rate_deg_s is not None:
         raise InvalidArgument("give yaw_deg or yaw_rate_deg_s, not both")
     _check_finite("yaw", yaw_deg or 0.0, yaw_rate_deg_s or 0.0)

@@ -1,4 +1,4 @@
-"""Flying, driving or diving somewhere: places, speed, heading."""
+"""Flying, driving or diving to a place; speed, heading, home, regions of interest."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from aerokit.errors import (
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavProtocolCapability, MavResult
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
 from aerokit.position import Position
-from aerokit.vehicle.commanding.context import Part
-from aerokit.vehicle.commanding.order import LOOKING
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, MAX_DISTANCE_M, Stillness, await_progress
+from aerokit.vehicle.commanding.context import VehicleBase
+from aerokit.vehicle.commanding.order import ROI
+from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, StallDetector, await_progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,8 +36,8 @@ RESEND_S = 1.0
 
 
 @checks_arguments
-class TravelActions(Part):
-    """Going to a place, turning; home."""
+class TravelActions(VehicleBase):
+    """Going to a place, turning, speed and home."""
 
     async def go_to(
         self,
@@ -48,46 +48,45 @@ class TravelActions(Part):
         tolerance_m: float | None = None,
         max_distance_m: float = MAX_DISTANCE_M,
         timeout: float | None = None,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
         """Fly to a place and return on arrival.
 
-        Cancelled half-way, or when it does not arrive in time or falls silent, the vehicle is told to hold where it
-        is; unless another order was given meanwhile or somebody else has changed the mode. A silent vehicle is told so
-        when it is heard again, if it still goes there then.
+        After a cancellation, a time-out or a silence the vehicle is told to hold where it is, unless another order
+        was given meanwhile or another party changed the mode. A silent vehicle is told to hold when it is received
+        again, if it is still on its way then. Sends MAV_CMD_DO_REPOSITION
+        (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), or SET_POSITION_TARGET_GLOBAL_INT to a
+        vehicle that does not support it.
 
         Args:
             target: latitude and longitude, and an altitude above home or above mean sea level; without an altitude
                 the present one is kept.
-            speed_m_s: ground speed from now on, above 0; None leaves it.
-            heading_deg: where to look on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
-            tolerance_m: how near is there, in metres; None: what suits the type of vehicle.
-            max_distance_m: metres from where it is; a place farther away is refused.
-            timeout: seconds; None: as long as it takes, provided that heartbeats come, the mode stays and it moves.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
-
-        Sends MAV_CMD_DO_REPOSITION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_REPOSITION), and
-        SET_POSITION_TARGET_GLOBAL_INT to a vehicle that does not know it.
+            speed_m_s: ground speed from now on, above 0; None keeps the present one.
+            heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
+            tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
+            max_distance_m: a place farther away than this many metres is refused.
+            timeout: seconds; None: no limit while heartbeats arrive, the mode stays and the vehicle moves.
+            max_silence_s: raise when no heartbeat was received for this long; None: no limit.
 
         Raises:
-            InvalidArgument: the target is no place on earth or too far away, or another argument is out of range.
-                Nothing was sent.
-            ValueUnknownError: position or home is not known and is needed here.
+            InvalidArgument: the target is not on earth or too far away, or another argument is out of range. Nothing
+                was sent.
+            ValueUnknownError: position or home is needed here and not known.
             CommandRejected: the vehicle refused (outside its fence, no position, …).
-            OperationRejected: on the way the mode changed (a pilot, a failsafe) or the vehicle disarmed.
-            CommandTimeout: there was no answer.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
+            OperationRejected: the mode changed (a pilot, a failsafe) or the vehicle disarmed on the way.
+            CommandTimeout: there was no acknowledgement.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: it did not arrive in time, or does not move.
         """
-        latitude, longitude, altitude, is_relative = self._where.global_target(target)
+        latitude, longitude, altitude, is_relative = self._position.global_target(target)
         _check_travel(speed_m_s, heading_deg, tolerance_m, timeout)
-        self._where.check_reach("target", [target], max_distance_m)
+        self._position.check_reach("target", [target], max_distance_m)
         near_m = self.autopilot.arrival_radius_m if tolerance_m is None else tolerance_m
         self._check_can_turn(heading_deg)
         if not self.telemetry.is_armed:
             raise OperationRejected("go_to: the vehicle is not armed; nothing was sent")
-        if self._where.stands_on_the_ground():
-            raise OperationRejected("go_to: the vehicle is on the ground: take_off() first; nothing was sent")
+        if self._position.is_on_ground():
+            raise OperationRejected("go_to: the vehicle is on the ground: call take_off() first; nothing was sent")
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
@@ -96,18 +95,19 @@ class TravelActions(Part):
             resend = await self._send_there(order, latitude, longitude, altitude, is_relative, yaw, speed_m_s)
             under_way = True
             if speed_m_s is not None and not self._speeds_by_reposition:
-                # ArduPilot obeys it only once it is under way
-                await self._sender.command_of(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+                # ArduPilot applies it only once the vehicle is on its way.
+                await self._sender.follow_up_command(order, MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
             if heading_deg is not None and math.isnan(yaw):
-                await self._sender.command_of(order, MavCmd.CONDITION_YAW, heading_deg % 360)
-            with self._holding.flying(order):
+                await self._sender.follow_up_command(order, MavCmd.CONDITION_YAW, heading_deg % 360)
+            with self._flight_cleanup.flying(order):
                 await self._await_arrival(target, near_m, timeout, max_silence_s, order, mode, resend)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
-            self._holding.hold_soon(order)
+        # The vehicle may have received the command.
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):
+            self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected:
             if under_way:
-                self._holding.hold_soon(order)
+                self._flight_cleanup.hold_in_background(order)
             raise
 
     async def _send_there(
@@ -120,7 +120,7 @@ class TravelActions(Part):
         yaw: float,
         speed_m_s: float | None,
     ) -> SetPositionTargetGlobalInt | None:
-        """Order it; what has to be sent again for as long as it is under way, because it has no answer."""
+        """Send the order; return the message to repeat on the way, if it has no acknowledgement."""
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
@@ -128,14 +128,19 @@ class TravelActions(Part):
         modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
         try:
             with self._arbiter.changing_mode():
-                await self._sender.give(
-                    order, self._talk.commands.send_int, MavCmd.DO_REPOSITION, *params, modes=modes, **place
+                await self._sender.run_command(
+                    order,
+                    self._session.commands.send_int,
+                    MavCmd.DO_REPOSITION,
+                    *params,
+                    modes=modes,
+                    **place,
                 )
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
-            self._sender.raise_if_over(order)
+            self._sender.raise_if_ended(order)
             resend = self._position_target(latitude, longitude, altitude, frame)
             self.connection.send(resend)
             return resend
@@ -159,7 +164,7 @@ class TravelActions(Part):
         mode: Mode,
         resend: SetPositionTargetGlobalInt | None,
     ) -> None:
-        """Wait for it. The older message has no answer: it is repeated while the vehicle tells that it is meant."""
+        """Wait for the arrival. The older message has no acknowledgement, so it is repeated meanwhile."""
         started = sent_at = self.connection.now()
 
         def is_there() -> bool:
@@ -168,33 +173,33 @@ class TravelActions(Part):
             if resend is not None and now - sent_at >= RESEND_S and self._arbiter.is_known and not order.end:
                 sent_at = now
                 self.connection.send(resend)
-            is_near = self._where.is_known_since(started) and self._where.way_left(target) <= near_m
+            is_near = self._position.is_known_since(started) and self._position.remaining_distance(target) <= near_m
             return is_near and not order.end
 
-        with self._talk.streaming("position"):
+        with self._session.streaming("position"):
             await await_progress(
-                self._talk,
+                self._session,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
                 is_done=is_there,
                 trouble=self._sender.stays_in(order, mode),
-                describe=lambda: f"it is {self._where.way_left(target):.1f} m away",
+                describe=lambda: f"it is {self._position.remaining_distance(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 held_for=0.5,
-                stillness=Stillness(self._talk),
+                stillness=StallDetector(self._session),
             )
 
     async def set_speed(self, speed_m_s: float) -> None:
-        """Change the ground speed for flying somewhere, in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
+        """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot takes it only while it is under way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` sees to that.
+        ArduPilot applies it only on the way in GUIDED or AUTO; ``go_to(speed_m_s=...)`` waits for that.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
-        await self._sender.command_aside(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
+        await self._sender.auxiliary_command(MavCmd.DO_CHANGE_SPEED, 1, speed_m_s, -1)
 
     async def set_heading(
         self,
@@ -204,27 +209,28 @@ class TravelActions(Part):
         rate_deg_s: float = 0.0,
         tolerance_deg: float = 5.0,
         timeout: float = 60.0,
-        max_silence_s: float | None = LONGEST_SILENCE_S,
+        max_silence_s: float | None = MAX_SILENCE_S,
     ) -> None:
-        """Turn on the spot and return when the nose points there.
+        """Turn on the spot and return when the vehicle has this heading.
 
-        ArduPilot: MAV_CMD_CONDITION_YAW, in GUIDED, which it is put into. PX4 has no such command and stops where it
-        is to turn: MAV_CMD_DO_REPOSITION.
+        ArduPilot: MAV_CMD_CONDITION_YAW in GUIDED, which is set first. PX4 has no such command and stops to turn:
+        MAV_CMD_DO_REPOSITION.
 
         Args:
-            heading_deg: −360 to 360, clockwise from north; ``relative``: by so many degrees, left is negative.
+            heading_deg: −360 to 360, clockwise from north; with ``relative`` an angle to turn by, negative to the
+                left.
             relative: count from the present heading.
-            rate_deg_s: how fast, degrees per second; 0 leaves it to the autopilot. PX4 does not look at it.
-            tolerance_deg: how near is there.
-            timeout: seconds until it is there.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
+            tolerance_deg: accepted deviation in degrees.
+            timeout: seconds until it has the heading.
+            max_silence_s: raise when no heartbeat was received for this long; None: wait until ``timeout``.
 
         Raises:
             InvalidArgument: out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed or it disarmed on the way.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
-            OperationTimeout: it did not get there in time.
+            OperationRejected: the mode changed or it disarmed meanwhile.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
+            OperationTimeout: it did not reach the heading in time.
         """
         check_range("heading_deg", heading_deg, -360, 360)
         check_range("rate_deg_s", rate_deg_s, 0, 360)
@@ -236,14 +242,14 @@ class TravelActions(Part):
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal), 2 * math.pi)
             params = (-1, MavDoRepositionFlags.CHANGE_MODE, 0, yaw, *(math.nan,) * 3)
-            await self._sender.give(
-                order, self._talk.commands.send_long, MavCmd.DO_REPOSITION, *params, modes=(mode,)
+            await self._sender.run_command(
+                order, self._session.commands.send_long, MavCmd.DO_REPOSITION, *params, modes=(mode,)
             )
         else:
             await self._sender.ensure_mode(mode, order)
-            # a goal, not an angle: sent again, it does not turn it further
+            # An absolute heading, not an angle: a repetition does not turn it further.
             direction = (1 if heading_deg >= 0 else -1) if relative else 0
-            await self._sender.command_of(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
+            await self._sender.follow_up_command(order, MavCmd.CONDITION_YAW, goal, rate_deg_s, direction, 0)
         await self._await_heading(goal, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -261,9 +267,9 @@ class TravelActions(Part):
         def off() -> float:
             return abs(math.remainder(heading.value - goal, 360)) if heading.is_known else math.inf
 
-        with self._talk.streaming("heading_deg"):
+        with self._session.streaming("heading_deg"):
             await await_progress(
-                self._talk,
+                self._session,
                 f"set_heading({goal:g}°)",
                 is_done=lambda: heading.updated_at >= started and off() <= tolerance_deg and not order.end,
                 trouble=self._sender.stays_in(order, mode),
@@ -273,45 +279,46 @@ class TravelActions(Part):
             )
 
     async def set_home(self, place: Position | None = None, *, timeout: float = 5.0) -> None:
-        """Have the vehicle return to another place, or to where it is now, and wait until HOME_POSITION tells it.
+        """Move the home position, to a place or to the vehicle's present position, and wait until HOME_POSITION
+        reports it.
+
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG
+        with a resolution of about a metre to old firmware, which does not support it as COMMAND_INT.
 
         Args:
-            place: latitude, longitude and an altitude above mean sea level; None: where it is now.
-            timeout: seconds until HOME_POSITION tells it.
-
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME), as COMMAND_LONG to
-        old firmware, which does not know it as COMMAND_INT: to within a metre then.
+            place: latitude, longitude and an altitude above mean sea level; None: the present position.
+            timeout: seconds until HOME_POSITION reports it.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
-            CommandRejected: the vehicle refused: it knows no position, or the place is none.
-            CommandTimeout: there was no answer.
-            OperationTimeout: it accepted, and HOME_POSITION did not tell it.
+            CommandRejected: the vehicle refused: it has no position, or the place is invalid.
+            CommandTimeout: there was no acknowledgement.
+            OperationTimeout: it accepted, and HOME_POSITION did not report it.
         """
         if place is not None and place.altitude_amsl_m is None:
-            raise InvalidArgument("place has no altitude_amsl_m: home needs one above mean sea level")
+            raise InvalidArgument("place has no altitude_amsl_m, which home requires")
         home = self.telemetry.home
-        with self._arbiter.aside() as order:
+        with self._arbiter.auxiliary_order() as order:
             if place is None:
-                await self._sender.give(order, self._talk.commands.send_long, MavCmd.DO_SET_HOME, 1)
+                await self._sender.run_command(order, self._session.commands.send_long, MavCmd.DO_SET_HOME, 1)
             else:
-                latitude, longitude, altitude, _ = self._where.global_target(place)
+                latitude, longitude, altitude, _ = self._position.global_target(place)
                 where: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
-                await self._sender.give(order, self._talk.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
-        asked_at = self.connection.now()
-        await self._talk.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
-        await home.wait_until(lambda _: home.updated_at >= asked_at, timeout=timeout, description="set_home")
+                await self._sender.run_command(order, self._session.commands.send_place, MavCmd.DO_SET_HOME, 0, **where)
+        requested_at = self.connection.now()
+        await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
+        await home.wait_until(lambda _: home.updated_at >= requested_at, timeout=timeout, description="set_home")
 
     def distance_to(self, target: Position) -> float:
-        """Metres from where the vehicle is to ``target``; in three dimensions when ``target`` has an altitude.
+        """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
 
         Infinite while the position is unknown.
         """
-        return self._where.distance_to(target)
+        return self._position.distance_to(target)
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
         if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
-            raise NotSupported(f"{self.autopilot.firmware} cannot be told where to look; nothing was sent")
+            raise NotSupported(f"{self.autopilot.firmware} has no command for a region of interest; nothing was sent")
 
     @property
     def _speeds_by_reposition(self) -> bool:
@@ -342,61 +349,63 @@ LOCATION = MavCmd.DO_SET_ROI_LOCATION
 
 
 @checks_arguments
-class LookActions(Part):
-    """Nose or gimbal at a place: of two orders the newer one counts."""
+class LookActions(VehicleBase):
+    """Pointing nose or gimbal at a place; the newer of two orders counts."""
 
     async def look_at(self, target: Position) -> None:
-        """Make nose or gimbal point at a place, until :meth:`stop_looking`; without an altitude, at its own.
+        """Point nose or gimbal at a place, until :meth:`stop_looking`; without an altitude, at the vehicle's own.
 
-        Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), and
-        MAV_CMD_DO_SET_ROI to old firmware, which knows no other.
+        Sends MAV_CMD_DO_SET_ROI_LOCATION (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_ROI_LOCATION), or
+        MAV_CMD_DO_SET_ROI to old firmware.
 
         Raises:
-            ValueUnknownError: home is not known and is needed here.
+            ValueUnknownError: home is needed here and not known.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no answer.
-            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        latitude, longitude, altitude, is_relative = self._where.global_target(target)
-        if not self._talk.commands.is_unknown(LOCATION):
+        latitude, longitude, altitude, is_relative = self._position.global_target(target)
+        if not self._session.commands.is_unknown(LOCATION):
             frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
             if await self._set_roi_location({"frame": frame, "x": latitude, "y": longitude, "z": altitude}):
                 return
-        above_home = altitude if is_relative else altitude - self._where.home_altitude()
+        above_home = altitude if is_relative else altitude - self._position.home_altitude()
         place = (latitude * 1e-7, longitude * 1e-7, above_home)
         await self._give(MavCmd.DO_SET_ROI, 0, 0, 0, 0, *place)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
-        """False for firmware that does not know it, or no COMMAND_INT at all: that says nothing."""
+        """Return False for firmware that does not support the command, or no COMMAND_INT."""
         with self._newest() as order:
             try:
-                await self._sender.give(order, self._talk.commands.send_int, LOCATION, **place)
+                await self._sender.run_command(order, self._session.commands.send_int, LOCATION, **place)
             except CommandTimeout:
                 knows_int = (self.telemetry.capabilities.latest or 0) & MavProtocolCapability.COMMAND_INT
                 if knows_int or not self._arbiter.is_known:
                     raise
-                self._raise_if_overruled(order)
+                self._raise_if_superseded(order)
                 return False
             except CommandRejected:
-                if not self._talk.commands.is_unknown(LOCATION):
+                if not self._session.commands.is_unknown(LOCATION):
                     raise
-                self._raise_if_overruled(order)
+                self._raise_if_superseded(order)
                 return False
         return True
 
     async def _give(self, command: int, *params: float) -> None:
         with self._newest() as order:
-            await self._sender.give(order, self._talk.commands.send_long, command, *params)
+            await self._sender.run_command(order, self._session.commands.send_long, command, *params)
 
     @contextmanager
     def _newest(self) -> Iterator[Order]:
-        with self._arbiter.aside(self._arbiter.of_device(LOOKING)) as order:
+        with self._arbiter.auxiliary_order(self._arbiter.of_device(ROI)) as order:
             yield order
 
     @staticmethod
-    def _raise_if_overruled(order: Order) -> None:
-        """A mode of the program's own is no reason: it looks there in any."""
-        if order.end and not order.taken_by:
+    def _raise_if_superseded(order: Order) -> None:
+        """Raise if the order was superseded. A mode of the program's own does not matter, because the ROI applies in
+        any.
+        """
+        if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def stop_looking(self) -> None:
@@ -404,15 +413,15 @@ class LookActions(Part):
 
         Raises:
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no answer.
-            OperationRejected: the mode changed, or a newer order was given, before there was an answer.
+            CommandTimeout: there was no acknowledgement.
+            OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
         with self._newest() as order:
             try:
-                await self._sender.give(order, self._talk.commands.send_long, MavCmd.DO_SET_ROI_NONE)
+                await self._sender.run_command(order, self._session.commands.send_long, MavCmd.DO_SET_ROI_NONE)
                 return
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise
-                self._raise_if_overruled(order)
+                self._raise_if_superseded(order)
         await self._give(MavCmd.DO_SET_ROI)

@@ -1,1 +1,1 @@
-"""What is on board beside the autopilot: cameras, gimbals, companion computers, receivers and others."""
+"""Components other than the autopilot: cameras, gimbals, companion computers, receivers and others."""

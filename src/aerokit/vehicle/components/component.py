@@ -1,4 +1,4 @@
-"""``Component``: one device of a vehicle beside its autopilot, spoken to as the autopilot is."""
+"""``Component``: any MAVLink component of a vehicle, and ``Components``: all of them."""
 
 from __future__ import annotations
 
@@ -11,59 +11,59 @@ import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.async_block import ReadOnly
-from aerokit._internal.files import unpacked
+from aerokit._internal.files import decompress
 from aerokit._internal.values import Snapshot
 from aerokit.connection.bus import Overflow, Subscription
-from aerokit.connection.components import is_autopilot
-from aerokit.errors import CommandRejected, CommandTimeout, FileFormatError, NotSupported, OperationTimeout
+from aerokit.connection.cells import Source, StateCell
+from aerokit.connection.heartbeats import is_autopilot
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    FileFormatError,
+    InvalidArgument,
+    NotSupported,
+    OperationTimeout,
+)
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavComponent, MavType
 from aerokit.mavlink.message import Message
-from aerokit.vehicle.components.session import WEB
+from aerokit.vehicle.components.session import WEB_SCHEMES, ComponentSession
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from aerokit.connection.cells import StateCell
     from aerokit.events import Event
-    from aerokit.mavlink.messages import CommandAck, ComponentInformationBasic, Heartbeat
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.messages import CommandAck, Heartbeat
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.sender import OrderSender
-    from aerokit.vehicle.components.session import ComponentTalk
     from aerokit.vehicle.components.settings import Settings
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.parameters.parameters import Parameters
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.session.session import VehicleSession
 
-__all__ = [
-    "KINDS",
-    "Component",
-    "ComponentInformation",
-    "ComponentStatus",
-    "information_of",
-    "kind_of",
-    "read_metadata",
-]
+__all__ = ["Component", "ComponentInformation", "ComponentStatus"]
 
 
 class ComponentStatus(Snapshot):
-    """One component of the vehicle's system, as far as it was heard.
+    """One component of the vehicle's system.
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
-    MAV_TYPE in small letters. ``device_id`` is 0, or 1 to 6 for a camera or gimbal without a component id of its own,
-    behind the component that speaks for it. ``heard_at`` is when it was last heard, on the loop's clock.
+    MAV_TYPE in lower case. ``device_id`` is 1 to 6 for a camera or gimbal without its own component id, attached to
+    this component, otherwise 0. ``received_at`` is the loop time of its last message.
     """
 
     component_id: int
     device_id: int
     kind: str
-    heard_at: float
+    received_at: float
 
 
 class ComponentInformation(Snapshot):
-    """What a component says of itself (COMPONENT_INFORMATION_BASIC); texts are empty where it tells nothing.
+    """Identity of a component (COMPONENT_INFORMATION_BASIC); unknown texts are empty.
 
-    ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits; ``manufactured_at`` is in seconds since 1970, None if not told.
+    ``capabilities`` are MAV_PROTOCOL_CAPABILITY bits; ``manufactured_at`` is in seconds since 1970, None if unknown.
     """
 
     vendor: str
@@ -76,25 +76,12 @@ class ComponentInformation(Snapshot):
 
 
 def kind_of(heartbeat: Heartbeat | None, component_id: int) -> str:
-    """The kind of a component: of one whose type says nothing, by its id."""
+    """Return the kind by MAV_TYPE, or by component id if the type is generic."""
     if heartbeat is not None and is_autopilot(heartbeat):
         return "autopilot"
     if heartbeat is not None and heartbeat.type != MavType.GENERIC:
         return _name(MavType, heartbeat.type)
     return _name(MavComponent, component_id) if heartbeat is not None else "unknown"
-
-
-def information_of(message: ComponentInformationBasic) -> ComponentInformation:
-    """The same in words."""
-    return ComponentInformation(
-        message.vendor_name,
-        message.model_name,
-        message.software_version,
-        message.hardware_version,
-        message.serial_number,
-        message.capabilities,
-        message.time_manufacture_s or None,
-    )
 
 
 def _name(enum: type[MavType | MavComponent], number: int) -> str:
@@ -110,99 +97,113 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 MetadataKind = Literal["general", "parameter", "commands", "peripherals", "events", "actuators"]
 
-ASK_S, ASKED = 1.0, 3
+ATTEMPT_TIMEOUT_S, REQUEST_ATTEMPTS = 1.0, 3
 
 
 @checks_arguments
 class Component(ReadOnly):
     """One component of a vehicle: a camera, a gimbal, a companion computer, a receiver or another.
 
-    Made by :meth:`aerokit.Vehicle.component`. Commands, messages with rates, parameters and files are those of this
-    component, by the code that the autopilot's go through. https://mavlink.io/en/services/component_information.html
+    Returned by :meth:`aerokit.Vehicle.component`. It has its own commands, messages with rates, parameters and files,
+    which work like those of the autopilot. https://mavlink.io/en/services/component_information.html
     """
 
     def __init__(
         self,
-        talk: ComponentTalk | Talk,
+        session: ComponentSession | VehicleSession,
         sender: OrderSender,
         files: Callable[[], Files],
         parameters: Callable[[], Parameters],
-        beside: Callable[[int], Component],
+        component_of: Callable[[int], Component],
     ) -> None:
-        self._talk, self._sender, self._beside = talk, sender, beside
+        self._session, self._sender, self._component_of = session, sender, component_of
         self._make_files, self._make_parameters = files, parameters
-        self.system_id: int = talk.system_id
-        """The vehicle's system id."""
-        self.component_id: int = talk.component_id
-        """Its MAV_COMPONENT id, 1 to 255."""
+        self.system_id: int = session.system_id
+        """System id of the vehicle."""
+        self.component_id: int = session.component_id
+        """MAV_COMPONENT id, 1 to 255."""
 
     def __repr__(self) -> str:
-        return f"<Component {self.system_id}/{self.component_id} {self.kind}, {self._talk.describe_link()}>"
-
-    # --------------------------------------------------------------------------------- state
+        return f"<Component {self.system_id}/{self.component_id} {self.kind}, {self._session.describe_link()}>"
 
     @property
     def kind(self) -> str:
-        """What its HEARTBEAT says it is: ``"camera"``, ``"gimbal"``, ``"onboard_controller"`` … or ``"unknown"``."""
-        heartbeat = self._talk.connection.heard.get((self.system_id, self.component_id))
+        """Kind according to HEARTBEAT: ``"camera"``, ``"gimbal"``, ``"onboard_controller"`` … or ``"unknown"``."""
+        heartbeat = self._session.connection.heartbeats.get((self.system_id, self.component_id))
         return kind_of(heartbeat, self.component_id)
 
     @property
     def age(self) -> float:
         """Seconds since its last HEARTBEAT; inf before the first."""
-        connection = self._talk.connection
-        return connection.now() - connection.heard_at(self.system_id, self.component_id)
+        connection = self._session.connection
+        return connection.now() - connection.last_heartbeat_at(self.system_id, self.component_id)
 
     @property
     def is_silent(self) -> bool:
-        """Whether it has not been heard for more than 3.5 seconds, or never."""
+        """True if its last HEARTBEAT is older than 3.5 seconds, or none was received."""
         return self.age > SILENT_AFTER_S
 
     async def information(self, *, timeout: float = 3.0) -> ComponentInformation:
-        """Ask what it is and what it can do (COMPONENT_INFORMATION_BASIC).
+        """Request its identity and capabilities (COMPONENT_INFORMATION_BASIC).
 
         Raises:
-            CommandRejected: it does not know the question.
+            CommandRejected: it does not support the message.
             OperationTimeout: it did not answer within ``timeout`` seconds.
         """
-        return information_of(await self.request(m.ComponentInformationBasic, timeout=timeout))
+        message = await self.request(m.ComponentInformationBasic, timeout=timeout)
+        return ComponentInformation(
+            message.vendor_name,
+            message.model_name,
+            message.software_version,
+            message.hardware_version,
+            message.serial_number,
+            message.capabilities,
+            message.time_manufacture_s or None,
+        )
 
     async def metadata(self, kind: MetadataKind = "general", *, timeout: float = 3.0) -> dict[str, Any]:
-        """What it tells of itself in a file (COMPONENT_METADATA, read by MAVFTP), as its JSON has it.
+        """Read one of its metadata files (COMPONENT_METADATA) by MAVFTP and return the JSON object.
 
         Args:
             kind: ``"general"`` lists the others: ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``,
                 ``"actuators"``. PX4 has general, parameter, events and actuators.
-            timeout: seconds until it must have said where the files are.
+            timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: it has no such file, or not on the vehicle.
+            NotSupported: it has no such file, or the file is not on the vehicle.
             FileFormatError: the file is damaged.
             FileError, FileTimeout: it cannot be read.
         """
-        return await read_metadata(self, kind, timeout)
+        general = await _read_json(self, await _general_uri(self, timeout))
+        if kind == "general":
+            return general
+        entries = general.get("metadataTypes")
+        for entry in entries if isinstance(entries, list) else ():
+            if not isinstance(entry, dict) or entry.get("type") != METADATA_TYPES[kind]:
+                continue
+            if isinstance(entry.get("uri"), str):
+                return await _read_json(self, entry["uri"])
+        raise NotSupported(f"component {self.component_id} has no {kind} metadata")
 
-    async def fetch(self, uri: str, *, patience_s: float = 10.0) -> bytes:
-        """The content of a file that a component names by its address, at most 16 MB.
+    async def fetch(self, uri: str, *, idle_timeout_s: float = 10.0) -> bytes:
+        """Return the content of a file by the address that a component has reported, at most 16 MB.
 
         Args:
-            uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another one of the vehicle;
+            uri: ``mftp://path`` is on this component, ``mftp://[;comp=1]path`` on another component of the vehicle;
                 ``http://`` and ``https://`` are fetched from the web.
-            patience_s: give up when nothing has come for so many seconds.
+            idle_timeout_s: fail after this many seconds without progress.
 
         Raises:
-            InvalidArgument: the address is another one.
+            InvalidArgument: the address has another scheme.
             FileFormatError: the file has more than 16 MB.
-            FileError, FileTimeout, OperationRejected: it was not given.
+            FileError, FileTimeout, OperationRejected: the file could not be read.
         """
         from aerokit.vehicle.components.session import fetch
 
-        return await fetch(uri, self._files_of, self.component_id, patience_s)
+        return await fetch(uri, self._files_of, self.component_id, idle_timeout_s)
 
     def _files_of(self, component_id: int) -> Files:
-        return self._beside(component_id).files
-
-    # ------------------------------------------------------------------------------ commands
+        return self._component_of(component_id).files
 
     async def command(
         self,
@@ -213,9 +214,9 @@ class Component(ReadOnly):
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
     ) -> CommandAck:
-        """Send it any MAV_CMD as COMMAND_LONG and return its ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
+        """Send any MAV_CMD as COMMAND_LONG and return the ACCEPTED ack; as :meth:`aerokit.Vehicle.command`."""
         return await self._sender.answered(
-            self._talk.commands.send_long,
+            self._session.commands.send_long,
             command,
             *params,
             component_id=self.component_id,
@@ -232,24 +233,24 @@ class Component(ReadOnly):
         timeout: float = 3.0,
         where: Callable[[MessageT], bool] | None = None,
     ) -> MessageT:
-        """Ask for one message (MAV_CMD_REQUEST_MESSAGE with these params behind the id) and return it.
+        """Request one message (MAV_CMD_REQUEST_MESSAGE) and return it.
 
         Args:
-            message_type: its class.
-            params: param2 to param6, where the message has several: which camera, stream, card …
-            timeout: seconds until it must have come; it is asked for up to three times.
-            where: which of several is meant; called with each that comes.
+            message_type: class of the message.
+            params: param2 to param6, e.g. the number of a camera, stream or storage.
+            timeout: seconds to wait; it is requested up to three times.
+            where: predicate to select one of several messages.
 
         Raises:
             CommandRejected: it refused.
-            OperationTimeout: no such message came.
+            OperationTimeout: the message did not arrive.
         """
-        with self._talk.hearing.subscribe((message_type,), 100, "drop_oldest", None) as answers:
+        with self._session.subscriber.subscribe((message_type,), 100, "drop_oldest", None) as answers:
             refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
-                for _ in range(ASKED):
+                for _ in range(REQUEST_ATTEMPTS):
                     try:
-                        await self._talk.commands.send_long(
+                        await self._session.commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
                             message_type.ID,
                             *params,
@@ -260,7 +261,7 @@ class Component(ReadOnly):
                         pass
                     except CommandRejected as error:
                         refusal = error
-                    with anyio.move_on_after(ASK_S if refusal is None else 0):
+                    with anyio.move_on_after(ATTEMPT_TIMEOUT_S if refusal is None else 0):
                         async for answer in answers:
                             if where is None or where(answer):
                                 return answer
@@ -268,10 +269,8 @@ class Component(ReadOnly):
                         raise refusal
         raise OperationTimeout(
             f"component {self.component_id} sent no {message_type.NAME} within {timeout:g} s;"
-            f" {self._talk.describe_link()}"
+            f" {self._session.describe_link()}"
         )
-
-    # ------------------------------------------------------------------------------ messages
 
     def subscribe(
         self,
@@ -280,90 +279,141 @@ class Component(ReadOnly):
         overflow: Overflow = "drop_oldest",
         rate_hz: float | None = None,
     ) -> Subscription[ItemT]:
-        """What this component says, and events that name it; it is asked for ``rate_hz``.
+        """Subscribe to messages of this component and events about it, requested at ``rate_hz``.
 
         As :meth:`aerokit.Vehicle.subscribe`.
         """
-        return self._talk.hearing.subscribe(types, capacity, overflow, rate_hz)
+        return self._session.subscriber.subscribe(types, capacity, overflow, rate_hz)
 
     def message(self, message_type: type[MessageT], *, rate_hz: float | None = None) -> StateCell[MessageT]:
-        """Its latest message of a kind, in a cell; as :meth:`aerokit.Vehicle.message`."""
-        return self._talk.hearing.cell(message_type, rate_hz)
+        """Return a cell with its latest message of a type; as :meth:`aerokit.Vehicle.message`."""
+        return self._session.subscriber.cell(message_type, rate_hz)
 
     @contextmanager
     def rate(self, message_type: type[Message], rate_hz: float) -> Iterator[None]:
-        """Have it send ``message_type`` at ``rate_hz`` or faster for the time of the ``with`` block."""
-        release = self._talk.rates.want(message_type, rate_hz)
+        """Request ``message_type`` at ``rate_hz`` or faster for the duration of the ``with`` block."""
+        release = self._session.rates.request(message_type, rate_hz)
         try:
             yield
         finally:
             release()
 
-    # --------------------------------------------------------------------------------- parts
-
     @cached_property
     def files(self) -> Files:
-        """The files on it, by MAVFTP."""
+        """Its files, by MAVFTP."""
         return self._make_files()
 
     @cached_property
     def parameters(self) -> Parameters:
-        """Its parameters (PARAM_VALUE), as those of the autopilot."""
+        """Its parameters (PARAM_VALUE)."""
         return self._make_parameters()
 
     @cached_property
     def settings(self) -> Settings:
-        """Its settings (PARAM_EXT), texts among them; those of a camera with what its definition file says of them."""
+        """Its settings (PARAM_EXT), which may be texts; for cameras explained by the camera definition file."""
         from aerokit.vehicle.components.settings import Settings
 
         async def information() -> m.CameraInformation:
             return await self.request(m.CameraInformation)
 
-        return Settings(self._talk, information, self._files_of)
+        return Settings(self._session, information, self._files_of)
 
 
-KINDS = {each.name.lower(): int(each) for each in CompMetadataType}
-"""Kinds of files: ``"general"``, ``"parameter"``, ``"commands"``, ``"peripherals"``, ``"events"``, ``"actuators"``."""
-
-
-async def read_metadata(component: Component, kind: str, timeout: float) -> dict[str, Any]:
-    """Fetch the file of this kind by MAVFTP; see :meth:`Component.metadata`."""
-    general = await _read(component, await _general_uri(component, timeout))
-    if kind == "general":
-        return general
-    for each in _listed(general):
-        if each.get("type") == KINDS[kind] and isinstance(each.get("uri"), str):
-            return await _read(component, each["uri"])
-    raise NotSupported(f"component {component.component_id} has no metadata of its {kind}")
+METADATA_TYPES = {metadata_type.name.lower(): int(metadata_type) for metadata_type in CompMetadataType}
 
 
 async def _general_uri(component: Component, timeout: float) -> str:
-    """Where its first file is, by COMPONENT_METADATA, or COMPONENT_INFORMATION of older firmware."""
+    """Address of the general metadata, from COMPONENT_METADATA, or COMPONENT_INFORMATION of older firmware."""
     try:
         return (await component.request(m.ComponentMetadata, timeout=timeout)).uri
     except CommandRejected:
         pass
     except OperationTimeout as error:
-        raise NotSupported(f"component {component.component_id} tells of no metadata: {error}") from None
+        raise NotSupported(f"component {component.component_id} reports no metadata: {error}") from None
     try:
         return (await component.request(m.ComponentInformation, timeout=timeout)).general_metadata_uri
     except (CommandRejected, OperationTimeout) as error:
-        raise NotSupported(f"component {component.component_id} tells of no metadata: {error}") from None
+        raise NotSupported(f"component {component.component_id} reports no metadata: {error}") from None
 
 
-def _listed(general: dict[str, Any]) -> list[dict[str, Any]]:
-    listed = general.get("metadataTypes")
-    return [each for each in listed if isinstance(each, dict)] if isinstance(listed, list) else []
-
-
-async def _read(component: Component, uri: str) -> dict[str, Any]:
-    if uri.lower().startswith(WEB):
-        raise NotSupported(f"{uri} is not on the vehicle: fetch it by another program")
-    data = unpacked(await component.fetch(uri), uri)
+async def _read_json(component: Component, uri: str) -> dict[str, Any]:
+    if uri.lower().startswith(WEB_SCHEMES):
+        raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
+    data = decompress(await component.fetch(uri), uri)
     try:
         content = json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{uri}: no JSON: {error}") from None
+        raise FileFormatError(f"{uri} is not valid JSON: {error}") from None
     if not isinstance(content, dict):
-        raise FileFormatError(f"{uri}: its outermost value is no object")
+        raise FileFormatError(f"{uri}: the top-level JSON value is not an object")
     return content
+
+
+# Device ids of cameras and gimbals without their own component id.
+DEVICE_IDS = range(1, 7)
+DEVICE_MESSAGES = (
+    (m.CameraInformation, "camera_device_id", "camera"),
+    (m.GimbalManagerInformation, "gimbal_device_id", "gimbal"),
+    (m.GimbalDeviceAttitudeStatus, "gimbal_device_id", "gimbal"),
+)
+
+
+class Components:
+    """The components of one vehicle: their status, and the `Component` objects."""
+
+    def __init__(
+        self, context: VehicleContext, files: Callable[[], Files], parameters: Callable[[], Parameters]
+    ) -> None:
+        self._context, self._session = context, context.session
+        self._files, self._parameters = files, parameters
+        self._by_id: dict[int, Component] = {}
+        self._statuses: dict[tuple[int, int], ComponentStatus] = {}
+        session = context.session
+        self.cell: StateCell[tuple[ComponentStatus, ...]] = session.connection.new_cell("components", "HEARTBEAT")
+        session.keep(self.cell)
+        bus = session.connection.bus
+        session.at_close(bus.attach(m.Heartbeat, self._on_heartbeat, system_id=session.system_id))
+        for message_type, field, kind in DEVICE_MESSAGES:
+            if bus.dialect.get(message_type.ID) is not None:
+                session.at_close(bus.attach(message_type, self._listener(field, kind), system_id=session.system_id))
+        for (system_id, _), heartbeat in session.connection.heartbeats.items():
+            if system_id == session.system_id:
+                self._on_heartbeat(heartbeat)
+
+    def component(self, component_id: int) -> Component:
+        """Return the object for a component id, always the same one, whether or not it has been discovered."""
+        if not 1 <= component_id <= 255:
+            raise InvalidArgument(f"component_id = {component_id} is not allowed: 1 to 255")
+        if component_id not in self._by_id:
+            self._by_id[component_id] = self._new(component_id)
+        return self._by_id[component_id]
+
+    def _new(self, component_id: int) -> Component:
+        from aerokit.vehicle.files.files import Files
+        from aerokit.vehicle.parameters.parameters import Parameters
+
+        sender = self._context.sender
+        if component_id == self._session.component_id:
+            return Component(self._session, sender, self._files, self._parameters, self.component)
+        session = ComponentSession(self._session, component_id)
+        files = Files(session.transfers)
+        return Component(session, sender, lambda: files, lambda: Parameters(session, files), self.component)
+
+    def _on_heartbeat(self, heartbeat: m.Heartbeat) -> None:
+        frame = heartbeat.received_frame
+        if frame is not None:
+            self._record(frame, 0, kind_of(heartbeat, frame.component_id))
+
+    def _listener(self, field: str, kind: str) -> Any:
+        def on_message(message: Any) -> None:
+            number, frame = getattr(message, field), message.received_frame
+            if frame is not None and number in DEVICE_IDS:
+                self._record(frame, number, kind)
+
+        return on_message
+
+    def _record(self, frame: Frame, device_id: int, kind: str) -> None:
+        key = frame.component_id, device_id
+        self._statuses[key] = ComponentStatus(*key, kind, frame.received_at)
+        source = Source(frame.system_id, frame.component_id, "HEARTBEAT")
+        self.cell.set(tuple(self._statuses[key] for key in sorted(self._statuses)), source)

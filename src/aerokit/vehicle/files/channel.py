@@ -1,4 +1,4 @@
-"""``FileChannel``: one vehicle's MAVFTP server as this program uses it: one operation at a time, every file closed."""
+"""``FileChannel`` and ``LogChannel``: operations with one vehicle by MAVFTP and LOG_*, one at a time, always ended."""
 
 from __future__ import annotations
 
@@ -10,34 +10,38 @@ import anyio
 
 from aerokit.errors import AerokitError, ConnectionClosed, FileError, FileTimeout, LinkError, OperationTimeout
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
+from aerokit.protocols.exchange import IDLE_TIMEOUT_S, OnProgress
 from aerokit.protocols.ftp import FtpClient, FtpRequest, FtpSessionLost, path_bytes
+from aerokit.protocols.logs import LogDownload, LogList, LogStop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
+    from aerokit.mavlink.messages import LogEntry
+    from aerokit.protocols.blocks import Reassembly
     from aerokit.protocols.ftp import FtpMessage
     from aerokit.vehicle.session.transfers import Transfers
 
 T = TypeVar("T")
 
-REOPENINGS = 3
-"""How often a file is opened for one transfer; the vehicle may close it at any time."""
-TAKEN = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)
-"""What opening is answered while a file is open."""
-GIVEN_UP_AFTER_S: dict[int, float] = {MavFtpErr.INVALIDSESSION: 3.2, MavFtpErr.NOSESSIONSAVAILABLE: 10.5}
-"""So long after the last request of anybody the vehicle closes a file: ArduPilot 3 s, PX4 10 s."""
-CLOSE_PATIENCE_S = 3.0
+# The vehicle may close a file at any time; a transfer opens it at most this often.
+MAX_OPEN_ATTEMPTS = 3
+# Error codes for opening a file while another one is open.
+SESSION_IN_USE = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)
+# The vehicle closes a file this long after the last request of any client: ArduPilot 3 s, PX4 10 s.
+SESSION_TIMEOUT_S: dict[int, float] = {MavFtpErr.INVALIDSESSION: 3.2, MavFtpErr.NOSESSIONSAVAILABLE: 10.5}
+CLOSE_TIMEOUT_S = 3.0
 
 
-class OpenFile(NamedTuple):
-    """A file that the vehicle has opened for us: its session, and its size as the vehicle says it."""
+class RemoteFile(NamedTuple):
+    """A file that the vehicle has opened: its session, and its size in bytes."""
 
     session: int
     size: int
 
 
 class FileChannel:
-    """Requests of one client, in order. What was read, or left in a hurry, is closed in the background."""
+    """MAVFTP requests in order. Files that were read, or abandoned, are closed in the background."""
 
     def __init__(self, transfers: Transfers) -> None:
         connection = transfers.connection
@@ -49,7 +53,6 @@ class FileChannel:
             source_component=connection.source_component,
             first_sequence=int(transfers.began_at * 1000.0),
         )
-        """Addresses and numbers."""
         self._lock = asyncio.Lock()
         self._closing: dict[int, _Closing] = {}
 
@@ -59,19 +62,18 @@ class FileChannel:
         what: str,
         *,
         timeout: float | None,
-        patience_s: float,
+        idle_timeout_s: float,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Wait for one's turn, and have what was left open before closed.
+        """Wait for the previous operations, and for sessions that are still being closed.
 
-        Raises:
-            FileTimeout: all of it has taken more than ``timeout`` seconds; ``missing()`` gives its ranges.
+        FileTimeout after ``timeout`` seconds has the ranges that ``missing()`` returns.
         """
         try:
             with anyio.fail_after(timeout):
                 async with self._lock:
                     for session in tuple(self._closing):
-                        await self._close_left(session, patience_s)
+                        await self._finish_closing(session, idle_timeout_s)
                     yield
         except OperationTimeout:
             raise
@@ -83,11 +85,11 @@ class FileChannel:
         opcode: MavFtpOpcode,
         path: str,
         *,
-        patience_s: float,
+        idle_timeout_s: float,
         offset: int = 0,
         data: bytes | None = None,
     ) -> FtpMessage:
-        """Ask for something that takes one message (``data``: the path), within an operation."""
+        """Send a request with a single reply, within an operation; ``data`` defaults to the path."""
         request = FtpRequest(
             self.client,
             opcode,
@@ -95,7 +97,7 @@ class FileChannel:
             offset=offset,
             data=path_bytes(path) if data is None else data,
             round_trip=self.transfers.round_trip,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
         )
         return await self.transfers.run(request)
 
@@ -103,126 +105,206 @@ class FileChannel:
         self,
         opcode: MavFtpOpcode,
         path: str,
-        use: Callable[[OpenFile], Awaitable[T]],
+        use: Callable[[RemoteFile], Awaitable[T]],
         *,
-        patience_s: float,
+        idle_timeout_s: float,
     ) -> T:
-        """Open a file, use it and close it, within an operation; once more when the vehicle closed it meanwhile."""
-        for attempt in range(1, REOPENINGS + 1):
-            file = await self._open(opcode, path, patience_s)
+        """Open a file, use it and close it, within an operation; repeat if the vehicle closes it meanwhile."""
+        for attempt in range(1, MAX_OPEN_ATTEMPTS + 1):
+            file = await self._open(opcode, path, idle_timeout_s)
             try:
                 result = await use(file)
             except FtpSessionLost:
-                await self._close(file.session, path, patience_s)
-                if attempt == REOPENINGS:
+                await self._close(file.session, path, idle_timeout_s)
+                if attempt == MAX_OPEN_ATTEMPTS:
                     raise
             except (OperationTimeout, ConnectionClosed, LinkError):
-                self._leave(file.session, path)
+                self._close_soon(file.session, path)
                 raise
             except Exception:
                 with suppress(FileTimeout):
-                    await self._close(file.session, path, min(patience_s, CLOSE_PATIENCE_S))
+                    await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:
-                self._leave(file.session, path)
+                self._close_soon(file.session, path)
                 raise
             else:
                 if opcode == MavFtpOpcode.OPENFILERO:
-                    self._leave(file.session, path)  # what was read is here, whatever comes of it
+                    self._close_soon(file.session, path)  # The data is complete, so do not wait.
                 else:
-                    await self._close(file.session, path, patience_s)
+                    await self._close(file.session, path, idle_timeout_s)
                 return result
         raise AssertionError("a loop that returns or raises")
 
-    # ------------------------------------------------------------------------------ sessions
-
-    async def _open(self, opcode: MavFtpOpcode, path: str, patience_s: float) -> OpenFile:
-        """Open a file. Where another session is in the way, give its owner the time to go, once."""
+    async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
+        """Open a file. If another session is in the way, wait once for the vehicle to time it out."""
         may_wait, may_be_ours = True, True
         while True:
-            request = self._request(opcode, path, self.client.next_session(), patience_s)
+            request = self._request(opcode, path, self.client.next_session(), idle_timeout_s)
             try:
                 reply = await self.transfers.run(request)
             except FileError as error:
-                if may_be_ours and request.attempts > 1 and error.code in TAKEN:
-                    may_be_ours = (
-                        False  # the first sending opened it, its answer and the memory of it are lost
-                    )
-                    await self._close_unanswered(request, path, patience_s)
+                if may_be_ours and request.attempts > 1 and error.code in SESSION_IN_USE:
+                    # The first request opened it, but the reply was lost.
+                    may_be_ours = False
+                    for session in self._possible_sessions(request):
+                        await self._close(session, path, idle_timeout_s)
                     continue
-                pause_s = GIVEN_UP_AFTER_S.get(error.code)
-                if not may_wait or pause_s is None or pause_s > patience_s + 1.0:
+                pause_s = SESSION_TIMEOUT_S.get(error.code)
+                if not may_wait or pause_s is None or pause_s > idle_timeout_s + 1.0:
                     raise
                 may_wait = False
                 await anyio.sleep(pause_s)
             except BaseException:
                 for session in self._possible_sessions(request):
-                    self._leave(session, path)
+                    self._close_soon(session, path)
                 raise
             else:
-                return OpenFile(reply.session, int.from_bytes(reply.data[:4], "little"))
+                return RemoteFile(reply.session, int.from_bytes(reply.data[:4], "little"))
 
-    def _request(self, opcode: MavFtpOpcode, path: str, session: int, patience_s: float) -> FtpRequest:
+    def _request(
+        self, opcode: MavFtpOpcode, path: str, session: int, idle_timeout_s: float, *, is_sent: bool = False
+    ) -> FtpRequest:
         return FtpRequest(
             self.client,
             opcode,
             path=path,
             session=session,
+            is_sent=is_sent,
             data=b"" if opcode == MavFtpOpcode.TERMINATESESSION else path_bytes(path),
             round_trip=self.transfers.round_trip,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """What a session is called that was opened without our having heard of it."""
-        return (request.session,) if self.transfers.autopilot.takes_file_sessions else (request.session, 0)
+        """Ids that the session may have if the reply to opening it was lost."""
+        return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
-    async def _close_unanswered(self, request: FtpRequest, path: str, patience_s: float) -> None:
-        for session in self._possible_sessions(request):
-            await self._close(session, path, patience_s)
-
-    async def _close(self, session: int, path: str, patience_s: float) -> None:
-        """Close a session and have that confirmed; when that goes wrong, it is left to the background."""
-        request = self._request(MavFtpOpcode.TERMINATESESSION, path, session, patience_s)
+    async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
+        """Close a session and wait for the confirmation; if that fails, continue in the background."""
+        request = self._request(MavFtpOpcode.TERMINATESESSION, path, session, idle_timeout_s)
         try:
             await self.transfers.run(request)
         except BaseException:
-            self._leave(session, path)
+            self._close_soon(session, path)
             raise
 
-    def _leave(self, session: int, path: str) -> None:
-        """Close a session at once, and have that confirmed in the background; the next operation waits for it."""
-        request = FtpRequest(
-            self.client,
-            MavFtpOpcode.TERMINATESESSION,
-            path=path,
-            session=session,
-            is_sent=True,
-            round_trip=self.transfers.round_trip,
-        )
-        with suppress(AerokitError):  # when nothing can be sent any more, there is nobody to tell
+    def _close_soon(self, session: int, path: str) -> None:
+        """Close a session without waiting; the next operation waits for the confirmation."""
+        request = self._request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
+        with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
             closing = self._closing[session] = _Closing(request)
             self.transfers.background.start(lambda: closing.confirm(self.transfers), "aerokit close file")
 
-    async def _close_left(self, session: int, patience_s: float) -> None:
-        """Make sure that a session is closed that was left before."""
+    async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
+        """Wait until a session is closed that :meth:`_close_soon` has started to close."""
         closing = self._closing[session]
         await closing.ended.wait()
         if not closing.request.is_answered:
-            await self._close(session, closing.request.path, patience_s)
+            await self._close(session, closing.request.path, idle_timeout_s)
         self._closing.pop(session, None)
 
 
 class _Closing:
-    """A session that is being closed with nobody waiting."""
+    """A session that is being closed in the background."""
 
     def __init__(self, request: FtpRequest) -> None:
         self.request, self.ended = request, asyncio.Event()
 
     async def confirm(self, transfers: Transfers) -> None:
         try:
-            with suppress(AerokitError):  # the vehicle closes it by itself after its own time-out
+            with suppress(AerokitError):  # The vehicle closes it after its own time-out.
                 await transfers.run(self.request)
         finally:
             self.ended.set()
+
+
+class LogChannel:
+    """LOG_* messages of one vehicle, one operation at a time; an interrupted one is ended in the background."""
+
+    def __init__(self, transfers: Transfers) -> None:
+        self._transfers = transfers
+        self._lock = asyncio.Lock()
+        self._ending: asyncio.Event | None = None
+
+    async def list(
+        self, idle_timeout_s: float, only: int | None, *, max_unanswered: int | None
+    ) -> tuple[LogEntry, ...]:
+        """Request all entries, or one, within an operation."""
+        transfers = self._transfers
+        exchange = LogList(
+            transfers.system_id,
+            transfers.component_id,
+            first_id=transfers.autopilot.first_log_id,
+            start=only,
+            end=only,
+            max_unanswered=max_unanswered,
+            round_trip=transfers.round_trip,
+            idle_timeout_s=idle_timeout_s,
+        )
+        return await transfers.run(exchange)
+
+    async def download(
+        self,
+        log_id: int,
+        size: int,
+        into: Reassembly,
+        idle_timeout_s: float,
+        timeout: float | None,
+        on_progress: OnProgress,
+    ) -> None:
+        transfers = self._transfers
+        exchange = LogDownload(
+            transfers.system_id,
+            transfers.component_id,
+            log_id,
+            size,
+            into,
+            round_trip=transfers.round_trip,
+            idle_timeout_s=idle_timeout_s,
+            on_progress=on_progress,
+        )
+        async with self.operation(f"log {log_id}", timeout, lambda: into.missing(size)):
+            await transfers.run(exchange)
+
+    @asynccontextmanager
+    async def operation(
+        self,
+        what: str,
+        timeout: float | None,
+        missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
+    ) -> AsyncIterator[None]:
+        """Wait for the previous operation; stop the vehicle from sending if this one does not complete."""
+        try:
+            with anyio.fail_after(timeout):
+                async with self._lock:
+                    if self._ending is not None:
+                        await self._ending.wait()
+                    try:
+                        yield
+                    except BaseException:
+                        self._end()
+                        raise
+        except OperationTimeout:
+            raise
+        except TimeoutError:
+            raise FileTimeout(f"{what}: not done within {timeout:g} s", missing=missing()) from None
+
+    def _end(self) -> None:
+        """Send LOG_REQUEST_END, and confirm it in the background before the next operation."""
+        transfers = self._transfers
+        exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)
+        ended = asyncio.Event()
+
+        async def confirm() -> None:
+            try:
+                with suppress(AerokitError):
+                    await transfers.run(exchange)
+            finally:
+                ended.set()
+
+        with suppress(AerokitError):  # The connection may be closed.
+            transfers.connection.send(exchange.message)
+            self._ending = ended
+            transfers.background.start(confirm, "aerokit end of logs")

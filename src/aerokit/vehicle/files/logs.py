@@ -2,71 +2,110 @@
 
 from __future__ import annotations
 
-import asyncio
-from contextlib import asynccontextmanager, suppress
+import logging
+import re
 from datetime import datetime, timedelta, timezone
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.files import PartFile
-from aerokit.errors import AerokitError, FileError, FileTimeout, InvalidArgument, OperationTimeout
+from aerokit._internal.values import Snapshot
+from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr
 from aerokit.mavlink.messages import LogErase
 from aerokit.protocols.blocks import Reassembly
-from aerokit.protocols.exchange import PATIENCE_S, OnProgress
-from aerokit.protocols.logs import LOG_BLOCK, LogDownload, LogEnd, LogList
-from aerokit.vehicle.files.log_paths import GrowthWatch, LogEntry, listed_logs, log_path
+from aerokit.protocols.exchange import IDLE_TIMEOUT_S, OnProgress
+from aerokit.protocols.logs import LOG_BLOCK
+from aerokit.vehicle.files.channel import LogChannel
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import Sequence
 
-    from aerokit.vehicle.files.files import Files
+    from aerokit.mavlink.messages import LogEntry as LogMessage
+    from aerokit.protocols.exchange import TransferProgress
+    from aerokit.vehicle.files.files import FileEntry, Files
     from aerokit.vehicle.session.transfers import Transfers
 
 __all__ = ["LogEntry", "LogMethod", "Logs"]
 
 LogMethod = Literal["auto", "ftp", "log"]
-SILENT_REQUESTS = 4
-"""So many unanswered requests for the list, and a PX4 is asked by MAVFTP whether it has any logs."""
-LARGEST_ID = 0xFFFF
-ERASE_PERIOD_S = 1.0
+# PX4 without logs does not answer: after this many requests, MAVFTP is used to check whether it has any.
+MAX_UNANSWERED_REQUESTS = 4
+MAX_LOG_ID = 0xFFFF
+ERASE_RETRY_INTERVAL_S = 1.0
 ERASE_PATIENCE_S = 60.0
-CLOCKS_APART = timedelta(days=1)
-"""The time of a log that is being written is the vehicle's clock, afterwards it is that of the file."""
+# The time of a log is the vehicle's clock while it is written, and the time of the file afterwards.
+MAX_CLOCK_DIFFERENCE = timedelta(days=1)
+ARDUPILOT_NAME = re.compile(r"(\d{8})\.BIN", re.IGNORECASE)
+PX4_LIST = "logdata.txt"
+PX4_LINE = re.compile(r"(\d+) (\d+) (\S+)")
+logger: logging.Logger = logging.getLogger("aerokit")
+
+
+class LogEntry(Snapshot):
+    """One flight log: id for :meth:`Logs.download`, size in bytes, and time of the last write.
+
+    The time is None if unknown to the vehicle; the size of a log that is still being written is a snapshot.
+    """
+
+    id: int
+    size: int
+    time_utc: datetime | None
+
+
+class GrowthReporter:
+    """Forwards progress, and reports in the log if there was more data than in the entry."""
+
+    def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
+        self._entry, self._on_progress = entry, on_progress
+        self._size = entry.size
+
+    def __call__(self, progress: TransferProgress) -> None:
+        self._size = progress.total or self._size
+        if self._on_progress is not None:
+            self._on_progress(progress)
+
+    def log_growth(self) -> None:
+        if self._size > self._entry.size:
+            logger.info(
+                "log %d was still being written: listed with %d bytes, downloaded with %d",
+                self._entry.id,
+                self._entry.size,
+                self._size,
+            )
 
 
 @checks_arguments
 class Logs:
-    """Lists, downloads and erases flight logs. Operations follow each other in the order of their calls.
+    """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
-    Every method takes ``patience_s``, the seconds to go on while nothing comes, and ``timeout``, those for all of it
-    (None: no limit). Every method may be cancelled at any moment; the vehicle is told to stop sending.
+    All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
+    total; None for no limit). You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers to the LOG_* messages only while it is disarmed, and ends the log that it is writing when one is
-    read by them; by MAVFTP its logs can be read in flight, too. Of a log that is being written comes what it has when
-    it is asked for; if that is more than its entry says, logger "aerokit" tells so (INFO).
+    ArduPilot answers the LOG_* messages only while disarmed, and ends its current log when one is read by them; by
+    MAVFTP its logs can also be read in flight. A log that is still being written is read up to its current end; if that
+    exceeds the size in its entry, logger "aerokit" reports it (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
-        self._lock = asyncio.Lock()
-        self._ending: asyncio.Event | None = None
+        self._channel = LogChannel(transfers)
+        # The newest log in the last list may have been growing.
         self._newest: LogEntry | None = None
-        """In the last list: it may have been growing then."""
 
     async def list(
-        self, *, patience_s: float = PATIENCE_S, timeout: float | None = None
+        self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None
     ) -> tuple[LogEntry, ...]:
-        """Return the logs that the vehicle has, the oldest first; an empty tuple when it has none.
+        """Return the logs on the vehicle, oldest first; an empty tuple if there are none.
 
         Raises:
-            FileTimeout: not all entries came; the text names the missing ones.
+            FileTimeout: entries are missing; the text names them.
         """
-        async with self._operation("list of logs", timeout, patience_s):
-            entries = await self._entries(patience_s)
+        async with self._channel.operation("list of logs", timeout):
+            entries = await self._entries(idle_timeout_s)
         self._newest = entries[-1] if entries else None
         return entries
 
@@ -77,285 +116,263 @@ class Logs:
         *,
         resume: bool = True,
         method: LogMethod = "auto",
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Copy a log to the disk of this computer. It gets its name when it is complete.
+        """Copy a log to this computer. A log that is still being written is read up to its current end.
 
-        Of one that is being written, that is as far as it goes when it is asked for. Until then it is ``<to>.part`` by
-        MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
+        Until it is complete it is ``<to>.part`` by MAVFTP, ``<to>.log<id>-<time>.part`` by the LOG_* messages.
 
         Args:
             log: an entry of :meth:`list`, or its id.
-            to: the file here.
-            resume: go on where an interrupted download of this log to this file has ended; by LOG_* only when the
-                vehicle tells its time.
-            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: what is faster with this autopilot, and
-                the other one where that does not work. By MAVFTP it must be certain which file the log is.
-            patience_s: see above.
-            timeout: see above.
-            on_progress: called with bytes, and the bytes there will be.
+            to: path of the local file.
+            resume: continue an interrupted download of this log to this file; by LOG_* only if the vehicle reports the
+                time of the log.
+            method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster one for this autopilot, and the
+                other one if that fails. MAVFTP requires that the file of the log can be identified.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the bytes so far and in total.
 
         Raises:
-            InvalidArgument: an argument that cannot be right. Nothing was sent.
-            FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
-            FileTimeout: it did not arrive; ``missing`` has the ranges.
-            OSError: the file cannot be written here.
+            InvalidArgument: an argument is invalid. Nothing was sent.
+            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
+            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
+            OSError: the local file cannot be written.
         """
         _check(log)
-        path, entry = await self._find(log, method, patience_s, timeout)
-        growth = GrowthWatch(entry if isinstance(log, int) else log, on_progress)
+        path, entry = await self._locate(log, method, idle_timeout_s, timeout)
+        growth = GrowthReporter(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
             await self._files.download(
-                path, to, resume=resume, patience_s=patience_s, timeout=timeout, on_progress=growth
+                path, to, resume=resume, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth
             )
-            growth.tell()
+            growth.log_growth()
             return
-        part = PartFile(to, _mark(entry))
-        is_known = entry.time_utc is not None  # without a time, another flight's log may have the same mark
+        part = PartFile(to, _part_suffix(entry))
+        # Without a time, a log of another flight may have the same suffix.
+        is_known = entry.time_utc is not None
         start = part.size if resume and is_known and part.size <= entry.size else 0
         with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
-            await self._fetch(entry, into, patience_s, timeout, growth)
+            await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
         part.finish()
-        growth.tell()
+        growth.log_growth()
 
     async def read(
         self,
         log: LogEntry | int,
         *,
         method: LogMethod = "auto",
-        patience_s: float = PATIENCE_S,
+        idle_timeout_s: float = IDLE_TIMEOUT_S,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> bytes:
         """Return the content of a log; arguments as for :meth:`download`.
 
         Raises:
-            InvalidArgument: an argument that cannot be right. Nothing was sent.
-            FileError: there is no such log, or it cannot be reached by MAVFTP when that was asked for.
-            FileTimeout: it did not arrive; ``missing`` has the ranges.
+            InvalidArgument: an argument is invalid. Nothing was sent.
+            FileError: there is no such log, or it was requested by MAVFTP and cannot be identified.
+            FileTimeout: it did not arrive; ``missing`` has the missing ranges.
         """
         _check(log)
-        path, entry = await self._find(log, method, patience_s, timeout)
-        growth = GrowthWatch(entry if isinstance(log, int) else log, on_progress)
+        path, entry = await self._locate(log, method, idle_timeout_s, timeout)
+        growth = GrowthReporter(entry if isinstance(log, int) else log, on_progress)
         if path is not None:
-            content = await self._files.read(path, patience_s=patience_s, timeout=timeout, on_progress=growth)
+            content = await self._files.read(path, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth)
         else:
             blocks = bytearray()
             into = Reassembly(blocks.extend, block_size=LOG_BLOCK)
-            await self._fetch(entry, into, patience_s, timeout, growth)
+            await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
             content = bytes(blocks)
-        growth.tell()
+        growth.log_growth()
         return content
 
-    async def erase(self, *, patience_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
-        """Erase all logs, and wait until they are gone; that can take minutes on some boards.
+    async def erase(self, *, idle_timeout_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
+        """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
-        LOG_ERASE is not acknowledged: the list tells. A log that the vehicle has begun meanwhile may be there.
+        LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
 
         Raises:
-            FileTimeout: there are still logs of before.
+            FileTimeout: some of the old logs still exist.
         """
-        async with self._operation("erase logs", timeout, patience_s):
-            before = {(entry.time_utc, entry.size) for entry in await self._entries(PATIENCE_S)}
-            until = self._transfers.connection.now() + patience_s
+        async with self._channel.operation("erase logs", timeout):
+            before = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
+            until = self._transfers.connection.now() + idle_timeout_s
             while before:
-                self._transfers.connection.send(
-                    LogErase(self._transfers.system_id, self._transfers.component_id)
-                )
-                await anyio.sleep(ERASE_PERIOD_S)
-                now_there = {(entry.time_utc, entry.size) for entry in await self._entries(PATIENCE_S)}
+                self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
+                await anyio.sleep(ERASE_RETRY_INTERVAL_S)
+                now_there = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
                 before &= now_there
                 if before and self._transfers.connection.now() >= until:
-                    raise FileTimeout(f"erase logs: {len(before)} are still there after {patience_s:g} s")
+                    raise FileTimeout(f"erase logs: {len(before)} logs still exist after {idle_timeout_s:g} s")
 
-    # ----------------------------------------------------------------------------- finding
-
-    async def _find(
-        self, log: LogEntry | int, method: LogMethod, patience_s: float, timeout: float | None
+    async def _locate(
+        self, log: LogEntry | int, method: LogMethod, idle_timeout_s: float, timeout: float | None
     ) -> tuple[str | None, LogEntry]:
-        """Where it is for MAVFTP (None: by LOG_*), and its entry, which LOG_* needs to be fresh."""
-        prefers_messages = method == "log" or (
-            method == "auto" and self._transfers.autopilot.logs_by_messages
-        )
+        """Return the path for MAVFTP (None: use LOG_*), and the entry, which LOG_* needs to be current."""
+        prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
-            path = await self._path(log, patience_s)
+            path = await self._path(log, idle_timeout_s)
             if path is not None:
                 return path, log
         try:
-            entry = await self._entry(log, patience_s, timeout, may_be_silent=method == "auto")
-        except FileTimeout:  # ArduPilot while it is armed
-            path = (
-                await self._path(log, patience_s) if isinstance(log, LogEntry) and method == "auto" else None
-            )
+            entry = await self._entry(log, idle_timeout_s, timeout, may_be_silent=method == "auto")
+        except FileTimeout:  # ArduPilot does not answer while it is armed.
+            path = await self._path(log, idle_timeout_s) if isinstance(log, LogEntry) and method == "auto" else None
             if path is None or not isinstance(log, LogEntry):
                 raise
             return path, log
         if prefers_messages:
             return None, entry
-        path = await self._path(entry, patience_s)
+        path = await self._path(entry, idle_timeout_s)
         if path is None and method == "ftp":
-            raise _no_such_log(entry.id, "it is not certain which file on the vehicle it is")
+            raise _no_such_log(entry.id, "its file on the vehicle cannot be identified")
         return path, entry
 
-    async def _path(self, entry: LogEntry, patience_s: float) -> str | None:
+    async def _path(self, entry: LogEntry, idle_timeout_s: float) -> str | None:
         directories = self._transfers.autopilot.log_directories
         if not directories or not await self._files.is_supported():
             return None
-        return await log_path(self._files, directories, entry, patience_s, has_grown=entry == self._newest)
+        return await log_path(self._files, directories, entry, idle_timeout_s, has_grown=entry == self._newest)
 
     async def _entry(
-        self, log: LogEntry | int, patience_s: float, timeout: float | None, *, may_be_silent: bool
+        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
     ) -> LogEntry:
-        """The fresh entry of a log. Asked for one that it has not, ArduPilot lists what it has not without an end."""
+        """Return the current entry. Asked for an id that does not exist, ArduPilot lists nonexistent logs endlessly."""
         log_id, only = (log, None) if isinstance(log, int) else (log.id, log.id)
-        async with self._operation(f"log {log_id}", timeout, patience_s):
-            entries = await self._entries(patience_s, only, SILENT_REQUESTS if may_be_silent else None)
+        async with self._channel.operation(f"log {log_id}", timeout):
+            entries = await self._entries(idle_timeout_s, only, MAX_UNANSWERED_REQUESTS if may_be_silent else None)
         for entry in entries:
             if entry.id == log_id:
-                if isinstance(log, LogEntry) and _is_other(log, entry):
+                if isinstance(log, LogEntry) and _is_different_log(log, entry):
                     break
                 return entry
-        text = (
-            "there is no such log"
-            if isinstance(log, int)
-            else "the vehicle's logs are others now, list them again"
-        )
-        raise _no_such_log(log_id, text)
+        if isinstance(log, int):
+            raise _no_such_log(log_id, "there is no such log")
+        raise _no_such_log(log_id, "the logs on the vehicle have changed: call list() again")
 
     async def _entries(
-        self, patience_s: float, only: int | None = None, most_unanswered: int | None = None
+        self, idle_timeout_s: float, only: int | None = None, max_unanswered: int | None = None
     ) -> tuple[LogEntry, ...]:
-        """What the vehicle lists. ArduPilot also lists logs that were erased, with nothing in them."""
-        entries = await self._listed_somehow(patience_s, only, most_unanswered)
-        return tuple(entry for entry in entries if entry.size)
-
-    async def _listed_somehow(
-        self, patience_s: float, only: int | None, most_unanswered: int | None
-    ) -> tuple[LogEntry, ...]:
-        autopilot = self._transfers.autopilot
-        if not autopilot.silent_without_logs or not await self._files.is_supported():
-            return await self._listed(patience_s, only, most_unanswered=most_unanswered)
-        with suppress(FileTimeout):
-            return await self._listed(patience_s, only, most_unanswered=SILENT_REQUESTS)
-        logs = await listed_logs(self._files, autopilot.log_directories, patience_s)
-        if logs is None:
-            return await self._listed(patience_s, only, most_unanswered=None)
-        return tuple(_make_entry(number, log.size, log.time_utc) for number, log in enumerate(logs))
-
-    async def _listed(
-        self, patience_s: float, only: int | None, *, most_unanswered: int | None
-    ) -> tuple[LogEntry, ...]:
-        exchange = LogList(
-            self._transfers.system_id,
-            self._transfers.component_id,
-            first_id=self._transfers.autopilot.first_log_id,
-            start=only,
-            end=only,
-            most_unanswered=most_unanswered,
-            round_trip=self._transfers.round_trip,
-            patience_s=patience_s,
-        )
-        entries = await self._transfers.run(exchange)
-        return tuple(_make_entry(each.id, each.size, each.time_utc) for each in entries)
-
-    # --------------------------------------------------------------------------- transfer
-
-    async def _fetch(
-        self,
-        entry: LogEntry,
-        into: Reassembly,
-        patience_s: float,
-        timeout: float | None,
-        on_progress: OnProgress,
-    ) -> None:
-        exchange = LogDownload(
-            self._transfers.system_id,
-            self._transfers.component_id,
-            entry.id,
-            entry.size,
-            into,
-            round_trip=self._transfers.round_trip,
-            patience_s=patience_s,
-            on_progress=on_progress,
-        )
-        missing = lambda: into.missing(entry.size)  # noqa: E731
-        async with self._operation(f"log {entry.id}", timeout, patience_s, missing):
-            await self._transfers.run(exchange)
-
-    @asynccontextmanager
-    async def _operation(
-        self,
-        what: str,
-        timeout: float | None,
-        patience_s: float,
-        missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
-    ) -> AsyncIterator[None]:
-        """Wait for one's turn; tell the vehicle to stop when it ends before its end."""
-        try:
-            with anyio.fail_after(timeout):
-                async with self._lock:
-                    if self._ending is not None:
-                        await self._ending.wait()
-                    try:
-                        yield
-                    except BaseException:
-                        self._end()
-                        raise
-        except OperationTimeout:
-            raise
-        except TimeoutError:
-            raise FileTimeout(f"{what}: not done within {timeout:g} s", missing=missing()) from None
-
-    def _end(self) -> None:
-        """Have the vehicle stop sending at once, and make sure of it in the background before the next operation."""
-        exchange = LogEnd(
-            self._transfers.system_id,
-            self._transfers.component_id,
-            is_sent=True,
-            round_trip=self._transfers.round_trip,
-        )
-        ended = asyncio.Event()
-
-        async def confirm() -> None:
+        """Request the list. ArduPilot also lists erased logs, with a size of 0."""
+        autopilot, listed = self._transfers.autopilot, self._channel.list
+        logs: Sequence[LogMessage | ListedLog] | None = None
+        if autopilot.silent_without_logs and await self._files.is_supported():
             try:
-                with suppress(AerokitError):
-                    await self._transfers.run(exchange)
-            finally:
-                ended.set()
-
-        with suppress(AerokitError):  # when nothing can be sent any more, there is nobody to tell
-            self._transfers.connection.send(exchange.message)
-            self._ending = ended
-            self._transfers.background.start(confirm, "aerokit end of logs")
+                logs = await listed(idle_timeout_s, only, max_unanswered=MAX_UNANSWERED_REQUESTS)
+            except FileTimeout:
+                logs = await listed_logs(self._files, autopilot.log_directories, idle_timeout_s)
+                max_unanswered = None
+        if logs is None:
+            logs = await listed(idle_timeout_s, only, max_unanswered=max_unanswered)
+        return tuple(_entry_of(log) for log in logs if log.size)
 
 
 def _check(log: LogEntry | int) -> None:
     log_id = log.id if isinstance(log, LogEntry) else log
-    if not isinstance(log_id, int) or not 0 <= log_id <= LARGEST_ID:
-        raise InvalidArgument(f"log = {log!r} is not allowed: an entry, or an id from 0 to {LARGEST_ID}")
+    if not isinstance(log_id, int) or not 0 <= log_id <= MAX_LOG_ID:
+        raise InvalidArgument(f"log = {log!r} is not allowed: an entry, or an id from 0 to {MAX_LOG_ID}")
 
 
-def _make_entry(log_id: int, size: int, time_utc: int) -> LogEntry:
-    return LogEntry(log_id, size, datetime.fromtimestamp(time_utc, tz=timezone.utc) if time_utc else None)
+def _entry_of(log: LogMessage | ListedLog) -> LogEntry:
+    time_utc = datetime.fromtimestamp(log.time_utc, tz=timezone.utc) if log.time_utc else None
+    return LogEntry(log.id, log.size, time_utc)
 
 
-def _is_other(before: LogEntry, now: LogEntry) -> bool:
-    """Logs grow while they are written; they do not shrink, and do not become much older."""
+def _is_different_log(before: LogEntry, now: LogEntry) -> bool:
+    # A log grows while it is written; it does not shrink or become much older.
     if now.size < before.size:
         return True
     if before.time_utc is None:
         return False
-    return now.time_utc is None or now.time_utc < before.time_utc - CLOCKS_APART
+    return now.time_utc is None or now.time_utc < before.time_utc - MAX_CLOCK_DIFFERENCE
 
 
 def _no_such_log(log_id: int, text: str) -> FileError:
     return FileError(f"log {log_id}: {text}", path=f"log {log_id}", code=MavFtpErr.FILENOTFOUND)
 
 
-def _mark(entry: LogEntry) -> str:
-    """What tells this log from others, for the name of its beginning on the disk."""
+def _part_suffix(entry: LogEntry) -> str:
+    # Identifies the log in the name of its part file.
     written_at = 0 if entry.time_utc is None else int(entry.time_utc.timestamp())
     return f".log{entry.id}-{written_at}"
+
+
+class ListedLog(NamedTuple):
+    """A line of the list that PX4 writes when its logs are requested; the line number is the log id."""
+
+    id: int
+    time_utc: int
+    size: int
+    path: str
+
+
+async def log_path(
+    files: Files,
+    directories: tuple[str, ...],
+    log: LogEntry,
+    idle_timeout_s: float,
+    *,
+    has_grown: bool = False,
+) -> str | None:
+    """Return the path of a log for MAVFTP; None if the file cannot be identified.
+
+    ArduPilot's log 1 is the lowest of its numbered files such as ``00000001.BIN``. PX4 writes a list of paths to a file
+    when its logs are requested, in the order of the ids. The size must match the entry; it may be larger for a log that
+    is, or (``has_grown``) may have been, still growing.
+    """
+    for directory in directories:
+        try:
+            entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
+        except FileError:
+            continue
+        numbered = {int(match[1]): entry for entry in entries if (match := ARDUPILOT_NAME.fullmatch(entry.name))}
+        if numbered:
+            return _numbered_path(directory, numbered, log, has_grown)
+        if any(entry.is_directory for entry in entries):
+            logs = await _list_in(files, directory, idle_timeout_s)
+            is_same = log.id < len(logs) and logs[log.id].size == log.size
+            return logs[log.id].path if is_same else None
+    return None
+
+
+async def listed_logs(
+    files: Files, directories: tuple[str, ...], idle_timeout_s: float
+) -> tuple[ListedLog, ...] | None:
+    """Return the logs in PX4's list, which it writes on request; None if there are logs but no list."""
+    for directory in directories:
+        try:
+            entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
+        except FileError:
+            continue
+        logs = await _list_in(files, directory, idle_timeout_s)
+        return None if entries and not logs else logs
+    return ()
+
+
+async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
+    """Read the list next to the directory of the logs; an empty tuple if there is none."""
+    root = directory.rpartition("/")[0]
+    try:
+        text = await files.read(f"{root}/{PX4_LIST}", idle_timeout_s=idle_timeout_s)
+    except FileError:
+        return ()
+    matches = [PX4_LINE.fullmatch(line) for line in text.decode("utf-8", "replace").splitlines()]
+    logs = [
+        ListedLog(number, int(match[1]), int(match[2]), f"{directory}/{match[3].partition('/log/')[2]}")
+        for number, match in enumerate(matches)
+        if match is not None
+    ]
+    return tuple(logs) if len(logs) == len(matches) else ()
+
+
+def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, has_grown: bool) -> str | None:
+    number = min(entries) + log.id - 1
+    entry = entries.get(number)
+    if entry is None or entry.size is None:
+        return None
+    may_be_larger = has_grown or number == max(entries)
+    has_size = entry.size >= log.size if may_be_larger else entry.size == log.size
+    return f"{directory}/{entry.name}" if has_size else None

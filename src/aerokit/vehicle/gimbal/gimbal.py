@@ -1,4 +1,4 @@
-"""``vehicle.gimbal``: where a gimbal points, and orders to it."""
+"""``Gimbal`` and ``Gimbals``: the gimbals of one vehicle."""
 
 from __future__ import annotations
 
@@ -9,45 +9,193 @@ import anyio
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
-from aerokit.errors import BusyError, CommandRejected, CommandTimeout
-from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation
+from aerokit.errors import BusyError, CommandRejected, CommandTimeout, InvalidArgument
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GlobalPositionInt
+from aerokit.position import Position
 from aerokit.vehicle.gimbal.control import GimbalControl
-from aerokit.vehicle.gimbal.device import LAST_NUMBER, Frame, information_of
-from aerokit.vehicle.gimbal.discovery import MOST, Hearing
-from aerokit.vehicle.gimbal.places import PlaceActions
-from aerokit.vehicle.gimbal.pointing import PointActions
+from aerokit.vehicle.gimbal.device import MAX_GIMBAL_NUMBER, YawFrame, information_of
+from aerokit.vehicle.gimbal.discovery import MAX_GIMBALS, GimbalRegistry
+from aerokit.vehicle.gimbal.orders import GimbalMixin
+from aerokit.vehicle.gimbal.pointing import (
+    AngleTarget,
+    PointingMixin,
+    attitude_stream,
+    direction_to,
+    wait_until_there,
+)
 from aerokit.vehicle.gimbal.rates import GimbalRates
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.gimbal.device import Device, GimbalInformation
+    from typing_extensions import Self
+
+    from aerokit.connection.bus import Detach
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.gimbal.device import GimbalDevice, GimbalInformation
+    from aerokit.vehicle.gimbal.pointing import Angles
 
 __all__ = ["Gimbal", "Gimbals"]
 
-ANSWER_S = 2.0
-"""How long information may take to come once it was promised."""
+# An older position of another vehicle is not used.
+POSITION_MAX_AGE_S = 5.0
+
+
+class _SystemTracker:
+    """Context manager that tracks the position of another system on this connection."""
+
+    def __init__(self, context: VehicleContext, system_id: int) -> None:
+        self._context, self._system_id = context, system_id
+        self._position: Position | None = None
+        self._received_at = 0.0
+        self._detach: Detach | None = None
+
+    def __enter__(self) -> Self:
+        bus = self._context.session.connection.bus
+        self._detach = bus.attach(GlobalPositionInt, self._on_position, system_id=self._system_id)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._detach is not None:
+            self._detach()
+
+    def direction(self) -> Angles | None:
+        """Direction from the vehicle; None while unknown."""
+        if self._position is None or self._context.session.connection.now() - self._received_at > POSITION_MAX_AGE_S:
+            return None
+        return direction_to(self._context, self._position)
+
+    def _on_position(self, message: GlobalPositionInt) -> None:
+        if message.lat or message.lon:
+            self._position = Position(message.lat * 1e-7, message.lon * 1e-7, altitude_amsl_m=message.alt * 1e-3)
+            self._received_at = self._context.session.connection.now()
 
 
 @checks_arguments
-class Gimbal(ReadOnly, PointActions, PlaceActions):
-    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or the mount of a vehicle
-    that knows no better.
+class RoiMixin(GimbalMixin):
+    """Region of interest: pointing a gimbal at a position or another vehicle. A newer order ends the previous one."""
 
-    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal tells that it is
-    there, ends when another one is given, and is stayed with however the vehicle moves. Where a manager obeys only who
-    is in control, an order outside a block of :meth:`control` claims it, until :meth:`release`.
+    async def look_at(
+        self, target: Position, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
+    ) -> None:
+        """Keep it pointed at a position; returns when it points there.
+
+        Sends MAV_CMD_DO_SET_ROI_LOCATION. Without an altitude, it is taken to be at the vehicle's own. A copter whose
+        gimbal does not pan turns its nose.
+
+        Args:
+            target: the position.
+            wait: False: return when it was accepted.
+            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            timeout: seconds to wait.
+
+        Raises:
+            InvalidArgument: the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager supports it for its first gimbal only. Nothing was sent.
+            ValueUnknownError: the target needs home or the vehicle's altitude, which is unknown. Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: your program had control and lost it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
+        orders = self._orders
+        orders.check_roi()
+        x, y, z, is_relative = self._context.vehicle_position.global_target(target)
+        frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
+        order = orders.begin_order()
+        aim = AngleTarget(
+            lambda: direction_to(self._context, target),
+            tolerance_deg,
+            "the vehicle does not report its position",
+        )
+        with attitude_stream(orders), self._session.streaming("position"):
+            since = self._now()
+            place = {"frame": frame, "x": x, "y": y, "z": z}
+            await orders.send_roi(order, MavCmd.DO_SET_ROI_LOCATION, orders.roi_parameter, **place)
+            if wait:
+                await wait_until_there(orders, order, f"{orders.name}: look_at", aim, since=since, timeout=timeout)
+
+    async def look_at_system(
+        self, system_id: int, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
+    ) -> None:
+        """Keep it pointed at another vehicle (MAV_CMD_DO_SET_ROI_SYSID); returns when it points there.
+
+        The gimbal's manager and this connection both need the position of the other vehicle (GLOBAL_POSITION_INT).
+
+        Args:
+            system_id: its MAVLink system id, 1 to 255.
+            wait: False: return when it was accepted.
+            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            timeout: seconds to wait.
+
+        Raises:
+            InvalidArgument: the system id or the tolerance is out of range. Nothing was sent.
+            NotSupported: the manager does not support it. Nothing was sent.
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: your program had control and lost it.
+            OperationRejected: another order was given meanwhile, or the vehicle rebooted.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
+            HeartbeatTimeout: the vehicle fell silent.
+        """
+        if isinstance(system_id, bool):
+            raise InvalidArgument(f"system_id = {system_id} is not allowed: 1 to 255")
+        check_range("system_id", system_id, 1, 255)
+        check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
+        orders = self._orders
+        orders.check_roi()
+        if not orders.rules.supports_roi_sysid:
+            orders.raise_not_supported("cannot point a gimbal at another system")
+        order = orders.begin_order()
+        with (
+            _SystemTracker(self._context, system_id) as tracker,
+            attitude_stream(orders),
+            self._session.streaming("position"),
+        ):
+            since = self._now()
+            await orders.send_roi(order, MavCmd.DO_SET_ROI_SYSID, system_id, orders.roi_parameter)
+            if wait:
+                aim = AngleTarget(tracker.direction, tolerance_deg, f"the position of system {system_id} is unknown")
+                what = f"{orders.name}: look_at_system({system_id})"
+                await wait_until_there(orders, order, what, aim, since=since, timeout=timeout)
+
+    async def stop_looking(self) -> None:
+        """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). The manager decides where the gimbal turns then.
+
+        Raises:
+            CommandRejected: the manager refused.
+            CommandTimeout: there was no answer.
+            GimbalTaken: your program had control and lost it.
+        """
+        orders = self._orders
+        orders.raise_if_taken()
+        await orders.send_roi(orders.begin_order(), MavCmd.DO_SET_ROI_NONE, orders.roi_parameter)
+
+
+# Time for information to arrive after it was promised.
+INFORMATION_TIMEOUT_S = 2.0
+
+
+@checks_arguments
+class Gimbal(ReadOnly, PointingMixin, RoiMixin):
+    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
+
+    ``vehicle.gimbal`` is the first one, ``vehicle.gimbals`` has all. An order returns when the gimbal reports that it
+    points there, and ends when another one is given. The gimbal keeps the direction while the vehicle moves. If the
+    manager requires control, an order outside a block of :meth:`control` claims it until :meth:`release`.
     """
 
     async def information(self) -> GimbalInformation:
-        """Ask what it is, what it can do, and its limits (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
+        """Request capabilities, limits and identity (GIMBAL_MANAGER_INFORMATION, GIMBAL_DEVICE_INFORMATION).
 
-        From then on angles beyond its limits are refused before anything is sent.
+        Afterwards, angles beyond its limits are refused before anything is sent.
 
         Raises:
-            CommandRejected: there is no gimbal manager, or it does not tell.
+            CommandRejected: there is no gimbal manager, or it does not support the messages.
             CommandTimeout: there was no answer.
         """
         orders = self._orders
@@ -55,7 +203,9 @@ class Gimbal(ReadOnly, PointActions, PlaceActions):
         refused: CommandRejected | CommandTimeout | None = None
         try:
             await orders.ask(GimbalManagerInformation.ID, manager_id)
-            await orders.hear(lambda: orders.device.manager_information, GimbalManagerInformation, ANSWER_S)
+            await orders.wait_for(
+                lambda: orders.device.manager_information, GimbalManagerInformation, INFORMATION_TIMEOUT_S
+            )
         except (CommandRejected, CommandTimeout) as error:
             refused = error
         device = orders.device
@@ -63,23 +213,26 @@ class Gimbal(ReadOnly, PointActions, PlaceActions):
             target = manager_id if device.number or not device.component_id else device.component_id
             try:
                 await orders.ask(GimbalDeviceInformation.ID, target, attempts=1)
-                await orders.hear(lambda: orders.device.device_information, GimbalDeviceInformation, ANSWER_S)
+                await orders.wait_for(
+                    lambda: orders.device.device_information, GimbalDeviceInformation, INFORMATION_TIMEOUT_S
+                )
             except (CommandRejected, CommandTimeout):
-                pass  # an autopilot has no such message of a gimbal that is a pair of servos
+                pass  # Autopilots do not support this message for servo gimbals.
         device = orders.device
-        told = (device.manager_information, device.device_information)
-        if told == (None, None):
+        messages = (device.manager_information, device.device_information)
+        if messages == (None, None):
             raise refused or CommandTimeout(
-                f"{orders.name}: information was promised and did not come; {self._talk.describe_link()}"
+                f"{orders.name}: it accepted the request for information, but sent none;"
+                f" {self._session.describe_link()}"
             )
         device.checks_limits = True
-        return information_of(device.device_id, orders.manager_id, *told)
+        return information_of(device.device_id, orders.manager_id, *messages)
 
     def control(self, *, secondary: bool = False) -> GimbalControl:
-        """Be in control of it for the time of an ``async with`` block; see :class:`GimbalControl`.
+        """Control the gimbal for the duration of an ``async with`` block; see :class:`GimbalControl`.
 
         Args:
-            secondary: take the secondary control, beside whoever has the primary.
+            secondary: take secondary control, alongside the station that has primary control.
         """
         return GimbalControl(self._orders, not secondary)
 
@@ -88,106 +241,108 @@ class Gimbal(ReadOnly, PointActions, PlaceActions):
         pitch_deg_s: float = 0.0,
         yaw_deg_s: float = 0.0,
         *,
-        frame: Frame = "vehicle",
+        frame: YawFrame = "vehicle",
         rate_hz: float = 10.0,
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> GimbalRates:
-        """Turn it at rates for the time of an ``async with`` block that feeds them; see :class:`GimbalRates`.
+        """Turn it at rates for the duration of an ``async with`` block that feeds them; see :class:`GimbalRates`.
 
         Args:
             pitch_deg_s: the first rate in degrees per second, −720 to 720; positive is up.
             yaw_deg_s: the first rate in degrees per second, −720 to 720; positive is to the right.
-            frame: whether its yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``) meanwhile.
+            frame: whether the yaw keeps to north (``"earth"``) or turns with the vehicle (``"vehicle"``).
             rate_hz: how often the latest rates are sent, 2 to 100.
-            valid_for_s: how long rates may be resent without new ones.
-            max_lag_s: how late the event loop may be.
+            valid_for_s: stop if no new rates are set for this time.
+            max_lag_s: stop if the event loop is blocked for this time.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
         """
         is_from_north = frame == "earth"
-        return GimbalRates(
-            self._orders, (pitch_deg_s, yaw_deg_s), is_from_north, rate_hz, valid_for_s, max_lag_s
-        )
+        return GimbalRates(self._orders, (pitch_deg_s, yaw_deg_s), is_from_north, rate_hz, valid_for_s, max_lag_s)
 
 
-TO_ALL = 0
-"""The component id of a question to everybody."""
+# Component id that addresses all components.
+BROADCAST_COMPONENT = 0
 
 
 @checks_arguments
 class Gimbals:
-    """The gimbals that were heard of: ``vehicle.gimbals[154]``; ``for gimbal in vehicle.gimbals``.
+    """The discovered gimbals: ``vehicle.gimbals[154]``; ``for gimbal in vehicle.gimbals``.
 
-    A gimbal is known by its gimbal device id: its component id (154, 171 to 175), or 1 to 6 behind the autopilot.
+    A gimbal is identified by its gimbal device id: its component id (154, 171 to 175), or 1 to 6 if attached to the
+    autopilot.
     """
 
-    def __init__(self, bridge: Bridge) -> None:
-        self._bridge = bridge
-        self._hearing = Hearing(bridge)
-        self._made: dict[tuple[int, int], Gimbal] = {}
-        self.first: Gimbal = Gimbal(bridge, self._hearing, None)
-        """The first one, whichever that is: one behind the autopilot goes before those with ids of their own."""
+    def __init__(self, context: VehicleContext) -> None:
+        self._context = context
+        self._registry = GimbalRegistry(context)
+        self._gimbals: dict[tuple[int, int], Gimbal] = {}
+        self.first: Gimbal = Gimbal(context, self._registry, None)
+        """The first gimbal; one attached to the autopilot takes precedence over those with their own component id."""
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """The gimbal device ids of those that were heard of, the first one first."""
-        return tuple(each.device_id for each in self._sorted())
+        """Gimbal device ids of the discovered gimbals, the first gimbal first."""
+        return tuple(device.device_id for device in self._sorted())
 
     def get(self, device_id: int) -> Gimbal:
-        """The gimbal of this id, whether it was heard of or not.
+        """Return the gimbal of this id, whether or not it has been discovered.
 
         Args:
-            device_id: 1 to 6 behind the autopilot, or a component id up to 255.
+            device_id: 1 to 6 if attached to the autopilot, or a component id up to 255.
 
         Raises:
-            InvalidArgument: there is no such id.
-            BusyError: too many gimbals were heard of already.
+            InvalidArgument: the id is out of range.
+            BusyError: the maximum number of gimbals is reached.
         """
         check_range("device_id", device_id, 1, 255)
-        device = self._hearing.find(device_id)
+        device = self._registry.find(device_id)
         if device is None:
-            is_numbered = device_id <= LAST_NUMBER
-            key = (self._bridge.talk.component_id, device_id) if is_numbered else (device_id, 0)
-            device = self._hearing.device(*key)
+            is_numbered = device_id <= MAX_GIMBAL_NUMBER
+            key = (self._context.session.component_id, device_id) if is_numbered else (device_id, 0)
+            device = self._registry.device(*key)
         if device is None:
-            raise BusyError(f"{MOST} gimbals were heard of already: {', '.join(map(str, self.ids))}")
+            raise BusyError(f"there are {MAX_GIMBALS} gimbals already: {', '.join(map(str, self.ids))}")
         return self._gimbal(device)
 
     async def discover(self, *, timeout: float = 2.0) -> tuple[int, ...]:
-        """Ask everybody on the vehicle which gimbals they manage (GIMBAL_MANAGER_INFORMATION); :attr:`ids` afterwards.
+        """Ask all components which gimbals they manage (GIMBAL_MANAGER_INFORMATION); return :attr:`ids` afterwards.
 
         Args:
-            timeout: seconds in which they have to answer; this takes so long.
+            timeout: seconds to wait for answers; the call always takes this time.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
         """
-        talk = self._bridge.talk
-        until = talk.connection.now() + timeout
+        session = self._context.session
+        until = session.connection.now() + timeout
         with anyio.move_on_after(timeout):
-            with suppress(CommandRejected, CommandTimeout):  # the autopilot's answer; others answer besides
-                await talk.commands.send_long(
-                    MavCmd.REQUEST_MESSAGE, GimbalManagerInformation.ID, component_id=TO_ALL, attempts=2
+            with suppress(CommandRejected, CommandTimeout):  # Other components than the autopilot may still answer.
+                await session.commands.send_long(
+                    MavCmd.REQUEST_MESSAGE,
+                    GimbalManagerInformation.ID,
+                    component_id=BROADCAST_COMPONENT,
+                    attempts=2,
                 )
-        await anyio.sleep(max(0.0, until - talk.connection.now()))
-        talk.connection.raise_if_ended()
+        await anyio.sleep(max(0.0, until - session.connection.now()))
+        session.connection.raise_if_ended()
         return self.ids
 
     def __getitem__(self, device_id: int) -> Gimbal:
         return self.get(device_id)
 
     def __iter__(self) -> Iterator[Gimbal]:
-        return iter([self._gimbal(each) for each in self._sorted()])
+        return iter([self._gimbal(device) for device in self._sorted()])
 
-    def _sorted(self) -> list[Device]:
-        return sorted(self._hearing.devices.values(), key=self._hearing.order)
+    def _sorted(self) -> list[GimbalDevice]:
+        return sorted(self._registry.devices.values(), key=self._registry.sort_key)
 
-    def _gimbal(self, device: Device) -> Gimbal:
-        if device.key not in self._made:
-            self._made[device.key] = Gimbal(self._bridge, self._hearing, device)
-        return self._made[device.key]
+    def _gimbal(self, device: GimbalDevice) -> Gimbal:
+        if device.key not in self._gimbals:
+            self._gimbals[device.key] = Gimbal(self._context, self._registry, device)
+        return self._gimbals[device.key]
 
     def __len__(self) -> int:
-        return len(self._hearing.devices)
+        return len(self._registry.devices)

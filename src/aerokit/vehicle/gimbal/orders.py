@@ -1,4 +1,4 @@
-"""`GimbalOrders`: what orders to one gimbal are sent as, and to whom: its manager, or the mount of an older vehicle."""
+"""`GimbalOrders`: sends orders to the manager of one gimbal, or to the mount of older firmware."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from aerokit._internal.wording import shown
+from aerokit._internal.formatting import short_repr
 from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
@@ -18,130 +18,106 @@ if TYPE_CHECKING:
 
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
-    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.gimbal.device import Claims, Device, GimbalControllers
-    from aerokit.vehicle.gimbal.discovery import Hearing
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.gimbal.device import GimbalControllers, GimbalDevice
+    from aerokit.vehicle.gimbal.discovery import GimbalRegistry
+    from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.state.equipment import GimbalAttitude
 
 NAN = math.nan
-
 PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE
-
 MOUNT = MavCmd.DO_MOUNT_CONTROL
 
+# Roll and pitch relative to the horizon, yaw relative to the nose of the vehicle.
 LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
-"""Roll and pitch from the horizon, yaw from the vehicle's nose."""
 
+# The same with yaw relative to north.
 LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
-"""Yaw from north."""
 
 RELEASE, UNCHANGED = -3, -1
-
-FOUND_S = 1.0
-"""How long what was promised may take to come."""
-
-BY_THE_STANDARD = GimbalRules()
+MANAGER_TIMEOUT_S = 1.0
+STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Of one gimbal, or of the first one. They end a wait for the one before; control is claimed when it is denied."""
+    """Orders to one gimbal, or to the first one. A new order ends the wait for the previous one."""
 
-    def __init__(self, bridge: Bridge, hearing: Hearing, device: Device | None) -> None:
-        self.bridge: Bridge = bridge
-        self.talk: Talk = bridge.talk
-        self._hearing, self._device = hearing, device
+    def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
+        self.context: VehicleContext = context
+        self.session: VehicleSession = context.session
+        self.registry: GimbalRegistry = registry
+        self._device = device
+        # Component id of the manager whose control was claimed outside of a control block.
         self._claimed: int | None = None
-        """Whose control was claimed without a block: a component id."""
-
-    # ------------------------------------------------------------------------- who is meant
 
     @property
-    def device(self) -> Device:
-        """The one that is meant now."""
-        return self._hearing.first if self._device is None else self._device
+    def device(self) -> GimbalDevice:
+        return self.registry.first if self._device is None else self._device
 
     @property
-    def shown(self) -> Device:
-        """Whose cells programs see of it; for the first one they are those of whichever is the first."""
-        return self._hearing.nobody if self._device is None else self._device
+    def public_device(self) -> GimbalDevice:
+        """The device whose cells the program sees: for the first gimbal it stays the same object."""
+        return self.registry.placeholder if self._device is None else self._device
 
     @property
-    def told(self) -> Device:
-        """Who tells where it points: itself, or the mount of old while no gimbal tells at all."""
-        is_mount = self._device is None and self._hearing.telling is None
-        return self._hearing.nobody if is_mount else self.device
+    def attitude_source(self) -> GimbalDevice:
+        """The device that reports the attitude: the placeholder while only an old mount reports one."""
+        is_mount = self._device is None and self.registry.reporting is None
+        return self.registry.placeholder if is_mount else self.device
 
     @property
     def manager_id(self) -> int:
-        """The component that the orders go to; the autopilot's while nobody has said that it is the manager."""
+        """Component id that orders are sent to; the autopilot's until a manager is known."""
         manager_id = self.device.manager_id
-        return self.talk.component_id if manager_id is None else manager_id
-
-    def silent_for_s(self, component_id: int) -> float:
-        """Seconds in which nothing was heard of a component; inf: it was never heard."""
-        return self._hearing.silent_for_s(component_id)
+        return self.session.component_id if manager_id is None else manager_id
 
     @property
-    def parameter(self) -> int:
-        """The gimbal device id in commands; an autopilot's first one needs none."""
-        if self._device is None and self.manager_id == self.talk.component_id:
+    def gimbal_id_param(self) -> int:
+        """Gimbal device id for commands; 0 for the first gimbal of an autopilot."""
+        if self._device is None and self.manager_id == self.session.component_id:
             return 0
         return self.device.device_id
 
     @property
     def rules(self) -> GimbalRules:
-        """What its manager makes of the protocol."""
-        is_autopilot = self.manager_id == self.talk.component_id
-        return self.talk.autopilot.gimbals if is_autopilot else BY_THE_STANDARD
+        is_autopilot = self.manager_id == self.session.component_id
+        return self.session.autopilot.gimbals if is_autopilot else STANDARD_RULES
 
     @property
     def roi_parameter(self) -> int:
-        """The gimbal device id in commands about a region of interest."""
-        return self.parameter if self.rules.looks_with_each else 0
+        return self.gimbal_id_param if self.rules.roi_per_gimbal else 0
 
-    def check_looks(self) -> None:
-        """Raise what says so before anything is sent: not this gimbal, or control was lost."""
-        if not self.rules.looks_with_each and self.parameter not in (0, 1):
-            self.not_supported("looks at places and systems with its first gimbal only")
+    def check_roi(self) -> None:
+        """Raise unless region-of-interest commands can be sent to this gimbal now."""
+        if not self.rules.roi_per_gimbal and self.gimbal_id_param not in (0, 1):
+            self.raise_not_supported("supports a region of interest for its first gimbal only")
         self.raise_if_taken()
 
     @property
-    def us(self) -> tuple[int, int]:
-        """Our ids, as who is in control."""
-        return self.talk.connection.source_system, self.talk.connection.source_component
+    def own_ids(self) -> tuple[int, int]:
+        return self.session.connection.source_system, self.session.connection.source_component
 
     @property
     def name(self) -> str:
-        """For error texts."""
         return f"gimbal {self.device.device_id}" if self.device.component_id else "the gimbal"
 
-    @property
-    def claims(self) -> Claims:
-        """What blocks of this program want or have control of, of all gimbals of the vehicle."""
-        return self._hearing.claims
-
-    # ----------------------------------------------------------------------------- sending
-
-    async def give(self, turn: Order | None, command: int, *params: float, is_sent: bool = False) -> None:
-        """One command to the manager, of an order, or on its own."""
-        with self.bridge.arbiter.aside(turn) as order:
-            await self.bridge.sender.give(
-                order,
-                self.talk.commands.send_long,
+    async def send(self, order: Order | None, command: int, *params: float, is_sent: bool = False) -> None:
+        with self.context.arbiter.auxiliary_order(order) as sent_order:
+            await self.context.sender.run_command(
+                sent_order,
+                self.session.commands.send_long,
                 command,
                 *params,
                 component_id=self.manager_id,
                 is_sent=is_sent,
             )
 
-    def begin(self) -> Order:
-        """A new order: those before end."""
-        return self.bridge.arbiter.of_device(self.device.topic)
+    def begin_order(self) -> Order:
+        return self.context.arbiter.of_device(self.device.topic)
 
-    async def insist(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
-        """Send a command, and claim control if that is denied, now or to somebody who did not wait for the answer."""
+    async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
+        """Send a command; if it is denied for lack of control, claim control and send it again."""
         self.raise_if_taken()
         self.claim_if_denied(command)
         try:
@@ -152,28 +128,28 @@ class GimbalOrders:
                 raise
             await send()
 
-    async def manage(self, turn: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
-        """PITCHYAW, in degrees; False for a manager that does not know it. Control is claimed if that is denied."""
-        if self.talk.commands.is_unknown(PITCHYAW, self.manager_id):
+    async def send_pitch_yaw(self, order: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
+        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW, in degrees; return False if the manager does not support it."""
+        if self.session.commands.is_unknown(PITCHYAW, self.manager_id):
             return False
         pitch_rate, yaw_rate = rates or (NAN, NAN)
-        params = (pitch, yaw, pitch_rate, yaw_rate, flags, 0, self.parameter)
+        params = (pitch, yaw, pitch_rate, yaw_rate, flags, 0, self.gimbal_id_param)
         try:
-            await self.insist(PITCHYAW, lambda: self.give(turn, PITCHYAW, *params))
+            await self.send_claiming_control(PITCHYAW, lambda: self.send(order, PITCHYAW, *params))
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
             return False
         return True
 
-    async def look(self, turn: Order, command: int, *params: float, **place: Any) -> None:
-        """A command about a region of interest, as COMMAND_INT if it has a place."""
+    async def send_roi(self, order: Order, command: int, *params: float, **place: Any) -> None:
+        """Send a region-of-interest command, as COMMAND_INT if it has a position."""
 
         async def send() -> None:
-            with self.bridge.arbiter.aside(turn) as order:
-                commands = self.talk.commands
-                await self.bridge.sender.give(
-                    order,
+            with self.context.arbiter.auxiliary_order(order) as sent_order:
+                commands = self.session.commands
+                await self.context.sender.run_command(
+                    sent_order,
                     commands.send_int if place else commands.send_long,
                     command,
                     *params,
@@ -181,155 +157,150 @@ class GimbalOrders:
                     **place,
                 )
 
-        if self.rules.looking_needs_control:
-            await self.insist(command, send)
+        if self.rules.roi_needs_control:
+            await self.send_claiming_control(command, send)
         else:
             await send()
 
-    async def mount(self, turn: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
-        """DO_MOUNT_CONTROL; False for firmware that is older, and was told the mode by a message without an answer."""
-        if not self.talk.commands.is_unknown(MOUNT, self.manager_id):
+    async def send_mount_mode(self, order: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
+        """Send DO_MOUNT_CONTROL; return False for older firmware, which gets the mode by MOUNT_CONFIGURE instead."""
+        if not self.session.commands.is_unknown(MOUNT, self.manager_id):
             try:
-                await self.give(turn, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
+                await self.send(order, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise
             else:
                 return True
-        if not turn.is_newest:
+        if not order.is_newest:
             return True
-        self.talk.send(MountConfigure(self.talk.system_id, self.manager_id, mode, 1, 1, 1))
+        self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, 1, 1, 1))
         return False
 
-    async def mount_to(self, turn: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
-        """The mount's angles, whose yaw is from the nose: right at the moment of the order."""
-        heading = self.talk.telemetry.attitude.latest
+    async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
+        """Send mount angles. The mount's yaw is relative to the nose, so it is right only at the time of sending."""
+        heading = self.session.telemetry.attitude.latest
         nose = 0.0 if heading is None else heading.yaw_deg
         turned = yaw if from_nose else math.remainder(yaw - nose, 360.0)
-        if not await self.mount(turn, MavMountMode.MAVLINK_TARGETING, pitch, roll, turned):
+        if not await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, turned):
             north = yaw + nose if from_nose else yaw
-            a, b, c = (round(each * 100) for each in (pitch, roll, north))
-            self.talk.send(MountControl(self.talk.system_id, self.manager_id, a, b, c, 0))
+            a, b, c = (round(angle * 100) for angle in (pitch, roll, north))
+            self.session.send(MountControl(self.session.system_id, self.manager_id, a, b, c, 0))
 
     def ask_in_background(self, message_id: int) -> None:
-        """Have the manager send a message once; that it may not is nobody's business."""
+        """Request a message from the manager once; errors are ignored."""
 
         async def ask() -> None:
             with suppress(AerokitError):
                 await self.ask(message_id, self.manager_id)
 
-        self.talk.background.start(ask, "aerokit gimbal")
+        self.session.background.start(ask, "aerokit gimbal")
 
     async def ask(self, message_id: int, component_id: int, *, attempts: int = 3) -> None:
-        """REQUEST_MESSAGE: a question, asked again until it is answered.
-
-        Raises:
-            CommandRejected: it has no such message, or not now.
-            CommandTimeout: there was no answer.
-        """
-        await self.talk.commands.send_long(
+        await self.session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
 
-    async def hear(self, found: Callable[[], object], kind: type[Message], within_s: float) -> None:
-        """Wait until something has come that was promised in messages of a kind, for so long at most."""
+    async def wait_for(self, found: Callable[[], object], kind: type[Message], within_s: float) -> None:
+        """Wait until ``found()`` is not None, checked at each message of a type, for ``within_s`` seconds at most."""
         done = asyncio.Event()
 
-        def look(_: Message) -> None:
+        def check(_: Message) -> None:
             if found() is not None:
                 done.set()
 
         if found() is not None:
             return
-        bus = self.talk.connection.bus
-        detach = bus.attach(kind, look, system_id=self.talk.system_id)
-        too_late = asyncio.get_running_loop().call_later(within_s, done.set)
+        bus = self.session.connection.bus
+        detach = bus.attach(kind, check, system_id=self.session.system_id)
+        timer = asyncio.get_running_loop().call_later(within_s, done.set)
         try:
             await done.wait()
         finally:
-            too_late.cancel()
+            timer.cancel()
             detach()
 
     async def find_manager(self) -> int:
-        """Who manages it: what was told, or, of a gimbal with an id of its own, itself if it says so when asked."""
+        """Return the manager, after asking the device whether it manages itself if no manager is known."""
         device = self.device
         if device.manager_id is None and device.component_id:
             with suppress(CommandRejected, CommandTimeout):
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
-                await self.hear(lambda: device.manager_id, GimbalManagerInformation, FOUND_S)
+                await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
         return self.manager_id
 
-    # ----------------------------------------------------------------------------- control
-
-    def configure(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        """The parameters that claim control, or let it go: ids in figures, because PX4's "whoever asks" is PX4."""
-        pair = (RELEASE, RELEASE) if release else self.us
+    def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
+        """Parameters that claim or release control. Own ids are explicit: PX4 takes -2 ("sender") for itself."""
+        pair = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         return (
             *(pair if is_primary else unchanged),
             *(unchanged if is_primary else pair),
             0,
             0,
-            self.parameter,
+            self.gimbal_id_param,
         )
 
     def claim_if_denied(self, command: int) -> bool:
-        """Say that we are in control, if the last answer denied us something, whoever waited for it."""
-        commands, manager_id = self.talk.commands, self.manager_id
-        if self.device.controls or commands.last_result(command, manager_id) != MavResult.DENIED:
+        """Claim control if the manager has denied this command for lack of it; return True if so."""
+        commands, manager_id = self.session.commands, self.manager_id
+        if self.device.control_blocks or commands.last_result(command, manager_id) != MavResult.DENIED:
             return False
         commands.forget_result(command, manager_id)
-        params = self.us if self.parameter == 0 else (*self.us, UNCHANGED, UNCHANGED, 0, 0, self.parameter)
+        params = (
+            self.own_ids
+            if self.gimbal_id_param == 0
+            else (*self.own_ids, UNCHANGED, UNCHANGED, 0, 0, self.gimbal_id_param)
+        )
         commands.send_unconfirmed(CONFIGURE, *params, component_id=manager_id)
         self._claimed = manager_id
         return True
 
-    async def let_go(self, turn: Order) -> None:
-        """What was claimed without a block."""
+    async def release_control(self, order: Order) -> None:
+        """Release control that was claimed outside of a control block."""
         if self._claimed == self.manager_id:
             self._claimed = None
             params = (
-                (RELEASE, RELEASE) if self.parameter == 0 else self.configure(is_primary=True, release=True)
+                (RELEASE, RELEASE) if self.gimbal_id_param == 0 else self.control_params(is_primary=True, release=True)
             )
-            await self.give(turn, CONFIGURE, *params)
+            await self.send(order, CONFIGURE, *params)
 
     def raise_if_taken(self) -> None:
-        """Nothing is ordered by who had control in a block that is still open, and has lost it."""
-        controls = self.device.controls.values()
-        if not any(each.is_held for each in controls):
-            for each in controls:
-                each.raise_if_taken()
+        """Raise GimbalTaken if an open control block has lost control and no other one has it."""
+        blocks = self.device.control_blocks.values()
+        if not any(block.is_held for block in blocks):
+            for block in blocks:
+                block.raise_if_taken()
 
     @property
     def is_taken(self) -> bool:
-        """Whether a block that is still open has lost control, and no other one has it."""
-        controls = self.device.controls.values()
-        return bool(controls) and not any(each.is_held for each in controls)
+        """True if :meth:`raise_if_taken` would raise."""
+        blocks = self.device.control_blocks.values()
+        return bool(blocks) and not any(block.is_held for block in blocks)
 
-    def not_supported(self, what: str) -> NoReturn:
-        """What the manager does not do, told before anything is sent."""
-        autopilot = self.talk.autopilot
-        who = autopilot.firmware if self.manager_id == self.talk.component_id else shown(self.manager_id)
-        raise NotSupported(f"{self.name}: {who} {what}; nothing was sent")
+    def raise_not_supported(self, what: str) -> NoReturn:
+        autopilot = self.session.autopilot
+        manager = autopilot.firmware if self.manager_id == self.session.component_id else short_repr(self.manager_id)
+        raise NotSupported(f"{self.name}: {manager} {what}; nothing was sent")
 
 
-class GimbalPart:
-    """A part of :class:`Gimbal`: its state, and some of its orders."""
+class GimbalMixin:
+    """Base class of the mixins of :class:`Gimbal`."""
 
-    def __init__(self, bridge: Bridge, hearing: Hearing, device: Device | None) -> None:
-        self._orders = GimbalOrders(bridge, hearing, device)
-        self._bridge, self._talk = bridge, bridge.talk
-        shown = self._orders.shown
+    def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
+        self._orders = GimbalOrders(context, registry, device)
+        self._context, self._session = context, context.session
+        shown = self._orders.public_device
         self.attitude: StateCell[GimbalAttitude] = shown.attitude
-        """Where it points (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION,
-        MOUNT_STATUS). The autopilot is asked for it while somebody waits, follows or observes; reading asks nothing."""
+        """Attitude (GIMBAL_DEVICE_ATTITUDE_STATUS of any component of the vehicle, MOUNT_ORIENTATION, MOUNT_STATUS). It
+        is requested from the autopilot while your program watches this cell; reading it requests nothing."""
         self.controllers: StateCell[GimbalControllers] = shown.controllers
-        """Who is in control of it, as its manager tells by itself (GIMBAL_MANAGER_STATUS)."""
+        """Stations in control, as reported by the manager (GIMBAL_MANAGER_STATUS)."""
 
     @property
     def device_id(self) -> int:
-        """Its gimbal device id: 1 to 6 behind its manager, or its component id; 0 while none is heard of."""
+        """Gimbal device id: 1 to 6 if attached to its manager, or the component id; 0 until one is discovered."""
         return self._orders.device.device_id
 
     def _now(self) -> float:
-        return self._talk.connection.now()
+        return self._session.connection.now()

@@ -1,4 +1,4 @@
-"""Turning a gimbal to angles, to its neutral position, and away."""
+"""``PointingMixin``: pointing a gimbal at angles, its neutral and its retracted position."""
 
 from __future__ import annotations
 
@@ -11,184 +11,174 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import GimbalDeviceFlags, MavMountMode
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
-from aerokit.vehicle.commanding.order import OVERRULED
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, OLD_POSITION_S, TICK_S, Arrivals
-from aerokit.vehicle.gimbal.device import Frame, information_of
-from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, GimbalPart
+from aerokit.vehicle.commanding.order import SUPERSEDED
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, POLL_INTERVAL_S, POSITION_MAX_AGE_S, ChangeSignal
+from aerokit.vehicle.gimbal.device import YawFrame, information_of
+from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, GimbalMixin
 from aerokit.vehicle.session.session import ACTION_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from aerokit.position import Position
-    from aerokit.vehicle.commanding.context import Bridge
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order
-    from aerokit.vehicle.gimbal.device import Device
+    from aerokit.vehicle.gimbal.device import GimbalDevice
     from aerokit.vehicle.gimbal.orders import GimbalOrders
 
+# A gimbal that turns by less than this in this time stands still; attitudes arrive about five times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
-"""What turns by less in so long is taken to stand still: attitudes come five times a second or so."""
 
-Wanted = tuple[float | None, float | None, float | None, float | None]
-"""Pitch, roll, yaw from north, yaw from the nose; None: any."""
+# Pitch, roll, yaw from north, yaw from the nose; None: any.
+Angles = tuple[float | None, float | None, float | None, float | None]
 
 
-class Aim:
-    """Whether it points somewhere, within a tolerance; ``where`` is asked each time, None: that is not known."""
+class AngleTarget:
+    """Angles to reach within a tolerance; ``where`` returns them on each call, None while they are unknown."""
 
-    def __init__(self, where: Callable[[], Wanted | None], tolerance_deg: float, unknown: str = "") -> None:
-        self._where, self._tolerance_deg, self._unknown = where, tolerance_deg, unknown
+    def __init__(self, where: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
+        self._position, self._tolerance_deg, self._unknown = where, tolerance_deg, unknown
 
-    def __call__(self, device: Device) -> bool:
-        """Whether it is there."""
+    def is_reached(self, device: GimbalDevice) -> bool:
         attitude = device.attitude.value
-        wanted = self._where()
-        told = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
+        wanted = self._position()
+        actual = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
         return wanted is not None and all(
-            want is None
-            or (have is not None and abs(math.remainder(have - want, 360)) <= self._tolerance_deg)
-            for want, have in zip(wanted, told, strict=True)
+            want is None or (have is not None and abs(math.remainder(have - want, 360)) <= self._tolerance_deg)
+            for want, have in zip(wanted, actual, strict=True)
         )
 
     def describe(self) -> str:
-        """What was wanted."""
-        wanted = self._where()
-        return f"wanted was {_angles(wanted)}" if wanted is not None else self._unknown
+        wanted = self._position()
+        return f"expected {_angles(wanted)}" if wanted is not None else self._unknown
 
 
-class Rest:
-    """Whether it does what a flag says (retracted, neutral), or looks straight ahead if that will do, and stands."""
+class RestTarget:
+    """A position reported by a flag (retracted, neutral), or straight ahead, in which the gimbal must stand still."""
 
     def __init__(self, flag: int, *, or_ahead: bool) -> None:
         self._flag, self._or_ahead = flag, or_ahead
         self._still_from: tuple[float, tuple[float, ...]] | None = None
 
-    def __call__(self, device: Device) -> bool:
-        """Whether it is there."""
+    def is_reached(self, device: GimbalDevice) -> bool:
         attitude = device.attitude.value
         at = device.attitude.updated_at
-        angles = tuple(
-            each or 0.0 for each in (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_from_nose_deg)
-        )
+        angles = tuple(angle or 0.0 for angle in (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_from_nose_deg))
         before = self._still_from
         if before is None or any(
-            abs(math.remainder(one - other, 360)) > STILL_DEG
-            for one, other in zip(angles, before[1], strict=True)
+            abs(math.remainder(new - old, 360)) > STILL_DEG for new, old in zip(angles, before[1], strict=True)
         ):
             self._still_from = (at, angles)
             return False
-        is_ahead = self._or_ahead and all(abs(each) <= 2 * STILL_DEG for each in (angles[0], angles[2]))
+        is_ahead = self._or_ahead and all(abs(angle) <= 2 * STILL_DEG for angle in (angles[0], angles[2]))
         return at - before[0] >= STILL_S and bool(device.flags & self._flag or is_ahead)
 
     def describe(self) -> str:
-        """What was wanted."""
-        return "and has not told that it rests there"
+        return "it has not reported that it rests there"
 
 
 @contextmanager
-def told_often(orders: GimbalOrders) -> Iterator[None]:
-    """Have the autopilot tell where its gimbals point; one with an id of its own does so by itself."""
-    if orders.device.component_id not in (0, orders.talk.component_id):
+def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
+    """Stream the attitude from the autopilot; gimbals with their own component id send it by themselves."""
+    if orders.device.component_id not in (0, orders.session.component_id):
         yield
         return
-    release = orders.talk.rates.want(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True)
+    release = orders.session.rates.request(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True)
     try:
         yield
     finally:
         release()
 
 
-async def arrive(
-    orders: GimbalOrders, turn: Order, what: str, is_there: Aim | Rest, *, since: float, timeout: float
+async def wait_until_there(
+    orders: GimbalOrders,
+    order: Order,
+    what: str,
+    target: AngleTarget | RestTarget,
+    *,
+    since: float,
+    timeout: float,
 ) -> None:
-    """Return when it is there, told by an attitude that came after ``since``.
-
-    Raises:
-        OperationRejected: another order was given, or the vehicle has rebooted.
-        GimbalTaken: control was lost in the block that has it.
-        HeartbeatTimeout: the vehicle is silent.
-        OperationTimeout: it was not there in time; the text says where it points.
-    """
-    talk, seen = orders.talk, since
-    until, boots = talk.connection.now() + timeout, orders.shown.boots
-    cells = (orders.shown.attitude, orders.told.attitude, orders.device.controllers)
-    with orders.device.in_use(), Arrivals(talk, *cells, every_arrival=True) as news:
+    """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
+    session, seen = orders.session, since
+    until, reboots = session.connection.now() + timeout, orders.public_device.reboots
+    cells = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
+    with orders.device.in_use(), ChangeSignal(session, *cells, every_arrival=True) as changes:
         while True:
-            told = orders.told
-            talk.connection.raise_if_ended()
-            if not turn.is_newest or orders.shown.boots != boots:
-                reason = OVERRULED if orders.shown.boots == boots else "the vehicle rebooted"
+            source = orders.attitude_source
+            session.connection.raise_if_ended()
+            if not order.is_newest or orders.public_device.reboots != reboots:
+                reason = SUPERSEDED if orders.public_device.reboots == reboots else "the vehicle rebooted"
                 raise OperationRejected(f"{what}: {reason}")
             orders.raise_if_taken()
-            if told.attitude.is_known and told.attitude.updated_at > seen:
-                seen = told.attitude.updated_at
-                if is_there(told):
+            if source.attitude.is_known and source.attitude.updated_at > seen:
+                seen = source.attitude.updated_at
+                if target.is_reached(source):
                     return
-            if talk.watch.silent_for_s > LONGEST_SILENCE_S:
-                raise HeartbeatTimeout(f"{what}: {talk.describe_link()}")
-            left = until - talk.connection.now()
+            if session.watch.silent_for_s > MAX_SILENCE_S:
+                raise HeartbeatTimeout(f"{what}: {session.describe_link()}")
+            left = until - session.connection.now()
             if left <= 0:
                 raise OperationTimeout(
-                    f"{what}: not there within {timeout:g} s: {_where(orders, since)}, {is_there.describe()};"
-                    f" {talk.describe_link()}"
+                    f"{what}: not reached within {timeout:g} s: {_position(orders, since)}, {target.describe()};"
+                    f" {session.describe_link()}"
                 )
-            await news.next(min(TICK_S, left))
+            await changes.next(min(POLL_INTERVAL_S, left))
 
 
-def _where(orders: GimbalOrders, since: float) -> str:
-    """Where it points, what it can do, what fails."""
-    told, device = orders.told, orders.device
-    if not told.attitude.is_known:
-        return f"it does not tell where it points (no {told.attitude.waits_for})"
-    cell = told.attitude
+def _position(orders: GimbalOrders, since: float) -> str:
+    source, device = orders.attitude_source, orders.device
+    cell = source.attitude
+    if not cell.is_known:
+        return f"it does not report its attitude (no {cell.waits_for})"
     attitude = cell.value
     angles = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
     text = f"it points to {_angles(angles)}"
     if cell.updated_at <= since:
-        text += f", told {cell.age:.1f} s ago and not since the order"
+        text += f", reported {cell.age:.1f} s ago, before the order"
     if device.failures:
-        text += f", it says: {device.describe_failures()}"
+        text += f", it reports {device.describe_failures()}"
     if device.manager_information is not None:
         limits = information_of(device.device_id, orders.manager_id, device.manager_information, None)
         text += f", its limits are pitch {_range(limits.pitch_deg)}, yaw {_range(limits.yaw_deg)}"
     return text
 
 
-def _angles(angles: Wanted) -> str:
+def _angles(angles: Angles) -> str:
     names = ("pitch", "roll", "yaw from north", "yaw from the nose")
-    told = [f"{name} {each:.1f}" for name, each in zip(names, angles, strict=True) if each is not None]
-    return ", ".join(told) or "nowhere that it knows"
+    known = [f"{name} {angle:.1f}" for name, angle in zip(names, angles, strict=True) if angle is not None]
+    return ", ".join(known) or "unknown angles"
 
 
 def _range(limits: tuple[float, float] | None) -> str:
     return "unknown" if limits is None else f"{limits[0]:g} to {limits[1]:g}"
 
 
-UPRIGHT_DEG = 89.0
-"""Of a camera that looks straighter up or down, all turning is yaw."""
+# Closer to straight up or down than this, yaw and roll are the same rotation.
+MAX_PITCH_FOR_YAW_DEG = 89.0
 
-NEAR_M = 1.0
-"""Nearer than this along the ground, any yaw will do."""
+# For targets nearer than this along the ground, the bearing is meaningless.
+MIN_BEARING_DISTANCE_M = 1.0
 
 
-def straight(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Wanted:
-    """Angles as they were ordered; of a camera that looks straight down or up, the yaw is anybody's."""
-    is_upright = abs(pitch) > UPRIGHT_DEG
+def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
+    """Angles of an order; straight down or up, any yaw is right."""
+    is_upright = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     turned = None if is_upright else yaw
     return (pitch, roll, None if from_nose else turned, turned if from_nose else None)
 
 
-def direction_to(bridge: Bridge, target: Position) -> Wanted | None:
-    """From where the vehicle is now; None while that is not known, or which of the two is higher."""
-    cell = bridge.talk.telemetry.position
+def direction_to(context: VehicleContext, target: Position) -> Angles | None:
+    """Direction from the vehicle to a position; None while its own position or the height difference is unknown."""
+    cell = context.session.telemetry.position
     here = cell.latest
-    if here is None or cell.age > OLD_POSITION_S:
+    if here is None or cell.age > POSITION_MAX_AGE_S:
         return None
     pairs = (
         (target.altitude_relative_m, here.altitude_relative_m),
         (target.altitude_amsl_m, here.altitude_amsl_m),
     )
-    up = next((its - own for its, own in pairs if its is not None and own is not None), None)
+    up = next((theirs - own for theirs, own in pairs if theirs is not None and own is not None), None)
     if up is None:
         if target.altitude_relative_m is not None or target.altitude_amsl_m is not None:
             return None
@@ -198,7 +188,7 @@ def direction_to(bridge: Bridge, target: Position) -> Wanted | None:
     return (
         pitch,
         None,
-        here.bearing_to(target) if along > NEAR_M and abs(pitch) <= UPRIGHT_DEG else None,
+        here.bearing_to(target) if along > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG else None,
         None,
     )
 
@@ -207,8 +197,8 @@ RETRACT, NEUTRAL = GimbalDeviceFlags.RETRACT, GimbalDeviceFlags.NEUTRAL
 
 
 @checks_arguments
-class PointActions(GimbalPart):
-    """Orders by angles: of two the newer one counts."""
+class PointingMixin(GimbalMixin):
+    """Orders by angles. A newer order ends the previous one."""
 
     async def point(
         self,
@@ -216,35 +206,35 @@ class PointActions(GimbalPart):
         yaw_deg: float,
         *,
         roll_deg: float = 0.0,
-        frame: Frame = "earth",
+        frame: YawFrame = "earth",
         wait: bool = True,
         tolerance_deg: float = 3.0,
         timeout: float = 10.0,
     ) -> None:
-        """Turn it, and return when it tells that it points there.
+        """Point it at angles; returns when it reports that it points there.
 
         Args:
             pitch_deg: from the horizon, −360 to 360: 0 is level, −90 straight down.
-            yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the vehicle's nose (``"vehicle"``).
-            roll_deg: from the horizon, −360 to 360. If it is not 0, only the mount's command can do it, which turns the
-                camera with the vehicle: a yaw from north is right at the moment of the order.
-            frame: what the yaw counts from, and keeps to.
+            yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
+            roll_deg: from the horizon, −360 to 360. Other values than 0 need the mount command, which turns the camera
+                with the vehicle: a yaw from north is right only at the time of the order.
+            frame: reference of the yaw, which it keeps afterwards.
             wait: False: return when it was accepted.
-            tolerance_deg: how near in each axis is there, above 0 to 45.
-            timeout: seconds until it has to be there.
+            tolerance_deg: accepted deviation in each axis, above 0 to 45.
+            timeout: seconds to wait.
 
-        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; control is claimed when that is denied, until :meth:`release`.
-        MAV_CMD_DO_MOUNT_CONTROL to a vehicle without a gimbal manager, and MOUNT_CONTROL, which has no answer, to one
-        that does not know that either.
+        Sends MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. If it is denied, aerokit claims control until :meth:`release`. A
+        vehicle without a gimbal manager gets MAV_CMD_DO_MOUNT_CONTROL, and one that does not support that either gets
+        MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
             InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
-                asked for. Nothing was sent.
+                called before. Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         for name, value in (("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg), ("roll_deg", roll_deg)):
@@ -252,87 +242,88 @@ class PointActions(GimbalPart):
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         from_nose = frame == "vehicle"
         self._check_limits(pitch_deg, roll_deg, yaw_deg if from_nose else None)
-        orders, turn = self._orders, self._orders.begin()
+        orders, order = self._orders, self._orders.begin_order()
 
         async def send() -> None:
             flags = LEVEL if from_nose else LOCKED
-            # the gimbal manager's command has no roll
-            if roll_deg or not await orders.manage(turn, pitch_deg, yaw_deg, flags=flags):
-                await orders.mount_to(turn, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
+            # The gimbal manager's command has no roll.
+            if roll_deg or not await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags):
+                await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 
-        wanted = straight(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
+        wanted = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
         if not wait:
             await send()
             return
-        with told_often(orders):
+        with attitude_stream(orders):
             since = self._now()
             await send()
             what = f"{orders.name}: point({pitch_deg:g}, {yaw_deg:g})"
-            await arrive(orders, turn, what, Aim(lambda: wanted, tolerance_deg), since=since, timeout=timeout)
+            target = AngleTarget(lambda: wanted, tolerance_deg)
+            await wait_until_there(orders, order, what, target, since=since, timeout=timeout)
 
     async def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Turn it to its neutral position, mostly level and straight ahead, and return when it rests there.
+        """Turn it to its neutral position, usually level and straight ahead; returns when it rests there.
 
         Args:
             wait: False: return when it was accepted.
-            timeout: seconds until it has to be there.
+            timeout: seconds to wait.
 
         Raises:
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
         await self._rest("neutral", NEUTRAL, MavMountMode.NEUTRAL, wait=wait, timeout=timeout)
 
     async def retract(self, *, wait: bool = True, timeout: float = 10.0) -> None:
-        """Put it away, and return when it rests there.
+        """Retract it; returns when it rests there.
 
         Args:
             wait: False: return when it was accepted.
-            timeout: seconds until it has to be there.
+            timeout: seconds to wait.
 
         Raises:
-            NotSupported: its manager takes the order and does nothing (PX4). Nothing was sent.
+            NotSupported: its manager accepts the order but does nothing (PX4). Nothing was sent.
             CommandRejected: the manager refused.
             CommandTimeout: there was no answer.
-            GimbalTaken: control was lost in the block that has it.
+            GimbalTaken: your program had control and lost it.
             OperationRejected: another order was given meanwhile, or the vehicle rebooted.
-            OperationTimeout: it was not there in time; the text says where it points.
+            OperationTimeout: it did not get there in time; the text has the last attitude.
             HeartbeatTimeout: the vehicle fell silent.
         """
-        if not self._orders.rules.retracts:
-            self._orders.not_supported("retracts no gimbal")
+        if not self._orders.rules.supports_retract:
+            self._orders.raise_not_supported("cannot retract a gimbal")
         await self._rest("retract", RETRACT, MavMountMode.RETRACT, wait=wait, timeout=timeout)
 
     async def release(self) -> None:
-        """Give it back to the pilot's sticks, and the control that was claimed without a block to whoever wants it.
+        """Return it to the pilot's sticks, and release control that was claimed outside of a control block.
 
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
         """
-        turn = self._orders.begin()
-        await self._orders.mount(turn, MavMountMode.RC_TARGETING)
-        await self._orders.let_go(turn)
+        order = self._orders.begin_order()
+        await self._orders.send_mount_mode(order, MavMountMode.RC_TARGETING)
+        await self._orders.release_control(order)
 
     async def _rest(self, what: str, flag: int, mode: int, *, wait: bool, timeout: float) -> None:
-        orders, turn = self._orders, self._orders.begin()
+        orders, order = self._orders, self._orders.begin_order()
 
         async def send() -> None:
-            if not await orders.manage(turn, NAN, NAN, flags=flag):
-                await orders.mount(turn, mode)
+            if not await orders.send_pitch_yaw(order, NAN, NAN, flags=flag):
+                await orders.send_mount_mode(order, mode)
 
         if not wait:
             await send()
             return
-        with told_often(orders):
+        with attitude_stream(orders):
             since = self._now()
             await send()
-            there = Rest(flag, or_ahead=flag == NEUTRAL)
-            await arrive(orders, turn, f"{orders.name}: {what}", there, since=since, timeout=timeout)
+            target = RestTarget(flag, or_ahead=flag == NEUTRAL)
+            await wait_until_there(orders, order, f"{orders.name}: {what}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
         device = self._orders.device

@@ -1,4 +1,4 @@
-"""``GimbalRates``: turning a gimbal at rates, for as long as the code lives that feeds them."""
+"""``GimbalRates``: turning a gimbal at rates while the program feeds them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import AerokitError, BusyError, CommandRejected, NotSupported, SetpointStreamStopped
 from aerokit.events import SILENT_AFTER_S
 from aerokit.mavlink.messages import GimbalManagerSetAttitude, GimbalManagerSetPitchyaw
-from aerokit.vehicle.commanding.order import OVERRULED
-from aerokit.vehicle.gimbal.control import LastWord
+from aerokit.vehicle.commanding.order import SUPERSEDED
+from aerokit.vehicle.gimbal.control import ReleaseCommand
 from aerokit.vehicle.gimbal.orders import LEVEL, LOCKED, NAN, PITCHYAW, GimbalOrders
 
 if TYPE_CHECKING:
@@ -25,28 +25,28 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.order import Order
 
-__all__ = ["FASTEST_DEG_S", "GimbalRates"]
+__all__ = ["GimbalRates"]
 
-FASTEST_DEG_S = 720.0
-"""What is taken as a rate; a gimbal turns as fast as it can."""
+# Gimbals limit the rate themselves.
+MAX_RATE_DEG_S = 720.0
 
 
 @checks_arguments
 class GimbalRates:
-    """Turns a gimbal at the latest rates for as long as its ``async with`` block feeds them.
+    """Turns a gimbal at the latest rates while its ``async with`` block feeds them.
 
     Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; then they are sent at ``rate_hz``
-    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero: it
-    stays where it points. The stream stops by itself, with a rate of zero, when nothing new was set for
-    ``valid_for_s``, the event loop was blocked for ``max_lag_s``, or the vehicle is silent; and is left to others when
-    another order was given to the gimbal, or control was lost. Then ``set`` and leaving the block raise.
+    (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving, in any way, orders a rate of zero:
+    the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if no new rates are set for
+    ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It stops without sending a
+    rate of zero if another order is given to the gimbal, or control is lost. Then ``set`` and leaving the block raise.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
-        NotSupported: the vehicle has no gimbal manager: mounts of old turn to angles only.
+        NotSupported: the vehicle has no gimbal manager; older mounts turn to angles only.
         CommandRejected: the manager refused.
         CommandTimeout: there was no answer.
-        GimbalTaken: control was lost in the block that has it.
+        GimbalTaken: your program had control and lost it.
     """
 
     def __init__(
@@ -62,52 +62,52 @@ class GimbalRates:
         check_range("valid_for_s", valid_for_s, 0, 60, above=True)
         check_range("max_lag_s", max_lag_s, 0, 60, above=True)
         _check(*first)
-        self._orders, self._talk = orders, orders.talk
+        self._orders, self._session = orders, orders.session
         self._rates, self._flags = first, int(LOCKED if is_from_north else LEVEL)
         self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
         self._set_at = self._began_at = -math.inf
-        self._turn: Order | None = None
+        self._order: Order | None = None
+        # Marks the gimbal as in use, so that the first one stays the first one.
         self._release = ExitStack()
-        """What keeps the first gimbal the first one meanwhile."""
         self._timer: asyncio.TimerHandle | None = None
         self._stopped: AerokitError | None = None
-        self._was_told = self._was_entered = False
+        self._was_raised = self._was_entered = False
 
     @property
     def is_running(self) -> bool:
-        """Whether rates are being sent."""
+        """True while rates are being sent."""
         return self._timer is not None
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
-        """Take new rates; they are sent at the next tick, and resent until ``valid_for_s`` has passed.
+        """Set new rates; they are sent at the next tick, and repeated until ``valid_for_s`` has passed.
 
         Args:
             pitch_deg_s: degrees per second, −720 to 720; positive is up.
             yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
 
         Raises:
-            InvalidArgument: a rate is out of range; those before stay in force until they are too old.
-            SetpointStreamStopped: the stream has ended by itself, or the block was left.
-            GimbalTaken: control was lost in the block that has it.
+            InvalidArgument: a rate is out of range; the previous rates stay valid.
+            SetpointStreamStopped: the stream has stopped, or the block has ended.
+            GimbalTaken: your program had control and lost it.
         """
         _check(pitch_deg_s, yaw_deg_s)
         self._raise_if_stopped()
         if self._timer is None:
-            raise SetpointStreamStopped("these rates are not being sent: use them inside their `async with`")
+            raise SetpointStreamStopped("these rates are not being sent: set them inside the `async with` block")
         self._rates, self._set_at = (pitch_deg_s, yaw_deg_s), self._now()
 
     async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
-        """Feed one pair of rates for ``duration_s`` seconds.
+        """Feed one pair of rates for a time.
 
         Args:
             pitch_deg_s: degrees per second, −720 to 720; positive is up.
             yaw_deg_s: degrees per second, −720 to 720; positive is to the right.
-            duration_s: for so long.
+            duration_s: time in seconds.
 
         Raises:
             InvalidArgument: a rate is out of range.
-            SetpointStreamStopped: the stream ended meanwhile.
-            GimbalTaken: control was lost in the block that has it.
+            SetpointStreamStopped: the stream has stopped.
+            GimbalTaken: your program had control and lost it.
         """
         until = self._now() + duration_s
         while (left := until - self._now()) > 0:
@@ -117,57 +117,52 @@ class GimbalRates:
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
-            raise BusyError("rates of a gimbal are entered once: call rates() again")
+            raise BusyError("GimbalRates can be entered only once: call rates() again")
         self._was_entered = True
         orders = self._orders
-        self._turn = orders.begin()
+        self._order = orders.begin_order()
         self._release.enter_context(orders.device.in_use())
         try:
-            if not await orders.manage(self._turn, NAN, NAN, *self._rates, flags=self._flags):
-                orders.not_supported("has no gimbal manager, which knows rates")
+            if not await orders.send_pitch_yaw(self._order, NAN, NAN, *self._rates, flags=self._flags):
+                orders.raise_not_supported("has no gimbal manager, which is needed for rates")
             self._set_at = self._began_at = self._now()
-            orders.bridge.on_finish.append(self._finish)
+            orders.context.on_finish.append(self._finish)
             self._tick(self._now())
-        except (CommandRejected, NotSupported):  # nothing was obeyed
+        except (CommandRejected, NotSupported):  # The gimbal does not turn.
             self._end()
             raise
-        except BaseException:  # no answer, too: it may be turning
-            self._leave()
+        except BaseException:  # Without an answer it may turn.
+            self._stop_rotation()
             raise
         return self
 
     async def __aexit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._stopped is None and (error := self._why_leave_alone()):
+        if self._stopped is None and (error := self._lost_to()):
             self._stop(error, zero=False)
         if self._stopped is None:
             zero = self._zero()
             self._end()
-            self._stopped = SetpointStreamStopped("the block of these rates was left")
+            self._stopped = SetpointStreamStopped("the block of these rates has ended")
             if exc is None:
-                await zero.say(f"{self._orders.name}: rates of zero")
+                await zero.send_and_wait(f"{self._orders.name}: rates of zero")
             else:
-                zero.leave()
-        elif exc is None and not self._was_told:
+                zero.send_soon()
+        elif exc is None and not self._was_raised:
             raise self._stopped
 
-    # ---------------------------------------------------------------------------- the stream
-
     def _tick(self, due: float) -> None:
-        """Send once more, unless something says that nobody feeds it any more."""
+        """Send once more, unless the stream must stop."""
         self._timer = None
-        if error := self._why_leave_alone():
+        if error := self._lost_to():
             self._stop(error, zero=False)
             return
-        if reason := self._why_stop(self._now() - due):
+        if reason := self._stop_reason(self._now() - due):
             self._stop(_stopped(reason))
             return
         try:
-            self._talk.connection.send(self._message())
+            self._session.connection.send(self._message())
         except AerokitError as error:
             self._stop(_stopped(str(error)))
             return
@@ -176,77 +171,73 @@ class GimbalRates:
 
     def _message(self) -> Message:
         orders = self._orders
-        pitch, yaw = (math.radians(each) for each in self._rates)
-        address = (self._talk.system_id, orders.manager_id, self._flags, orders.parameter)
-        if orders.rules.knows_pitchyaw:
+        pitch, yaw = (math.radians(rate) for rate in self._rates)
+        address = (self._session.system_id, orders.manager_id, self._flags, orders.gimbal_id_param)
+        if orders.rules.supports_pitchyaw:
             return GimbalManagerSetPitchyaw(*address, NAN, NAN, pitch, yaw)
         return GimbalManagerSetAttitude(*address, (NAN, NAN, NAN, NAN), 0.0, pitch, yaw)
 
-    def _why_stop(self, lag: float) -> str | None:
+    def _stop_reason(self, lag: float) -> str | None:
         age = self._now() - self._set_at
         if lag > self._max_lag_s:
             return f"the event loop was blocked for {lag:.1f} s"
         if age > self._valid_for_s:
             return f"no new rates came for {age:.1f} s (valid_for_s = {self._valid_for_s:g})"
-        if self._talk.watch.is_silent and self._talk.connection.is_open:
-            return f"the vehicle has been silent for {self._talk.heartbeat_age:.1f} s"
+        if self._session.watch.is_silent and self._session.connection.is_open:
+            return f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s"
         manager_id = self._orders.manager_id
-        silent_for_s = min(self._orders.silent_for_s(manager_id), self._now() - self._began_at)
-        if manager_id != self._talk.component_id and silent_for_s > SILENT_AFTER_S:
+        silent_for_s = min(self._orders.registry.silent_for_s(manager_id), self._now() - self._began_at)
+        if manager_id != self._session.component_id and silent_for_s > SILENT_AFTER_S:
             return f"the gimbal's manager has been silent for {silent_for_s:.1f} s"
         return None
 
-    def _why_leave_alone(self) -> AerokitError | None:
-        """Somebody else has it, or another order of ours holds."""
+    def _lost_to(self) -> AerokitError | None:
+        """Return the error if control was lost, or a newer order was given."""
         try:
             self._orders.raise_if_taken()
         except AerokitError as error:
             return error
-        if self._turn is not None and not self._turn.is_newest:
-            return _stopped(OVERRULED)
+        if self._order is not None and not self._order.is_newest:
+            return _stopped(SUPERSEDED)
         return None
 
     def _stop(self, error: AerokitError, *, zero: bool = True) -> None:
         self._stopped = error
         if zero:
-            self._leave()
+            self._stop_rotation()
         else:
             self._end()
 
-    def _zero(self) -> LastWord:
-        orders, turn = self._orders, self._turn
-        params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.parameter)
-        return LastWord(
-            orders,
-            PITCHYAW,
-            params,
-            lambda: turn is not None and turn.is_newest and not orders.is_taken,
+    def _zero(self) -> ReleaseCommand:
+        orders, order = self._orders, self._order
+        params = (NAN, NAN, 0.0, 0.0, self._flags, 0, orders.gimbal_id_param)
+        return ReleaseCommand(
+            orders, PITCHYAW, params, lambda: order is not None and order.is_newest and not orders.is_taken
         )
 
-    def _leave(self) -> None:
+    def _stop_rotation(self) -> None:
         zero = self._zero()
         self._end()
-        zero.leave()
+        zero.send_soon()
 
     def _finish(self) -> None:
-        """The block of the vehicle is left."""
-        self._stop(_stopped("the block of its vehicle was left"))
+        self._stop(_stopped("the block of the vehicle has ended"))
 
     def _end(self) -> None:
         self._release.close()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self._finish in self._orders.bridge.on_finish:
-            self._orders.bridge.on_finish.remove(self._finish)
+        if self._finish in self._orders.context.on_finish:
+            self._orders.context.on_finish.remove(self._finish)
 
     def _raise_if_stopped(self) -> None:
         if self._stopped is not None:
-            self._was_told = True
+            self._was_raised = True
             raise self._stopped
 
     def _now(self) -> float:
-        return self._talk.connection.now()
+        return self._session.connection.now()
 
 
 def _stopped(reason: str) -> SetpointStreamStopped:
@@ -254,5 +245,5 @@ def _stopped(reason: str) -> SetpointStreamStopped:
 
 
 def _check(pitch_deg_s: float, yaw_deg_s: float) -> None:
-    check_range("pitch_deg_s", pitch_deg_s, -FASTEST_DEG_S, FASTEST_DEG_S)
-    check_range("yaw_deg_s", yaw_deg_s, -FASTEST_DEG_S, FASTEST_DEG_S)
+    check_range("pitch_deg_s", pitch_deg_s, -MAX_RATE_DEG_S, MAX_RATE_DEG_S)
+    check_range("yaw_deg_s", yaw_deg_s, -MAX_RATE_DEG_S, MAX_RATE_DEG_S)

@@ -1,1 +1,1 @@
-"""Missions, fences and rally points that a vehicle holds."""
+"""Missions, fences and rally points on a vehicle."""

@@ -1,15 +1,19 @@
-"""`PlanContext`: what the transfers of missions, fences and rally points of one vehicle share."""
+"""`PlanContext` and `MissionTracker`: state of the plans of one vehicle."""
 
 from __future__ import annotations
 
 import asyncio
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import anyio
 
+from aerokit.connection.cells import Source, StateCell
+from aerokit.errors import ConnectionClosed
+from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
+from aerokit.mavlink.enums import MissionState
 from aerokit.mavlink.messages import MissionCurrent
-from aerokit.vehicle.missions.mission_progress import MissionWatch
+from aerokit.vehicle.state.condition import MissionProgress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -18,118 +22,235 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.missions.item import MissionItem
     from aerokit.position import Position
-    from aerokit.protocols.exchange import OnProgress
-    from aerokit.vehicle.commanding.context import Bridge
-    from aerokit.vehicle.session.session import Talk
+    from aerokit.vehicle.commanding.context import VehicleContext
+    from aerokit.vehicle.files.files import Files
+    from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.session.transfers import Transfers
 
-FRESH_IDS_S = 2.5
-"""MISSION_CURRENT comes at 1 Hz."""
+# MISSION_CURRENT is sent at 1 Hz.
+PLAN_ID_MAX_AGE_S = 2.5
+
+# The same item reached again within this time is a repeated message.
+DUPLICATE_WINDOW_S = 0.3
+
+REPEAT_AFTER_S = 1.0
+
+# A vehicle that has landed may report another item than the last one this long before it disarms.
+FINAL_ITEM_MAX_AGE_S = 3.0
+
+# A vehicle that starts its mission again may report for this long that it is complete.
+STALE_STATE_S = 3.0
 
 
-class PlanFiles(Protocol):
-    """What transfers of plans ask of the vehicle's files."""
-
-    async def read(self, path: str, *, patience_s: float, on_progress: OnProgress | None) -> bytes:
-        """Return the whole file."""
-        ...
-
-    async def write(
-        self, path: str, data: bytes, *, patience_s: float, on_progress: OnProgress | None
-    ) -> None:
-        """Write the whole file."""
-
-
-class PlanMemory:
-    """What one kind of plan was when it was last sent or read, counted as the vehicle counts, and by which way."""
+class PlanCache:
+    """Last known content of one kind of plan on the vehicle, with the item numbers of the vehicle."""
 
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
-        self.learned_at: float = -math.inf
+        self.updated_at: float = -math.inf
+        # True if the vehicle offers the plan as a file; None until tried.
         self.has_file: bool | None = None
-        """Whether the vehicle has a file of it; None: not tried yet."""
 
-    def learn(self, items: Sequence[MissionItem], now: float) -> None:
-        """The vehicle holds these."""
-        self.items, self.learned_at = tuple(items), now
+    def set(self, items: Sequence[MissionItem], now: float) -> None:
+        self.items, self.updated_at = tuple(items), now
 
     def forget(self, now: float) -> None:
-        """The vehicle may hold anything from now on."""
-        self.items = None
-        self.learned_at = now
+        self.items, self.updated_at = None, now
 
 
 class PlanContext:
-    """One lock, since autopilots have one state for the transfers of all three; what MISSION_CURRENT calls them, and
-    how far the mission is.
+    """State shared by the mission, the fence and the rally points of one vehicle.
 
-    ``files``: gives the vehicle's files when they are needed.
+    They share one lock, because autopilots have one state machine for the transfers of all three. ``files`` returns the
+    vehicle's files on demand.
     """
 
-    def __init__(self, bridge: Bridge, files: Callable[[], PlanFiles]) -> None:
-        self.bridge: Bridge = bridge
-        self.talk: Talk = bridge.talk
-        self.files: Callable[[], PlanFiles] = files
-        self.transfers: Transfers = bridge.talk.transfers
-        self.autopilot: Autopilot = bridge.talk.autopilot
+    def __init__(self, vehicle_context: VehicleContext, files: Callable[[], Files]) -> None:
+        self.vehicle_context: VehicleContext = vehicle_context
+        self.session: VehicleSession = vehicle_context.session
+        self.files: Callable[[], Files] = files
+        self.transfers: Transfers = vehicle_context.session.transfers
+        self.autopilot: Autopilot = vehicle_context.session.autopilot
         self.lock: asyncio.Lock = asyncio.Lock()
-        self.memories: tuple[PlanMemory, PlanMemory, PlanMemory] = (PlanMemory(), PlanMemory(), PlanMemory())
-        """By MAV_MISSION_TYPE."""
+        # By MAV_MISSION_TYPE.
+        self.caches: tuple[PlanCache, PlanCache, PlanCache] = (PlanCache(), PlanCache(), PlanCache())
         self._current: Frame | None = None
-        talk = bridge.talk
-        talk.at_close(
-            talk.connection.bus.attach_frames(MissionCurrent, self._note_current, system_id=talk.system_id)
+        session = vehicle_context.session
+        session.at_close(
+            session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id)
         )
-        self.watch: MissionWatch = MissionWatch(talk)
+        self.tracker: MissionTracker = MissionTracker(session)
 
     def now(self) -> float:
-        """Seconds on the loop's clock."""
-        return self.talk.connection.now()
+        return self.session.connection.now()
 
     def offset_of(self, mission_type: int) -> int:
-        """How much higher the vehicle counts items than the program does: home may be its item 0."""
+        """Offset of the vehicle's item numbers: 1 if its item 0 is home, else 0."""
         return int(mission_type == 0 and self.autopilot.home_is_item_0)
 
     @property
     def home(self) -> Position | None:
-        """Where the vehicle says that its home is."""
-        home = self.talk.telemetry.home.latest
+        home = self.session.telemetry.home.latest
         return None if home is None else home.position.replace(altitude_amsl_m=home.altitude_amsl_m)
 
     @property
-    def is_flown(self) -> bool:
-        """Whether the vehicle is flying its mission."""
-        mode = self.autopilot.mode_for("mission", is_vtol=self.talk.telemetry.is_vtol)
-        return (
-            mode is not None
-            and self.talk.telemetry.is_in(mode)
-            and not self.talk.telemetry.is_surely_disarmed
-        )
+    def is_flying_mission(self) -> bool:
+        """True while the vehicle is in its mission mode and may be armed."""
+        return self.tracker.is_in_mission_mode and not self.session.telemetry.is_confirmed_disarmed
 
-    def id_of(self, mission_type: int, since: float) -> int:
-        """What a MISSION_CURRENT that came lately, and after ``since``, calls the plan; 0 where it does not."""
+    def plan_id(self, mission_type: int, since: float) -> int:
+        """Return the plan's id in a recent MISSION_CURRENT that arrived after ``since``; 0 if unknown."""
         frame = self._current
-        if frame is None or frame.received_at <= since or self.now() - frame.received_at > FRESH_IDS_S:
+        if frame is None or frame.received_at <= since or self.now() - frame.received_at > PLAN_ID_MAX_AGE_S:
             return 0
         current = MissionCurrent.decode_body(frame.body)
         return (current.mission_id, current.fence_id, current.rally_points_id)[mission_type]
 
-    async def is_called(self, mission_type: int, opaque_id: int) -> bool:
-        """Whether MISSION_CURRENT, waited for, calls the plan so."""
-        told, now = asyncio.Event(), self.now()
+    async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
+        """Wait for a MISSION_CURRENT with this plan id; False if none arrives in time."""
+        received, now = asyncio.Event(), self.now()
 
-        def look(_: MissionCurrent) -> None:
-            if self.id_of(mission_type, now) == opaque_id:
-                told.set()
+        def check(_: MissionCurrent) -> None:
+            if self.plan_id(mission_type, now) == opaque_id:
+                received.set()
 
-        detach = self.talk.connection.bus.attach(MissionCurrent, look, system_id=self.talk.system_id)
+        detach = self.session.connection.bus.attach(MissionCurrent, check, system_id=self.session.system_id)
         try:
-            with anyio.move_on_after(FRESH_IDS_S):
-                await told.wait()
+            with anyio.move_on_after(PLAN_ID_MAX_AGE_S):
+                await received.wait()
         finally:
             detach()
-        return told.is_set()
+        return received.is_set()
 
-    def _note_current(self, frame: Frame) -> None:
-        if self.talk.telemetry.accepts(frame):
+    def _on_current(self, frame: Frame) -> None:
+        if self.session.telemetry.accepts(frame):
             self._current = frame
+
+
+class MissionTracker:
+    """Cells and events for mission progress. Item numbers do not count home.
+
+    An ArduCopter that lands at the end disarms and returns to its first item, without reporting that the mission is
+    complete. PX4 reports completion until the next mission has started, reports an active mission also in its landing
+    mode, and sends each reached item ten times.
+    """
+
+    def __init__(self, session: VehicleSession) -> None:
+        self._session = session
+        self._offset = int(session.autopilot.home_is_item_0)
+        self._repeats = session.autopilot.repeats_item_reached
+        new_cell = session.connection.new_cell
+        self.current: StateCell[int | None] = new_cell("mission.current", "MISSION_CURRENT")
+        self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
+        self.progress: StateCell[MissionProgress] = new_cell("mission.progress", "MISSION_CURRENT")
+        session.add_timeout_hint(self.current, self.count, self.progress)
+        # The last item that was reached.
+        self.reached: int | None = None
+        # True if the last mission was flown to its end.
+        self.is_complete: bool = False
+        self._reached_at = self._at_last_at = -math.inf
+        self._may_repeat = False
+        self._was_active = False
+        self._stale_until = -math.inf
+        telemetry = session.telemetry
+        session.at_close(
+            telemetry.mission_current.observe(self._on_current, every_arrival=True),
+            telemetry.mission_reached.observe(self._on_reached, every_arrival=True),
+            telemetry.armed.observe(self._on_armed),
+            session.connection.on_end(self.close),
+            lambda: self.close(ConnectionClosed("the block of this vehicle was left")),
+        )
+        session.on_reboot.append(self.forget)
+
+    @property
+    def last(self) -> int | None:
+        """Number of the last item; None while the number of items is unknown."""
+        count = self.count.latest
+        return count - 1 if count else None
+
+    @property
+    def is_at_last(self) -> bool:
+        """True while the current item is the last one, and shortly afterwards."""
+        return self._session.connection.now() - self._at_last_at <= FINAL_ITEM_MAX_AGE_S
+
+    def on_transfer_count(self, count: int) -> None:
+        self._set_count(count, "MISSION_COUNT")
+
+    def start(self) -> None:
+        self.is_complete = self._was_active = False
+        self._stale_until = self._session.connection.now() + STALE_STATE_S
+
+    def forget(self) -> None:
+        for cell in (self.current, self.count, self.progress):
+            cell.forget()
+        self.reached, self._was_active, self.is_complete = None, False, False
+
+    def close(self, error: Exception) -> None:
+        for cell in (self.current, self.count, self.progress):
+            cell.close(error)
+
+    def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
+        before = self.current.latest
+        current = None if reported.current is None else reported.current - self._offset
+        if current is not None and current < 0:  # ArduPilot's home
+            current = None
+        if reported.total is None and reported.state == MissionState.NO_MISSION:
+            current = None
+            self._set_count(0, "MISSION_CURRENT")
+        elif reported.total is not None:
+            self._set_count(reported.total, "MISSION_CURRENT")
+        self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source("MISSION_CURRENT"))
+        self.current.set(current, self._source("MISSION_CURRENT"))
+        if current is not None and current == self.last:
+            self._at_last_at = self._session.connection.now()
+        if current != before:
+            self._detect_repeat(before, current)
+            self._session.publish(MissionCurrentChanged, before, current)
+        self._on_state(reported.state)
+
+    def _detect_repeat(self, before: int | None, current: int | None) -> None:
+        # The vehicle approaches an item again that it has reached before. PX4 may report an item as reached before it
+        # becomes the current one.
+        if current is not None and current == self.reached:
+            is_long_ago = self._session.connection.now() - self._reached_at > REPEAT_AFTER_S
+            self._may_repeat = self._may_repeat or is_long_ago or (before is not None and before > current)
+
+    def _on_state(self, state: int) -> None:
+        if state != MissionState.COMPLETE:
+            self._stale_until = -math.inf
+            if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
+                self._was_active, self.is_complete = True, False
+        elif self._session.connection.now() >= self._stale_until:
+            self._complete()
+
+    def _on_armed(self, _: bool | None, is_armed: bool) -> None:
+        if not is_armed and self._was_active and self.is_at_last and self.is_in_mission_mode:
+            self._complete()
+
+    def _on_reached(self, _: int | None, seq: int) -> None:
+        # ArduPilot reports item 0 (home) when it has reached a guided target.
+        item, now = seq - self._offset, self._session.connection.now()
+        is_again = item == self.reached and (
+            not self._may_repeat if self._repeats else now - self._reached_at < DUPLICATE_WINDOW_S
+        )
+        if item < 0 or is_again:
+            return
+        self.reached, self._reached_at, self._may_repeat = item, now, False
+        self._session.publish(MissionItemReached, item)
+
+    def _complete(self) -> None:
+        self.is_complete = True
+        if self._was_active:
+            self._was_active = False
+            self._session.publish(MissionFinished)
+
+    @property
+    def is_in_mission_mode(self) -> bool:
+        mode = self._session.autopilot.mode_for("mission", is_vtol=self._session.telemetry.is_vtol)
+        return mode is not None and self._session.telemetry.is_in(mode)
+
+    def _set_count(self, count: int, message: str) -> None:
+        self.count.set(count, self._source(message))
+
+    def _source(self, message: str) -> Source:
+        return Source(self._session.system_id, self._session.component_id, message)

@@ -1,4 +1,4 @@
-"""``MissionControl``: the mission that a vehicle holds, and flying it."""
+"""``MissionControl``: the mission of a vehicle, and flying it."""
 
 from __future__ import annotations
 
@@ -8,270 +8,370 @@ import anyio
 
 from aerokit._internal.arguments import checks_arguments
 from aerokit.errors import CommandRejected, InvalidArgument, OperationRejected, OperationTimeout
-from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.vehicle.commanding.progress import LONGEST_SILENCE_S, await_progress
-from aerokit.vehicle.missions.mission_progress import MissionEnd
-from aerokit.vehicle.missions.plans import HeldPlan
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MavResult, MissionState
+from aerokit.position import Position
+from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S
+from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
+from aerokit.vehicle.missions.plans import VehiclePlan
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from aerokit.autopilots.modes import Mode
     from aerokit.connection.cells import StateCell
     from aerokit.missions import Mission
+    from aerokit.missions.item import MissionItem
+    from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, SentCommand
-    from aerokit.vehicle.missions.context import PlanContext
+    from aerokit.vehicle.missions.context import MissionTracker, PlanContext
     from aerokit.vehicle.state.condition import MissionProgress
 
 __all__ = ["MissionControl"]
 
-MODE_TIMEOUT_S = 6.0
-LAST_ITEM = 0xFFFF - 1
+MAX_ITEM = 0xFFFF - 1
+LANDING_COMMANDS = (MavCmd.NAV_RETURN_TO_LAUNCH, MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
+
+# MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
+END_GRACE_S = 2.0
+
+# A return may end at a rally point, whose position is unknown here: it is taken as finished after this time.
+RETURN_TIMEOUT_S = 300.0
+
+
+class MissionEndDetector:
+    """Detects the end of a mission.
+
+    A mission ends when the vehicle reports that it is complete, or has landed and disarmed at its last item. If it
+    ends with a landing, or with a return that ends in one, it must be on the ground: PX4 reports completion when the
+    return starts, which it flies in another mode. A return without a landing ends at home. Vehicles that do not report
+    a mission state must have reached the last item.
+    """
+
+    def __init__(
+        self, vehicle_context: VehicleContext, tracker: MissionTracker, mode: Mode, items: Sequence[MissionItem] | None
+    ) -> None:
+        session = vehicle_context.session
+        self._vehicle_context, self._session = vehicle_context, session
+        self._tracker, self._mode = tracker, mode
+        self._order = vehicle_context.arbiter.newest
+        last = items[-1].command if items else None
+        self._ends_by_landing = last in LANDING_COMMANDS
+        self._ends_in_air = last == MavCmd.NAV_RETURN_TO_LAUNCH and not session.autopilot.lands_after_return
+        self._returns_since: float | None = None
+        self._landing_modes = tuple(
+            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in ("return", "land")
+        )
+        self._grace_until = session.connection.now() + MODE_GRACE_S
+        self._was_in_mode = False
+        self._left_at: float | None = None
+
+    def has_ended(self) -> bool:
+        if self._tracker.is_complete:
+            at_home = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
+            return not self._ends_by_landing or self._is_on_ground or at_home
+        # ArduPlane returns in another mode, which stops its mission.
+        if self._ends_in_air and self._is_landing:
+            return self._is_on_ground or self._is_home
+        self._returns_since = None
+        if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
+            return True
+        progress = self._tracker.progress.latest
+        reports_state = progress is not None and progress.state != MissionState.UNKNOWN
+        last = self._tracker.last
+        return not reports_state and last is not None and self._tracker.reached == last
+
+    def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
+        """Return the reason why the mission can no longer end. ``order`` is the last one for the mission."""
+        session, now = self._session, self._session.connection.now()
+        if self._vehicle_context.arbiter.newest not in (self._order, order):
+            return "another order was given"
+        is_in_mode = session.telemetry.is_in(self._mode)
+        self._was_in_mode = self._was_in_mode or is_in_mode
+        if not session.telemetry.is_confirmed_disarmed and (
+            is_paused or is_in_mode or self._is_landing or now < self._vehicle_context.arbiter.mode_settles_at
+        ):
+            self._left_at = None
+            return None
+        if self._left_at is None:  # The report of the end may come after the change of mode that it causes.
+            self._left_at = now
+        if now - self._left_at < END_GRACE_S or now < self._grace_until:
+            return None
+        if session.telemetry.is_confirmed_disarmed:
+            return f"the vehicle is not armed, {self.describe()}"
+        if self._was_in_mode:
+            return f"the mode changed to {session.telemetry.mode_name}, {self.describe()}"
+        return f"the vehicle is not flying its mission, it is in {session.telemetry.mode_name}"
+
+    def describe(self) -> str:
+        """Return e.g. ``at item 3 of 7``."""
+        current, count = self._tracker.current.latest, self._tracker.count.latest
+        where = "before its first item" if current is None else f"at item {current}"
+        return f"{where} of {'?' if count is None else count}"
+
+    @property
+    def _is_landing(self) -> bool:
+        """True if the vehicle has changed from the mission mode to that of its last item."""
+        mode = self._session.telemetry.mode.latest
+        current, last = self._tracker.current.latest, self._tracker.last
+        return self._ends_by_landing and current is not None and current == last and mode in self._landing_modes
+
+    @property
+    def _is_home(self) -> bool:
+        """True if the vehicle is at home, or ``RETURN_TIMEOUT_S`` have passed since it began to return."""
+        session, now = self._session, self._session.connection.now()
+        if self._returns_since is None:
+            self._returns_since = now
+        home = session.telemetry.home.latest
+        place = None if home is None else Position(home.latitude_deg, home.longitude_deg)
+        is_near = (
+            place is not None
+            and self._vehicle_context.vehicle_position.distance_to(place) <= session.autopilot.arrival_radius_m
+        )
+        return is_near or now - self._returns_since > RETURN_TIMEOUT_S
+
+    @property
+    def _is_on_ground(self) -> bool:
+        landed = self._session.telemetry.landed_state.latest
+        return self._session.telemetry.is_confirmed_disarmed or landed == MavLandedState.ON_GROUND
 
 
 @checks_arguments
-class MissionControl(HeldPlan["Mission"]):
-    """``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
+class MissionControl(VehiclePlan["Mission"]):
+    """The mission of a vehicle: ``await vehicle.mission.upload(mission)``, ``start()``, ``wait_finished()``.
 
-    Items are counted from 0 and home is never one of them, whatever the autopilot. Starting, pausing and resuming are
+    Item numbers count from 0, and home is not an item, for all autopilots. Starting, pausing and resuming are
     orders like taking off: the newest one wins.
     """
 
     def __init__(self, context: PlanContext) -> None:
         super().__init__(context)
-        self._bridge, self._talk = context.bridge, context.talk
-        self._watch = context.watch
+        self._vehicle_context, self._session = context.vehicle_context, context.session
+        self._tracker = context.tracker
+        # The last order of this object.
         self._order: Order | None = None
-        """The last one given here."""
         self._is_paused = False
-
-    # ------------------------------------------------------------------------------------- state
 
     @property
     def current(self) -> StateCell[int | None]:
-        """The item it goes for (MISSION_CURRENT); None: it has not begun, or there is no mission."""
-        return self._watch.current
+        """Current item (MISSION_CURRENT); None before the start, and without a mission."""
+        return self._tracker.current
 
     @property
     def count(self) -> StateCell[int]:
-        """How many items it holds, by MISSION_CURRENT or by the last transfer."""
-        return self._watch.count
+        """Number of items, from MISSION_CURRENT or the last transfer."""
+        return self._tracker.count
 
     @property
     def progress(self) -> StateCell[MissionProgress]:
         """``current``, ``total`` and ``state`` (MISSION_STATE: 2 not started, 3 active, 4 paused, 5 complete)."""
-        return self._watch.progress
+        return self._tracker.progress
 
     @property
     def reached(self) -> int | None:
-        """The item that was reached last (MISSION_ITEM_REACHED), None before the first."""
-        return self._watch.reached
-
-    # ------------------------------------------------------------------------------------ orders
+        """The last item that was reached (MISSION_ITEM_REACHED); None before the first."""
+        return self._tracker.reached
 
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
-        """Have it go for this item next; it does so at once when it is flying its mission.
+        """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
 
-        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which knows that alone. An item that is no
-        place to go to (a DO command) is run through: ``current`` then shows the one behind it.
+        Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which supports only that. An item without a
+        position (a DO command) is executed; ``current`` then shows the next item.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: somebody else steers, or a newer order was given, before it was confirmed.
+            OperationRejected: a pilot took over, or a newer order was given, before it was confirmed.
             OperationTimeout: MISSION_CURRENT did not confirm it.
         """
         self._check_item(item)
-        with self._bridge.arbiter.aside() as order:
+        with self._vehicle_context.arbiter.auxiliary_order() as order:
             await self._set_current(item, timeout, order)
 
     async def start(self, item: int = 0, *, timeout: float = 10.0) -> None:
-        """Fly the mission from ``item`` on, its first one by default; returns when HEARTBEAT tells the mission mode.
+        """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
-        The vehicle must be armed: **it takes off** if the mission says so. A copter on the ground needs a take-off item
-        first. Cancelled half-way, the vehicle is told to hold.
+        The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
+        a take-off item first. If you cancel the call, aerokit orders the vehicle to hold.
 
-        Sends MISSION_START to ArduPilot, which takes off then also from the ground, and changes the mode of others.
+        Sends MISSION_START to ArduPilot, which then takes off from the ground, and changes the mode of others.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: it is not armed, or its mode changed meanwhile.
-            CommandRejected: the vehicle refused: it has no mission, no position, …; ``reasons`` tells.
-            OperationTimeout: it accepted and stayed in another mode.
-            NotSupported: this type of vehicle has no mode for missions.
+            CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
+            OperationTimeout: it accepted but stayed in another mode.
+            NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
-        bridge, talk = self._bridge, self._talk
-        mode = bridge.sender.mode_for("mission.start", "mission")
-        if not talk.telemetry.is_armed:
-            raise OperationRejected(
-                "mission.start: the vehicle is not armed: arm() comes first; nothing was sent"
-            )
-        order = self._order = bridge.arbiter.order(mode)
+        vehicle_context, session = self._vehicle_context, self._session
+        mode = vehicle_context.sender.mode_for("mission.start", "mission")
+        if not session.telemetry.is_armed:
+            raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
+        order = self._order = vehicle_context.arbiter.order(mode)
         self._is_paused = False
-        self._watch.start()
+        self._tracker.start()
         try:
-            await self._set_current(item, timeout, order, goes_on=False)
-            await self._enter(mode, order, timeout)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # it may have heard the order
-            bridge.holding.hold_soon(order)
+            await self._set_current(item, timeout, order, keeps_jump_counts=False)
+            await self._enter_mode(mode, order, timeout)
+        except (
+            anyio.get_cancelled_exc_class(),
+            OperationTimeout,
+        ):  # The vehicle may have received the order.
+            vehicle_context.flight_cleanup.hold_in_background(order)
             raise
 
     async def pause(self) -> None:
-        """Stop where it is and keep the place in the mission; returns when HEARTBEAT tells the mode for holding.
+        """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
 
-        Raises OperationRejected when it does not fly its mission, else as :meth:`Vehicle.hold`.
+        Raises OperationRejected if it is not flying its mission, else as :meth:`Vehicle.hold`.
         """
-        bridge, talk = self._bridge, self._talk
-        mode = bridge.sender.mode_for("mission.pause", "hold")
-        if not self._context.is_flown:
+        vehicle_context, session = self._vehicle_context, self._session
+        mode = vehicle_context.sender.mode_for("mission.pause", "hold")
+        if not self._context.is_flying_mission:
             raise OperationRejected(
-                f"mission.pause: the vehicle does not fly its mission, it is in {talk.telemetry.mode_name};"
+                f"mission.pause: the vehicle is not flying its mission, it is in {session.telemetry.mode_name};"
                 " nothing was sent"
             )
-        self._order = bridge.arbiter.order(mode)
+        self._order = vehicle_context.arbiter.order(mode)
         self._is_paused = True
-        await bridge.holding.stop_in(mode, self._order)
+        await vehicle_context.flight_cleanup.stop_in(mode, self._order)
 
     async def resume(self, *, timeout: float = 10.0) -> None:
-        """Go on with the mission from the current item; also after a pilot or another order has interrupted it.
+        """Continue the mission from the current item; also after a pilot or another order has interrupted it.
 
-        ArduPilot begins anew if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
+        ArduPilot starts again from the first item if its parameter MIS_RESTART is 1. Raises as :meth:`start`.
         """
-        bridge, talk = self._bridge, self._talk
-        mode = bridge.sender.mode_for("mission.resume", "mission")
-        if not talk.telemetry.is_armed:
+        vehicle_context, session = self._vehicle_context, self._session
+        mode = vehicle_context.sender.mode_for("mission.resume", "mission")
+        if not session.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
-        order = self._order = bridge.arbiter.order(mode)
-        self._watch.start()
+        order = self._order = vehicle_context.arbiter.order(mode)
+        self._tracker.start()
         try:
-            await self._enter(mode, order, timeout)
+            await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
-            bridge.holding.hold_soon(order)
+            vehicle_context.flight_cleanup.hold_in_background(order)
             raise
         self._is_paused = False
 
-    async def wait_finished(
-        self, *, timeout: float | None = None, max_silence_s: float | None = LONGEST_SILENCE_S
-    ) -> None:
-        """Wait until the mission has been flown to its end; for a mission that ends with landing, until it has landed.
+    async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
+        """Wait until the mission has been flown to its end; for one that ends with landing, until it has landed.
 
-        A :meth:`pause` from elsewhere in the program is waited through. Cancelled, the vehicle goes on.
+        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle.
 
         Args:
-            timeout: seconds until it is finished; None: as long as it takes.
-            max_silence_s: give up when no heartbeat has come for so many seconds; None: wait on, however long.
+            timeout: seconds to wait; None for no limit.
+            max_silence_s: fail after this many seconds without a heartbeat; None for no limit.
 
         Raises:
-            OperationRejected: it does not fly the mission any more: a pilot, a failsafe or another order has taken it
-                out of the mission's mode, or it disarmed on the way. ``reasons`` has what the vehicle said.
+            OperationRejected: it no longer flies the mission: a pilot, a failsafe or another order changed the mode, or
+                it disarmed on the way. ``reasons`` has what the vehicle reported.
             OperationTimeout: not finished in time.
-            HeartbeatTimeout: the vehicle has been silent for ``max_silence_s`` seconds.
+            HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
         """
-        bridge, talk = self._bridge, self._talk
-        mode = bridge.sender.mode_for("mission.wait_finished", "mission")
-        end = MissionEnd(bridge, self._watch, mode, self._context.memories[0].items)
-        with talk.streaming("mission_current", "landed_state"):
+        vehicle_context, session = self._vehicle_context, self._session
+        mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
+        end = MissionEndDetector(vehicle_context, self._tracker, mode, self._context.caches[0].items)
+        with session.streaming("mission_current", "landed_state"):
             await await_progress(
-                talk,
+                session,
                 "mission.wait_finished",
-                is_done=end.is_reached,
-                trouble=lambda: end.trouble(self._order, is_paused=self._is_paused),
+                is_done=end.has_ended,
+                trouble=lambda: end.failure(self._order, is_paused=self._is_paused),
                 describe=end.describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
 
     @property
-    def explains_mode(self) -> bool:
-        """Whether the vehicle is in a mode in which its mission ends by itself: holding, returning or landing.
+    def has_ended(self) -> bool:
+        """True if the vehicle holds, returns or lands because its mission has ended.
 
-        That is so when the mission was ordered last, and is complete or at its last item; it is nobody else's doing.
+        This requires that the mission was the last order, and is complete or at its last item.
         """
-        talk = self._bridge.talk
-        if self._order is None or self._bridge.arbiter.newest is not self._order:
+        session = self._vehicle_context.session
+        if self._order is None or self._vehicle_context.arbiter.newest is not self._order:
             return False
         ends_in = [
-            talk.autopilot.mode_for(purpose, is_vtol=talk.telemetry.is_vtol)
+            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for purpose in ("hold", "return", "land")
         ]
-        return (self._watch.is_complete or self._watch.is_at_last) and talk.telemetry.mode.latest in ends_in
-
-    # ------------------------------------------------------------------------------------ inside
+        return (self._tracker.is_complete or self._tracker.is_at_last) and session.telemetry.mode.latest in ends_in
 
     def _plan_type(self) -> type[Mission]:
         from aerokit.missions import Mission
 
         return Mission
 
-    def _counted(self, count: int) -> None:
-        self._watch.counted(count)
+    def _on_count(self, count: int) -> None:
+        self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
-        count = self._watch.count.latest
-        last = LAST_ITEM if count is None else count - 1
+        count = self._tracker.count.latest
+        last = MAX_ITEM if count is None else count - 1
         if count == 0:
-            raise InvalidArgument("the vehicle's mission is empty: upload() comes first; nothing was sent")
+            raise InvalidArgument("the vehicle's mission is empty: call upload() first; nothing was sent")
         if not isinstance(item, int) or isinstance(item, bool) or not 0 <= item <= last:
             raise InvalidArgument(f"item = {item!r} is not allowed: 0 to {last}")
 
-    async def _set_current(self, item: int, timeout: float, order: Order, *, goes_on: bool = True) -> None:
-        """``goes_on``: keep what it has counted of jumps. ArduPilot's item 0, home, stands for a fresh start."""
-        bridge, talk = self._bridge, self._talk
+    async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
+        """Set the current item. ArduPilot's item 0 resets its jump counts, unless ``keeps_jump_counts``."""
+        vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(0)
-        if talk.autopilot.sets_current_by_command:
+        if session.autopilot.sets_current_by_command:
             try:
-                await bridge.sender.command_of(
-                    order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not goes_on else seq
+                await vehicle_context.sender.follow_up_command(
+                    order, MavCmd.DO_SET_MISSION_CURRENT, 0 if item == 0 and not keeps_jump_counts else seq
                 )
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise
             else:
                 return
-        with bridge.arbiter.sending(order) as sending:
+        with vehicle_context.arbiter.sending(order) as sending:
             try:
                 await self._set_current_by_message(seq, timeout, sending)
             except OperationTimeout as error:
                 if order.end:
-                    raise OperationRejected(str(error), reasons=talk.texts_since(order.given_at)) from None
+                    raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
                 raise
 
-    async def _set_current_by_message(
-        self, seq: int, timeout: float, standing: SentCommand | None = None
-    ) -> None:
-        from aerokit.protocols.missions import MissionSetCurrent
+    async def _set_current_by_message(self, seq: int, timeout: float, order_status: SentCommand | None = None) -> None:
+        from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
-        async with self._context.lock:  # PX4 does not hear it during a transfer
-            if standing is not None:
-                self._bridge.sender.raise_if_over(standing.order)
+        async with self._context.lock:  # PX4 ignores it during a transfer.
+            if order_status is not None:
+                self._vehicle_context.sender.raise_if_ended(order_status.order)
             await transfers.run(
-                MissionSetCurrent(
+                SetCurrentItem(
                     *target,
                     seq,
-                    self._told_seq,
-                    standing=standing,
+                    self._current_seq,
+                    order_status=order_status,
                     round_trip=transfers.round_trip,
-                    patience_s=timeout,
+                    idle_timeout_s=timeout,
                 )
             )
 
     @property
-    def _told_seq(self) -> int | None:
-        """The item in the last MISSION_CURRENT, as counted on the wire."""
-        progress = self._talk.telemetry.mission_current.latest
+    def _current_seq(self) -> int | None:
+        progress = self._session.telemetry.mission_current.latest
         return None if progress is None else progress.current
 
-    async def _enter(self, mode: Mode, order: Order, timeout: float) -> None:
-        bridge, talk = self._bridge, self._talk
-        if not talk.autopilot.mission_starts_by_command:
-            await bridge.sender.change_mode(mode, order, timeout, told_since=order.given_at)
+    async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
+        vehicle_context, session = self._vehicle_context, self._session
+        if not session.autopilot.mission_starts_by_command:
+            await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)
             return
         try:
-            with bridge.arbiter.changing_mode():
-                await bridge.sender.give(order, talk.commands.send_long, MavCmd.MISSION_START, modes=(mode,))
-                await bridge.sender.await_mode(mode, order, [], timeout, order.given_at)
+            with vehicle_context.arbiter.changing_mode():
+                await vehicle_context.sender.run_command(
+                    order, session.commands.send_long, MavCmd.MISSION_START, modes=(mode,)
+                )
+                await vehicle_context.sender.await_mode(mode, order, [], timeout, order.given_at)
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
-            await bridge.sender.change_mode(mode, order, timeout, told_since=order.given_at)
+            await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)

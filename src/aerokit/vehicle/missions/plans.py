@@ -1,7 +1,8 @@
-"""What missions, fences and rally points of one vehicle share: one transfer at a time, what was sent or read last."""
+"""Base class of missions, fences and rally points on a vehicle."""
 
 from __future__ import annotations
 
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from aerokit._internal.arguments import check_kind, checks_arguments
@@ -10,28 +11,26 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator
 
     from aerokit.missions import Fence, RallyPoints
     from aerokit.protocols.exchange import OnProgress
     from aerokit.vehicle.missions.context import PlanContext
-    from aerokit.vehicle.missions.transfer import Plan, PlanTransfer
+    from aerokit.vehicle.missions.transfer import PlanProtocol, PlanTransfer
 
-__all__ = ["FenceControl", "HeldPlan", "PlanMethod", "RallyControl"]
+__all__ = ["FenceControl", "PlanMethod", "RallyControl", "VehiclePlan"]
 
-PlanT = TypeVar("PlanT", bound="Plan")
+PlanT = TypeVar("PlanT", bound="PlanProtocol")
 
-ResultT = TypeVar("ResultT")
 
 PlanMethod = Literal["auto", "ftp", "items"]
 
 
 @checks_arguments
-class HeldPlan(ReadOnly, Generic[PlanT]):
-    """A mission, a fence or rally points that a vehicle holds.
+class VehiclePlan(ReadOnly, Generic[PlanT]):
+    """A mission, a fence or rally points on a vehicle.
 
-    There is one transfer of them at a time with one vehicle; another one waits for its turn. Each can be cancelled at
-    any moment, and the vehicle is told.
+    There is one transfer at a time with each vehicle; others wait. You can cancel any call; the vehicle is informed.
     """
 
     def __init__(self, context: PlanContext) -> None:
@@ -45,100 +44,88 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         only_changes: bool = True,
         verify: bool = True,
         max_distance_m: float = MAX_DISTANCE_M,
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> None:
-        """Have the vehicle hold this plan instead of the one it holds; an empty one clears it.
+        """Replace the plan on the vehicle by this one; an empty one clears it.
 
         Args:
-            plan: it is checked before anything is sent.
-            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or what the
-                vehicle has.
-            only_changes: when it is known what the vehicle holds, from an upload or a download and confirmed by the
-                vehicle, send nothing if it is the same, and only the items that differ if the vehicle takes them alone.
-            verify: read it back and compare, or compare the checksum that PX4 tells when that is quicker. What was sent
-                as a file is always read back.
-            max_distance_m: metres from where the vehicle is, if it has told that; a plan with a place farther away is
-                refused.
-            patience_s: give up after so many seconds without progress.
-            timeout: seconds for all of it.
-            on_progress: called with how far it is, in items, or in bytes of a file.
+            plan: checked before anything is sent.
+            method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
+            only_changes: if the vehicle's plan is known from an earlier transfer, and the vehicle confirms it, send
+                nothing if it is equal, and only the items that differ if the vehicle supports that.
+            verify: read the plan back and compare, or compare PX4's checksum where that is faster. Files are always
+                read back.
+            max_distance_m: refuse a plan with a position farther than this from the vehicle, if its position is known.
+            idle_timeout_s: fail after this many seconds without progress.
+            timeout: seconds in total.
+            on_progress: called with the progress in items, or in bytes of a file.
 
         See https://mavlink.io/en/services/mission.html. PX4 keeps the old items until it has all of the new ones.
-        ArduPilot overwrites a mission and rally points one by one (a fence at the end), so that after a failure it
-        holds a part of both: the error says so.
+        ArduPilot overwrites missions and rally points one by one (a fence at the end), so that after a failure it holds
+        a mixture of both: the error says so.
 
         Raises:
-            InvalidArgument: the plan cannot be right, or has a place that is too far away; nothing was sent.
-            MissionRejected: the vehicle refused; ``item``, ``result`` and ``reasons`` tell what and why.
-            MissionTimeout: it fell silent; ``missing`` are the items it did not confirm.
-            VerificationFailed: it confirmed, and holds something else.
-            NotSupported: ``"ftp"`` was asked for, and it has none.
+            InvalidArgument: the plan is invalid, or has a position that is too far away. Nothing was sent.
+            MissionRejected: the vehicle refused; see ``item``, ``result`` and ``reasons``.
+            MissionTimeout: it stopped answering; ``missing`` are the items it did not confirm.
+            VerificationFailed: it confirmed, but holds something else.
+            NotSupported: ``"ftp"`` was requested, but it has none.
             FileError, FileTimeout: the same for a file, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
         plan = self._checked(plan)
-        places = [each.position for each in plan.to_items()]
-        self._context.bridge.where.check_reach("plan", filter(None, places), max_distance_m)
+        places = [item.position for item in plan.to_items()]
+        self._context.vehicle_context.vehicle_position.check_reach("plan", filter(None, places), max_distance_m)
 
-        async def work(transfer: PlanTransfer[PlanT]) -> None:
+        async with self._transfer(idle_timeout_s, timeout, on_progress) as transfer:
             await transfer.upload(plan, method, only_changes=only_changes, verify=verify)
-            self._counted(len(plan.to_items()))
-
-        await self._transfer(work, method, patience_s, timeout, on_progress)
+            self._on_count(len(plan.to_items()))
 
     async def download(
         self,
         *,
         method: PlanMethod = "auto",
-        patience_s: float = 10.0,
+        idle_timeout_s: float = 10.0,
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> PlanT:
-        """Read what the vehicle holds; arguments as for :meth:`upload`.
+        """Read the plan on the vehicle; arguments as for :meth:`upload`.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: items are missing in the end; ``missing`` has them.
-            RemoteProtocolError: what it sent makes no sense.
+            MissionTimeout: items are missing; ``missing`` has them.
+            RemoteProtocolError: the received items are not a valid plan.
             NotSupported, FileError, FileTimeout: as for :meth:`upload`, with ``"ftp"``.
             OperationTimeout: not done within ``timeout``.
         """
-
-        async def work(transfer: PlanTransfer[PlanT]) -> PlanT:
+        async with self._transfer(idle_timeout_s, timeout, on_progress) as transfer:
             plan = await transfer.download(method)
-            self._counted(len(plan.to_items()))
+            self._on_count(len(plan.to_items()))
             return plan
 
-        return await self._transfer(work, method, patience_s, timeout, on_progress)
-
-    async def clear(self, *, patience_s: float = 10.0, timeout: float | None = None) -> None:
-        """Have the vehicle forget it, and see that it has. ArduPilot refuses to forget a mission that it is flying.
+    async def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
+        """Clear the plan on the vehicle, and verify that. ArduPilot refuses to clear a mission that it is flying.
 
         Raises:
-            InvalidArgument: an argument that cannot be right; nothing was sent.
+            InvalidArgument: an argument is invalid. Nothing was sent.
             MissionRejected: the vehicle refused.
-            MissionTimeout: it fell silent.
-            VerificationFailed: it confirmed, and still holds items.
+            MissionTimeout: it stopped answering.
+            VerificationFailed: it confirmed, but still holds items.
             OperationTimeout: not done within ``timeout``.
         """
-
-        async def work(transfer: PlanTransfer[PlanT]) -> None:
+        async with self._transfer(idle_timeout_s, timeout, None) as transfer:
             await transfer.clear()
-            self._counted(0)
-
-        await self._transfer(work, "items", patience_s, timeout, None)
-
-    # ------------------------------------------------------------------------------------ inside
+            self._on_count(0)
 
     def _plan_type(self) -> type[PlanT]:
-        """The class of the plan, imported when needed."""
+        """Return the class of the plan, imported on demand."""
         raise NotImplementedError
 
-    def _counted(self, count: int) -> None:
-        """So many items are known to be held."""
+    def _on_count(self, count: int) -> None:
+        """Called with the number of items after a transfer."""
 
     def _checked(self, plan: PlanT) -> PlanT:
         plan_type = self._plan_type()
@@ -146,41 +133,37 @@ class HeldPlan(ReadOnly, Generic[PlanT]):
         plan.check(home_is_item_0=bool(self._context.offset_of(plan_type.MISSION_TYPE)))
         return plan
 
+    @asynccontextmanager
     async def _transfer(
-        self,
-        work: Callable[[PlanTransfer[PlanT]], Awaitable[ResultT]],
-        method: str,
-        patience_s: float,
-        timeout: float | None,
-        on_progress: OnProgress | None,
-    ) -> ResultT:
+        self, idle_timeout_s: float, timeout: float | None, on_progress: OnProgress | None
+    ) -> AsyncIterator[PlanTransfer[PlanT]]:
         from aerokit.vehicle.missions.transfer import PlanTransfer
 
         context = self._context
-        transfer = PlanTransfer(context, self._plan_type(), patience_s=patience_s, on_progress=on_progress)
+        transfer = PlanTransfer(context, self._plan_type(), idle_timeout_s=idle_timeout_s, on_progress=on_progress)
         with context.transfers.limit(timeout):
             async with context.lock:
-                return await work(transfer)
+                yield transfer
 
 
 @checks_arguments
-class FenceControl(HeldPlan["Fence"]):
-    """``await vehicle.fence.upload(Fence(polygons=[...]))``: where the vehicle may and may not be.
+class FenceControl(VehiclePlan["Fence"]):
+    """The fence of a vehicle: ``await vehicle.fence.upload(Fence(polygons=[...]))``.
 
-    Uploading does not switch it on for ArduPilot (:meth:`enable`, or the parameter FENCE_ENABLE); PX4 minds every fence
-    it holds, and does what GF_ACTION says.
+    For ArduPilot, uploading does not enable the fence: use :meth:`enable`, or the parameter FENCE_ENABLE. PX4 always
+    obeys its fence; GF_ACTION defines its reaction.
     """
 
     async def enable(self, on: bool = True) -> None:
-        """Have the vehicle mind its fence, or not (MAV_CMD_DO_FENCE_ENABLE), until it reboots.
+        """Enable or disable the fence (MAV_CMD_DO_FENCE_ENABLE) until the next reboot.
 
         See https://mavlink.io/en/messages/common.html#MAV_CMD_DO_FENCE_ENABLE.
 
         Raises:
-            CommandRejected: the vehicle refused; PX4 does not know the command.
+            CommandRejected: the vehicle refused; PX4 does not support the command.
             CommandTimeout: it did not answer.
         """
-        await self._context.bridge.sender.command_aside(MavCmd.DO_FENCE_ENABLE, float(on))
+        await self._context.vehicle_context.sender.auxiliary_command(MavCmd.DO_FENCE_ENABLE, float(on))
 
     def _plan_type(self) -> type[Fence]:
         from aerokit.missions import Fence
@@ -188,10 +171,10 @@ class FenceControl(HeldPlan["Fence"]):
         return Fence
 
 
-class RallyControl(HeldPlan["RallyPoints"]):
-    """``await vehicle.rally.upload(RallyPoints([...]))``: where the vehicle may return to instead of home.
+class RallyControl(VehiclePlan["RallyPoints"]):
+    """Rally points, alternatives to home for a return: ``await vehicle.rally.upload(RallyPoints([...]))``.
 
-    PX4 calls them safe points, and returns to one of them when RTL_TYPE says so.
+    PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
     """
 
     def _plan_type(self) -> type[RallyPoints]:

@@ -1,4 +1,4 @@
-"""``PlanTransfer``: the shortest way to have a vehicle hold a plan, and to read the one it holds."""
+"""``PlanTransfer``: uploads and downloads plans in the fastest way that the vehicle supports."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from aerokit.errors import (
     VerificationFailed,
 )
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavProtocolCapability
-from aerokit.missions.compare import Storage, changed_items, item_differences
-from aerokit.missions.pack import PACKED_NAMES, pack_items, unpack_items
-from aerokit.missions.wire import shift_jumps, with_home
-from aerokit.protocols.mission_download import Downloaded, MissionDownload
-from aerokit.protocols.mission_upload import MissionUpload, UploadEnd
+from aerokit.missions.compare import ItemStorage, changed_items, item_differences
+from aerokit.missions.wire import PACKED_PATHS, pack_items, shift_jumps, unpack_items, with_home
+from aerokit.protocols.mission_download import DownloadResult, MissionDownload
+from aerokit.protocols.mission_upload import MissionUpload, UploadResult
 from aerokit.protocols.missions import MissionClear, mission_checksum
 
 if TYPE_CHECKING:
@@ -35,90 +34,81 @@ if TYPE_CHECKING:
 
 ResultT = TypeVar("ResultT")
 
-SETTLE_S = 0.3
-"""How long after a refusal the vehicle's texts about it are waited for."""
+# Texts that explain a refusal may arrive this long after it.
+REFUSAL_TEXT_DELAY_S = 0.3
 
 
 class PlanChannel:
-    """The ways to and from one vehicle for one MAV_MISSION_TYPE. Items are counted as the vehicle counts them.
+    """Transfers plans of one MAV_MISSION_TYPE, with the item numbers of the vehicle.
 
-    Errors count as the program does, have the vehicle's texts in them, and say what became of the old items.
+    Errors have the item numbers of the program, the texts of the vehicle, and the state of the old items.
     """
 
     def __init__(
-        self, context: PlanContext, mission_type: int, patience_s: float, on_progress: OnProgress | None
+        self, context: PlanContext, mission_type: int, idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
         self.mission_type = mission_type
         self._context = context
-        self._options: dict[str, Any] = {"patience_s": patience_s, "on_progress": on_progress}
-        self._path = PACKED_NAMES[mission_type]
+        self._options: dict[str, Any] = {"idle_timeout_s": idle_timeout_s, "on_progress": on_progress}
+        self._path = PACKED_PATHS[mission_type]
+        # True if the vehicle may hold some of our items.
         self._has_changed = False
-        """Whether something of ours may be among what the vehicle holds."""
+        # True if positions are sent as 32-bit floats, because the vehicle does not support MISSION_ITEM_INT.
         self.is_single_precision: bool = False
-        """Whether places go through 32-bit floats: the vehicle knows no MISSION_ITEM_INT."""
 
-    # ------------------------------------------------------------------------------- one by one
-
-    async def send(self, items: Sequence[MissionItem]) -> UploadEnd:
-        """Send all items. A refusal that may be about any of several is tried again, one item at a time."""
+    async def send(self, items: Sequence[MissionItem]) -> UploadResult:
+        """Send all items. If a refusal does not identify the item, send them again one at a time."""
         window = self._context.autopilot.mission_upload_window
         exchange = await self._upload(items, window=window)
         try:
             return await self._run(exchange)
         except MissionRejected:
-            if not exchange.was_vague:
+            if not exchange.is_refusal_ambiguous:
                 raise
         return await self._run(await self._upload(items, window=1))
 
-    async def send_part(self, items: Sequence[MissionItem], first: int) -> UploadEnd | None:
-        """Send the items from ``first`` on in place of those there; None: the vehicle will not have it in parts."""
+    async def send_part(self, items: Sequence[MissionItem], first: int) -> UploadResult | None:
+        """Replace the items from ``first`` on; None if the vehicle does not support partial uploads."""
         exchange = await self._upload(items, window=1, first=first)
         try:
             end = await self._run(exchange)
             self._has_changed = True
             return end
         except MissionRejected:
-            if exchange.was_begun:
+            if exchange.was_started:
                 raise
             return None
 
-    async def receive(self, only: Sequence[int] | None = None) -> Downloaded:
-        """Read all items, or ``only`` some."""
+    async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
         received = await self._run(
             MissionDownload(
                 *self._target,
                 window=self._context.autopilot.mission_download_window,
                 only=only,
-                gives_int=await self._knows_int(),
+                gives_int=await self._supports_int(),
                 **self._wire_options,
             )
         )
-        return received.replace(items=self._tidy(received.items))
+        return received.replace(items=self._normalized(received.items))
 
     async def clear(self) -> None:
-        """Have the vehicle forget all items."""
         await self._run(MissionClear(*self._target, **self._wire_options))
 
-    # ---------------------------------------------------------------------------------- as a file
-
     async def has_ftp(self) -> bool:
-        """Whether the vehicle has file transfer at all."""
         return await self._has(MavProtocolCapability.FTP, by_default=False)
 
     async def write_file(self, items: Sequence[MissionItem]) -> None:
-        """Write the file. ArduPilot looks at it when it is closed, and does not tell what it thinks of it."""
+        """Write the file. ArduPilot evaluates it when it is closed, without reporting the result."""
         await self._context.files().write(self._path, pack_items(items, self.mission_type), **self._options)
         self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
-        """Read the file; RemoteProtocolError when it is none of this kind."""
+        """Read the file; raises RemoteProtocolError if it is not a file of this kind."""
         data = await self._context.files().read(self._path, **self._options)
-        return self._tidy(unpack_items(data, self.mission_type))
+        return self._normalized(unpack_items(data, self.mission_type))
 
-    # ------------------------------------------------------------------------------------ inside
-
-    def _tidy(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
-        """Outside missions ``autocontinue`` has no meaning, and comes back from ArduPilot as False."""
+    def _normalized(self, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
+        # Fences and rally points have no autocontinue; ArduPilot returns False for it.
         if self.mission_type == MavMissionType.MISSION:
             return items
         return tuple(item.replace(autocontinue=True) for item in items)
@@ -143,150 +133,138 @@ class PlanChannel:
         capabilities = await self._context.transfers.capabilities()
         return by_default if capabilities is None else bool(capabilities & capability)
 
-    async def _knows_int(self) -> bool:
-        knows = await self._has(MavProtocolCapability.MISSION_INT)
-        self.is_single_precision = not knows
-        return knows
+    async def _supports_int(self) -> bool:
+        is_supported = await self._has(MavProtocolCapability.MISSION_INT)
+        self.is_single_precision = not is_supported
+        return is_supported
 
-    async def _upload(
-        self, items: Sequence[MissionItem], *, window: int, first: int | None = None
-    ) -> MissionUpload:
+    async def _upload(self, items: Sequence[MissionItem], *, window: int, first: int | None = None) -> MissionUpload:
         return MissionUpload(
             *self._target,
             items,
             first=first,
             window=window,
-            takes_int=await self._knows_int(),
+            takes_int=await self._supports_int(),
             **self._wire_options,
         )
 
     async def _run(self, exchange: MissionExchange[ResultT]) -> ResultT:
-        """Run it; given up from outside, it is given up at the vehicle too."""
+        """Run an exchange; if it is cancelled, cancel it on the vehicle, too."""
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(
-                "MAVLink 1 has messages for missions only: to the vehicle this would be its mission; nothing was sent"
+                "MAVLink 1 can transfer missions only: the vehicle would take this as its mission; nothing was sent"
             )
         started = connection.now()
         try:
             return await self._context.transfers.run(exchange)
         except MissionRejected as error:
-            await anyio.sleep(SETTLE_S)
-            texts = self._context.talk.texts_since(started)
-            message = f"{error}{self._what_is_left(exchange)}"
+            await anyio.sleep(REFUSAL_TEXT_DELAY_S)
+            texts = self._context.session.texts_since(started)
+            message = f"{error}{self._describe_remains(exchange)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
-            error.args = (f"{error}{self._what_is_left(exchange, is_silent=True)}",)
+            error.args = (f"{error}{self._describe_remains(exchange, is_silent=True)}",)
             raise
         finally:
             if not exchange.done and connection.is_open:
-                for goodbye in exchange.cancellation():
-                    connection.send(goodbye)
+                for notice in exchange.cancellation():
+                    connection.send(notice)
 
-    def _what_is_left(self, exchange: MissionExchange[Any], *, is_silent: bool = False) -> str:
+    def _describe_remains(self, exchange: MissionExchange[Any], *, is_silent: bool = False) -> str:
         if not isinstance(exchange, MissionUpload):
             return ""
-        self._has_changed |= exchange.was_changing
-        is_overwritten = self.mission_type in self._context.autopilot.replaced_as_they_come
-        if is_silent and exchange.was_sent_whole:
-            return "; everything was sent, and it is not known whether the vehicle took it: download to see"
+        self._has_changed |= exchange.may_have_changed_items
+        is_overwritten = self.mission_type in self._context.autopilot.overwrites_plans_in_place
+        if is_silent and exchange.was_sent_completely:
+            return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_overwritten and self._has_changed:
-            return "; the vehicle now holds a part of the new items and a part of the old ones: upload again, or clear"
+            return "; the vehicle now holds some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:
-            return "; if the vehicle heard of it, it has cut what it held to the new number of items"
-        return "; the vehicle holds what it held before"
+            return "; if the vehicle received the request, it has cut its plan to the new number of items"
+        return "; the vehicle still holds its previous items"
 
 
-KINDS = ("mission", "fence", "rally points")
+PLAN_NAMES = ("mission", "fence", "rally points")
 
-CHECKSUM_TAKES_S = 1.0
-"""MISSION_CURRENT comes at 1 Hz."""
+# MISSION_CURRENT, which has the checksum, is sent at 1 Hz.
+CHECKSUM_INTERVAL_S = 1.0
 
-PART_COSTS = 4
-"""A stretch of changed items costs about as many messages more as so many items."""
+# A partial upload costs about as many extra messages as this number of items.
+PART_OVERHEAD_ITEMS = 4
 
 
-class Plan(Protocol):
-    """What missions, fences and rally points have in common."""
+class PlanProtocol(Protocol):
+    """Interface of missions, fences and rally points."""
 
     MISSION_TYPE: ClassVar[int]
 
-    def check(self, *, home_is_item_0: bool) -> None:
-        """Raise InvalidArgument unless it can be sent."""
+    def check(self, *, home_is_item_0: bool) -> None: ...
 
-    def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
-        """Its items."""
-        ...
+    def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]: ...
 
     @classmethod
-    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool) -> Self:
-        """The plan of these items."""
-        ...
+    def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool) -> Self: ...
 
 
-PlanT = TypeVar("PlanT", bound=Plan)
+PlanT = TypeVar("PlanT", bound=PlanProtocol)
 
 
 class PlanTransfer(Generic[PlanT]):
-    """One upload, download or clearing. Items are counted as the vehicle counts them: an ArduPilot's home is item 0."""
+    """One upload, download or clearing, with the item numbers of the vehicle: item 0 of an ArduPilot is home."""
 
     def __init__(
         self,
         context: PlanContext,
         plan_type: type[PlanT],
         *,
-        patience_s: float,
+        idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> None:
         self._context, self._plan_type = context, plan_type
         self._type = plan_type.MISSION_TYPE
-        self._memory = context.memories[self._type]
-        self._channel = PlanChannel(context, self._type, patience_s, on_progress)
+        self._cache = context.caches[self._type]
+        self._channel = PlanChannel(context, self._type, idle_timeout_s, on_progress)
         self._offset = context.offset_of(self._type)
-        self._storage = Storage(context.autopilot.mission_storage)
-
-    # ---------------------------------------------------------------------------------- whole
+        self._storage = ItemStorage(context.autopilot.mission_storage)
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
-        """Have the vehicle hold this plan."""
         items = plan.to_items()
-        if self._offset:  # its own home, not the planner's: older firmware might take it for a new one
+        if self._offset:  # Send the vehicle's home, because older firmware might replace it by that of the plan.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:
             await self.clear()
             return
         if only_changes and await self._send_changes(items, method, verify=verify):
             return
-        self._memory.forget(self._context.now())
+        self._cache.forget(self._context.now())
         if await self._uses_file(method, is_upload=True):
             await self._send_file(items, method)
         else:
             await self._send_items(items, method, verify=verify)
 
     async def download(self, method: str) -> PlanT:
-        """Read the plan that the vehicle holds."""
         return self._plan_type.from_items(await self._read(method), home_is_item_0=bool(self._offset))
 
     async def clear(self) -> None:
-        """Have the vehicle hold nothing, and see that it does."""
-        self._memory.forget(self._context.now())
+        self._cache.forget(self._context.now())
         await self._channel.clear()
         left = (await self._channel.receive(only=())).count - self._offset
         if left > 0:
-            self._fail(("the vehicle still has items: " + str(left),))
+            self._raise_mismatch((f"the vehicle still has items: {left}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         if await self._uses_file(method):
             try:
                 items = await self._channel.read_file()
             except (FileError, FileTimeout, RemoteProtocolError) as error:
-                self._note_no_file(error, method)
+                self._on_file_error(error, method)
             else:
-                self._memory.has_file = True
-                self._memory.learn(items, self._context.now())
+                self._cache.has_file = True
+                self._cache.set(items, self._context.now())
                 return items
         received = await self._channel.receive()
-        self._memory.learn(received.items, self._context.now())
+        self._cache.set(received.items, self._context.now())
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
@@ -295,30 +273,30 @@ class PlanTransfer(Generic[PlanT]):
         has_ftp = await self._channel.has_ftp()
         if method == "ftp":
             if not has_ftp:
-                raise NotSupported(f"{self._kind}: the vehicle has no file transfer; nothing was sent")
+                raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
-        # ArduPilot empties the old mission first, and cannot do so while it flies it
-        is_flown = is_upload and self._type == 0 and self._context.is_flown
-        return has_ftp and self._memory.has_file is not False and not is_flown
+        # ArduPilot clears the old mission first, and refuses that while it flies it.
+        is_flying = is_upload and self._type == 0 and self._context.is_flying_mission
+        return has_ftp and self._cache.has_file is not False and not is_flying
 
-    def _note_no_file(self, error: Exception, method: str) -> None:
-        """Use items from now on, unless files are insisted on, or used to be there: then raise the error."""
-        if method == "ftp" or (self._memory.has_file and not isinstance(error, FileError)):
+    def _on_file_error(self, error: Exception, method: str) -> None:
+        """Use items from now on; raise the error if files were requested or have worked before."""
+        if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
-        self._memory.has_file = False
+        self._cache.has_file = False
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         end = await self._channel.send(items)
-        self._memory.learn(items, self._context.now())
-        if (end.is_sure and not verify) or await self._has_checksum_of(items):
+        self._cache.set(items, self._context.now())
+        if (end.is_confirmed and not verify) or await self._has_checksum_of(items):
             return
         try:
-            await self._verify(items, method)
+            self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
         except VerificationFailed as error:
-            if end.is_sure:
+            if end.is_confirmed:
                 raise
             raise MissionRejected(
-                f"{self._kind}: the vehicle refused, at about item {end.item}, and holds something else now",
+                f"{self._name}: the vehicle refused at about item {end.item}, and now holds something else",
                 result=MavMissionResult.ERROR,
                 item=end.item,
                 reasons=error.differences,
@@ -328,7 +306,7 @@ class PlanTransfer(Generic[PlanT]):
         try:
             await self._channel.write_file(items)
         except (FileError, FileTimeout) as error:
-            self._note_no_file(error, method)
+            self._on_file_error(error, method)
         else:
             found = await self._read(method)
             try:
@@ -337,78 +315,70 @@ class PlanTransfer(Generic[PlanT]):
             except VerificationFailed:
                 if method == "ftp":
                     raise
-        # there is no such file; or something was refused, and the other protocol tells which item, and why
+        # There is no such file, or an item was refused: the mission protocol reports which one and why.
         await self._send_items(items, method, verify=True)
 
-    # -------------------------------------------------------------------------------- changes
-
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only what differs; False when it is not known what the vehicle holds, or this is no shorter way."""
+        """Send only differences; False if the vehicle's plan is unknown, or this is not faster."""
         autopilot = self._context.autopilot
-        if autopilot.tells_mission_checksum:
-            told = self._context.id_of(self._type, self._memory.learned_at)
+        if autopilot.reports_mission_checksum:
+            reported = self._context.plan_id(self._type, self._cache.updated_at)
             checksum = mission_checksum(items)
-            # still, not a moment ago
-            if told == checksum and await self._context.is_called(self._type, checksum):
+            # The plan may have been replaced a moment ago, so wait for the next report, too.
+            if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
                 return True
-        if not autopilot.writes_partial_missions or not self._is_short(self._changes(items), len(items)):
+        if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changes(items), len(items)):
             return False
-        await self._read(method)  # somebody else may have changed it since
+        await self._read(method)  # Another station may have changed the plan.
         changes = self._changes(items)
         if changes == []:
             return True
-        if changes is None or not self._is_short(changes, len(items)):
+        if changes is None or not self._is_worthwhile(changes, len(items)):
             return False
-        held = list(self._memory.items or ())
-        self._memory.forget(self._context.now())
+        held = list(self._cache.items or ())
+        self._cache.forget(self._context.now())
         for part in _stretches(changes):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
                 return False
             held[part.start : part.stop] = items[part.start : part.stop]
-        self._memory.learn(held, self._context.now())
+        self._cache.set(held, self._context.now())
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first: int, *, verify: bool) -> bool:
         end = await self._channel.send_part(items, first)
         if end is None:
             return False
-        if verify or not end.is_sure:
+        if verify or not end.is_confirmed:
             seqs = range(first, first + len(items))
             received = await self._channel.receive(only=seqs)
             self._compare(dict(zip(seqs, items)), dict(zip(seqs, received.items)))  # noqa: B905 - may be shorter
         return True
 
     def _changes(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Where these items differ from those the vehicle is known to hold; None when it holds another number."""
-        held = self._memory.items
+        """Numbers of the items that differ from the known plan; None if that has another number of items."""
+        held = self._cache.items
         if held is None or len(held) != len(items):
             return None
         return [seq for seq in changed_items(items, held, self._storage) if seq >= self._offset]
 
     @staticmethod
-    def _is_short(changes: Collection[int] | None, count: int) -> bool:
+    def _is_worthwhile(changes: Collection[int] | None, count: int) -> bool:
         if changes is None:
             return False
-        return len(changes) + PART_COSTS * len(list(_stretches(changes))) < count or len(changes) == 0
-
-    # ------------------------------------------------------------------------------ verifying
+        return len(changes) + PART_OVERHEAD_ITEMS * len(list(_stretches(changes))) < count or len(changes) == 0
 
     async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
-        """Whether the vehicle soon tells the checksum of these items, where that is quicker than reading them back."""
+        """Wait for the checksum of these items, if that is faster than reading them back; True if it arrives."""
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
         takes_s = len(items) / autopilot.mission_download_window * round_trip_s
-        if not autopilot.tells_mission_checksum or takes_s < CHECKSUM_TAKES_S:
+        if not autopilot.reports_mission_checksum or takes_s < CHECKSUM_INTERVAL_S:
             return False
         checksum = mission_checksum(items)
-        if not await self._context.is_called(self._type, checksum):
+        if not await self._context.wait_for_plan_id(self._type, checksum):
             return False
-        self._memory.learn(items, self._context.now())
+        self._cache.set(items, self._context.now())
         return True
-
-    async def _verify(self, items: Sequence[MissionItem], method: str) -> None:
-        found = await self._read(method)
-        self._compare(dict(enumerate(items)), dict(enumerate(found)))
 
     def _compare(self, wanted: dict[int, MissionItem], found: dict[int, MissionItem]) -> None:
         differences = []
@@ -418,25 +388,23 @@ class PlanTransfer(Generic[PlanT]):
         for seq in sorted(wanted.keys() & found.keys()):
             if seq >= self._offset:
                 item, other = shift_jumps([wanted[seq], found[seq]], -self._offset)
-                texts = item_differences(
-                    item, other, self._storage, single_precision=self._channel.is_single_precision
-                )
+                texts = item_differences(item, other, self._storage, single_precision=self._channel.is_single_precision)
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]
         if differences:
-            self._fail(tuple(differences))
+            self._raise_mismatch(tuple(differences))
 
-    def _fail(self, differences: tuple[str, ...]) -> None:
-        self._memory.forget(self._context.now())
-        message = f"{self._kind}: the vehicle confirmed, and holds something else than it was sent"
+    def _raise_mismatch(self, differences: tuple[str, ...]) -> None:
+        self._cache.forget(self._context.now())
+        message = f"{self._name}: the vehicle confirmed the plan, but holds something else"
         raise VerificationFailed(message, differences=differences)
 
     @property
-    def _kind(self) -> str:
-        return KINDS[self._type]
+    def _name(self) -> str:
+        return PLAN_NAMES[self._type]
 
 
 def _stretches(seqs: Collection[int]) -> Iterator[range]:
-    """Numbers in a row: 3, 4, 7 → 3–4, 7."""
+    """Ranges of consecutive numbers: 3, 4, 7 → 3–4, 7."""
     start = previous = None
     for seq in sorted(seqs):
         if previous is not None and start is not None and seq > previous + 1:

@@ -1,1 +1,1 @@
-"""The parameters of one autopilot."""
+"""Parameters of one autopilot: download, read, write, transactions."""

@@ -1,4 +1,4 @@
-"""``ParameterAccess``: parameters of one vehicle by the names they have there: lists, reads, writes."""
+"""``ParameterAccess``: lists, reads and writes parameters by the names that the vehicle uses."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import anyio
 
-from aerokit.errors import (
-    FileError,
-    FileTimeout,
-    NotSupported,
-    RemoteProtocolError,
-)
+from aerokit.errors import FileError, FileTimeout, NotSupported, RemoteProtocolError
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavProtocolCapability
 from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
@@ -28,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from aerokit.protocols.exchange import OnProgress
-    from aerokit.protocols.parameter_requests import Answer
+    from aerokit.protocols.parameter_requests import ParameterAnswer
     from aerokit.vehicle.files.files import Files
     from aerokit.vehicle.parameters.store import ParameterCache
     from aerokit.vehicle.session.transfers import Transfers
@@ -36,26 +31,27 @@ if TYPE_CHECKING:
 DownloadMethod = Literal["auto", "ftp", "list"]
 UploadMethod = Literal["auto", "ftp", "set"]
 CacheChoice = bool | str | os.PathLike[str]
-"""False: no cache; True: the one of this user; or a directory."""
+"""False: no cache; True: the user's cache directory; or the path of another directory."""
 
-FIRST_ANSWER_S, FIRST_ATTEMPTS = 2.0, 3
-"""Silent for so long, and for so many sendings, MAVFTP is not there, whatever the vehicle says."""
-ANSWER_S = 0.1
-AS_BEFORE = 0
-ECHOES_S = 3.0
-"""How long after a write late and repeated answers to it may still come."""
-FEW_READS = 5
-"""More are not answered at once."""
-SLOW_S = 0.5
-"""After this long it is doubtful whether the vehicle has a parameter: to find out takes several rounds of requests."""
-LEAST_TO_PACK = 10
-"""Fewer changes than that are set one by one: it takes no longer, and each is confirmed by the vehicle itself."""
-MOST_TO_READ_BACK = 100
-"""More than that are read back by a download."""
+# MAVFTP is taken as unsupported after this long, or this many attempts, without an answer, even if it is advertised.
+FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS = 2.0, 3
+ANSWER_DELAY_S = 0.1
+# SET_MESSAGE_INTERVAL: the default rate of the autopilot.
+DEFAULT_INTERVAL = 0
+# Late or repeated answers to a write may arrive for this long.
+ECHO_WINDOW_S = 3.0
+# ArduPilot answers this many reads at once; more wait for its next turn.
+MAX_READS_UNBOOSTED = 5
+# Finding out whether a parameter exists takes several requests, so the rate is raised after this time.
+BOOST_DELAY_S = 0.5
+# Fewer changes are set one by one, which is as fast, and confirmed by the vehicle.
+MIN_PACK_SIZE = 10
+# More values than this are read back by a download.
+MAX_READ_BACK = 100
 
 
 class ParameterAccess:
-    """What the vehicle has, and how to get and change it. Knows nothing of renamed parameters."""
+    """The parameters of one vehicle. Does not translate renamed parameters."""
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
@@ -64,30 +60,27 @@ class ParameterAccess:
         self._writing = asyncio.Lock()
         self._has_pack: bool | None = None
         self._answers: RoundTrip | None = None
-        self._attending = 0
+        self._boosts = 0
         self._written_at: dict[str, float] = {}
+        # Last value of each parameter that this program has written and the vehicle has confirmed.
         self.written: dict[str, int | float] = {}
-        """What the vehicle has confirmed of the last write of each, by this program."""
 
     @property
     def _answer_time(self) -> RoundTrip:
-        """How long reads take. Not the link's own time: ArduPilot answers ten times a second, five reads each time."""
+        # Longer than the round trip of the link: ArduPilot answers five reads, ten times a second.
         if self._answers is None:
             link_s = self._transfers.round_trip.smoothed_s
-            self._answers = RoundTrip(None if link_s is None else link_s + ANSWER_S)
+            self._answers = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
         return self._answers
 
     @property
     def has_upper_case_names(self) -> bool:
-        """Whether all parameters of this autopilot are spelled in capitals."""
+        """True if all parameter names of this autopilot are in upper case."""
         return self._transfers.autopilot.has_upper_case_parameters
 
     def forget(self) -> None:
-        """The vehicle has started anew, perhaps with another firmware."""
         self.store.forget()
         self._has_pack = None
-
-    # ------------------------------------------------------------------------------- all of them
 
     async def download(
         self,
@@ -95,81 +88,75 @@ class ParameterAccess:
         *,
         refresh: bool,
         cache: CacheChoice,
-        patience_s: float,
+        idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> ParameterTable:
-        """The whole table; see :meth:`Parameters.download`."""
         async with self._downloading:
             if self.store.is_complete and not refresh:
                 return self.store.table
-            keeper = None
+            cached_list = None
             if cache is not False and self._transfers.autopilot.has_parameter_hash:
                 from aerokit.vehicle.parameters.store import ParameterCache
 
-                keeper = _Keeper(self, ParameterCache(None if cache is True else cache), patience_s)
-                if await keeper.begin(refresh):
+                cached_list = _CachedList(self, ParameterCache(None if cache is True else cache), idle_timeout_s)
+                if await cached_list.load_if_current(refresh):
                     return self.store.table
-            await self._download(method, patience_s, on_progress)
-            if keeper is not None:
-                await keeper.keep()
+            await self._download(method, idle_timeout_s, on_progress)
+            if cached_list is not None:
+                await cached_list.save()
             return self.store.table
 
-    async def _download(
-        self, method: DownloadMethod, patience_s: float, on_progress: OnProgress | None
-    ) -> None:
+    async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         if method == "ftp" or (method == "auto" and await self.has_pack()):
             try:
-                with nullcontext() if method == "ftp" else self._unless_silent():
-                    await self._download_pack(patience_s, on_progress)
+                with nullcontext() if method == "ftp" else self._ftp_probe():
+                    await self._download_pack(idle_timeout_s, on_progress)
                 return
             except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
                 if method == "ftp":
                     raise
-                is_for_now = isinstance(error, RemoteProtocolError) or (
+                is_temporary = isinstance(error, RemoteProtocolError) or (
                     isinstance(error, FileError) and error.code == MavFtpErr.NOSESSIONSAVAILABLE
                 )
-                self._has_pack = None if is_for_now else False
-        await self._download_list(patience_s, on_progress)
+                self._has_pack = None if is_temporary else False
+        await self._download_list(idle_timeout_s, on_progress)
 
     @contextmanager
-    def _unless_silent(self) -> Iterator[None]:
-        """FileTimeout soon when MAVFTP is not answered at all: relays drop it, and there is another way."""
+    def _ftp_probe(self) -> Iterator[None]:
+        """Raise FileTimeout early if MAVFTP is not answered at all: some relays drop it, and there is another way."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
-        at_most_s = max(FIRST_ANSWER_S, FIRST_ATTEMPTS * round_trip.timeout_s())
-        heard: list[object] = []
-        detach = connection.bus.attach(
-            FileTransferProtocol, heard.append, system_id=self._transfers.system_id
-        )
+        timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
+        answers: list[object] = []
+        detach = connection.bus.attach(FileTransferProtocol, answers.append, system_id=self._transfers.system_id)
         with anyio.CancelScope() as scope:
-            timer = asyncio.get_running_loop().call_later(
-                at_most_s, lambda: None if heard else scope.cancel()
-            )
+            timer = asyncio.get_running_loop().call_later(timeout_s, lambda: None if answers else scope.cancel())
             try:
                 yield
             finally:
                 timer.cancel()
                 detach()
         if scope.cancelled_caught:
-            raise FileTimeout(f"MAVFTP was not answered within {at_most_s:.1f} s")
+            raise FileTimeout(f"MAVFTP was not answered within {timeout_s:.1f} s")
 
     async def has_pack(self) -> bool:
-        """Whether the vehicle seems to give ``@PARAM/param.pck``: it has MAVFTP, and did not refuse it."""
+        """Return True if the vehicle has MAVFTP and has not refused ``@PARAM/param.pck``."""
         if self._has_pack is not None:
             return self._has_pack
         capabilities = await self._transfers.capabilities()
         return bool(capabilities and capabilities & MavProtocolCapability.FTP)
 
-    async def _download_pack(self, patience_s: float, on_progress: OnProgress | None) -> None:
-        """Read the file, again when it does not hold together.
+    async def _download_pack(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
+        """Read the packed file; retry if its content is inconsistent.
 
-        ArduPilot makes it up as it is read: where a parameter comes to differ from its default meanwhile, all behind it
-        moves by some bytes, and holes that are filled do not fit. Without defaults nothing moves.
+        ArduPilot generates it while it is read: when a parameter comes to differ from its default meanwhile, all
+        following data moves by some bytes, and blocks read at different times do not fit. Without defaults, nothing
+        moves.
         """
         from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
 
         for path in (PACK_PATH_WITH_DEFAULTS, PACK_PATH_WITH_DEFAULTS, PACK_PATH):
             since = self.store.updates
-            data = await self._files.read(path, patience_s=patience_s, on_progress=on_progress)
+            data = await self._files.read(path, idle_timeout_s=idle_timeout_s, on_progress=on_progress)
             try:
                 table = unpack_parameters(data)
             except RemoteProtocolError:
@@ -183,13 +170,11 @@ class ParameterAccess:
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
         known = self.store.table
         return ParameterTable(
-            Parameter(each.name, each.value, each.type, known[each.name].default, each.index)
-            if each.default is None and each.name in known
-            else each
-            for each in table.values()
+            param.replace(default=known[param.name].default) if param.default is None and param.name in known else param
+            for param in table.values()
         )
 
-    async def _download_list(self, patience_s: float, on_progress: OnProgress | None) -> None:
+    async def _download_list(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         from aerokit.protocols.parameter_list import ParameterList
 
         transfers = self._transfers
@@ -198,20 +183,18 @@ class ParameterAccess:
             transfers.component_id,
             bytewise=self.store.bytewise,
             round_trip=self._answer_time,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,
         )
         since = self.store.updates
-        with self._attended():
+        with self._boosted():
             table = await transfers.run(exchange)
         self.store.replace(self._with_known_defaults(table), since=since)
 
-    # ------------------------------------------------------------------------------- some of them
-
     async def read(
-        self, names: Iterable[str], patience_s: float, *, are_doubtful: bool = False
-    ) -> dict[str, Answer]:
-        """What the vehicle says of each of them; ``are_doubtful``: perhaps it has none of these names."""
+        self, names: Iterable[str], idle_timeout_s: float, *, probe: bool = False
+    ) -> dict[str, ParameterAnswer]:
+        """Read parameters; ``probe``: the vehicle may not have them."""
         names = tuple(names)
         if not names:
             return {}
@@ -224,55 +207,52 @@ class ParameterAccess:
             transfers.component_id,
             names,
             bytewise=store.bytewise,
-            are_doubtful=are_doubtful,
-            rivals={name: other_names(name) for name in names} if are_doubtful else {},
-            distrusted={name: old for name in names if (old := store.distrusted(name)) is not None},
+            probe=probe,
+            alternatives={name: other_names(name) for name in names} if probe else {},
+            possibly_stale={name: old for name in names if (old := store.replaced_value(name)) is not None},
             own_system=transfers.connection.source_system,
             round_trip=self._answer_time,
-            patience_s=patience_s,
+            idle_timeout_s=idle_timeout_s,
         )
-        with self._attended(after_s=0.0 if len(names) > FEW_READS else SLOW_S if are_doubtful else math.inf):
+        with self._boosted(after_s=0.0 if len(names) > MAX_READS_UNBOOSTED else BOOST_DELAY_S if probe else math.inf):
             return await transfers.run(exchange)
 
     @contextmanager
-    def _attended(self, *, after_s: float = 0.0) -> Iterator[None]:
-        """Have the vehicle see to parameters more often until the block ends, where that can be had.
+    def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
+        """Raise the rate at which ArduPilot handles parameters, by SET_MESSAGE_INTERVAL of PARAM_VALUE.
 
-        It is asked by SET_MESSAGE_INTERVAL once the block has lasted ``after_s`` seconds, and again at its end.
+        Sent after ``after_s`` seconds, if the block lasts that long, and restored at its end.
         """
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
             yield
             return
-        has_begun = False
+        is_boosted = False
 
-        def begin() -> None:
-            nonlocal has_begun
-            has_begun = True
-            self._attending += 1
-            if self._attending == 1:
+        def boost() -> None:
+            nonlocal is_boosted
+            is_boosted = True
+            self._boosts += 1
+            if self._boosts == 1:
                 self._set_interval(interval_s * 1e6)
 
-        timer = asyncio.get_running_loop().call_later(after_s, begin)
+        timer = asyncio.get_running_loop().call_later(after_s, boost)
         try:
             yield
         finally:
             timer.cancel()
-            if has_begun:
-                self._attending -= 1
-                if not self._attending:
-                    self._set_interval(AS_BEFORE)
+            if is_boosted:
+                self._boosts -= 1
+                if not self._boosts:
+                    self._set_interval(DEFAULT_INTERVAL)
 
     def _set_interval(self, interval_us: float) -> None:
         self._transfers.command_in_background(MavCmd.SET_MESSAGE_INTERVAL, ParamValue.ID, interval_us)
 
     async def write(
-        self,
-        wanted: Iterable[Parameter],
-        patience_s: float,
-        on_progress: OnProgress | None = None,
-    ) -> dict[str, Answer]:
-        """Set each of them; what the vehicle says it is then. Writes of other tasks wait until it is done."""
+        self, wanted: Iterable[Parameter], idle_timeout_s: float, on_progress: OnProgress | None = None
+    ) -> dict[str, ParameterAnswer]:
+        """Set parameters and return the vehicle's values. Writes of other tasks wait."""
         wanted = tuple(wanted)
         if not wanted:
             return {}
@@ -281,11 +261,13 @@ class ParameterAccess:
         transfers = self._transfers
         async with self._writing:
             before = {
-                each.name: each.value for each in map(self.store.get, _names(wanted)) if each is not None
+                parameter.name: parameter.value
+                for parameter in map(self.store.get, _names(wanted))
+                if parameter is not None
             }
             for name in _names(wanted):
                 self.written.pop(name, None)
-                self.store.trust(name)
+                self.store.clear_replaced(name)
             recent = self._recently_written() & set(_names(wanted))
             exchange = ParameterWrites(
                 transfers.system_id,
@@ -296,70 +278,68 @@ class ParameterAccess:
                 recent=recent,
                 own_system=transfers.connection.source_system,
                 round_trip=self._answer_time if recent else transfers.round_trip,
-                patience_s=patience_s,
+                idle_timeout_s=idle_timeout_s,
                 on_progress=on_progress,
             )
-            with self._attended(after_s=0.0 if len(recent) > FEW_READS else math.inf):
+            with self._boosted(after_s=0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf):
                 answers = await transfers.run(exchange)
             for name, answer in answers.items():
                 self._written_at[name] = transfers.connection.now()
                 if isinstance(answer, Parameter):
                     self.written[name] = answer.value
                 if isinstance(answer, Parameter) and name in before and answer.value != before[name]:
-                    self.store.distrust(name, before[name])
+                    self.store.mark_replaced(name, before[name])
             return answers
 
     def _recently_written(self) -> set[str]:
-        """Those are read back after the next write, too: echoes of the last one may still come."""
+        """Names whose values may still be echoed: the next write of one of them is read back."""
         now = self._transfers.connection.now()
-        self._written_at = {name: at for name, at in self._written_at.items() if now - at < ECHOES_S}
+        self._written_at = {name: at for name, at in self._written_at.items() if now - at < ECHO_WINDOW_S}
         return set(self._written_at)
 
     async def write_pack(
         self,
         wanted: Iterable[Parameter],
         method: UploadMethod,
-        patience_s: float,
+        idle_timeout_s: float,
         on_progress: OnProgress | None,
-    ) -> dict[str, Answer]:
-        """As :meth:`write`, all in one file where that works; what did not arrive that way is set one by one."""
+    ) -> dict[str, ParameterAnswer]:
+        """Like :meth:`write`, but in one file if possible; values that were not applied are then set one by one."""
         wanted = tuple(wanted)
-        if method == "set" or (
-            method == "auto" and (len(wanted) < LEAST_TO_PACK or not await self.has_pack())
-        ):
-            return await self.write(wanted, patience_s, on_progress)
-        answers: dict[str, Answer] = {}
+        if method == "set" or (method == "auto" and (len(wanted) < MIN_PACK_SIZE or not await self.has_pack())):
+            return await self.write(wanted, idle_timeout_s, on_progress)
+        answers: dict[str, ParameterAnswer] = {}
         try:
             async with self._writing:
-                await self._upload_pack(wanted, patience_s, on_progress)
-            answers = await self._read_back(wanted, patience_s)
+                await self._upload_pack(wanted, idle_timeout_s, on_progress)
+            answers = await self._read_back(wanted, idle_timeout_s)
         except (FileError, FileTimeout, NotSupported):
             if method == "ftp":
                 raise
-        left = [each for each in wanted if not self._is_there(each, answers.get(each.name))]
-        self.written.update({each.name: each.value for each in wanted if each not in left})
-        return {each.name: answers[each.name] for each in wanted if each not in left} | await self.write(
-            left, patience_s, on_progress
-        )
+        left = [param for param in wanted if not self._was_applied(param, answers.get(param.name))]
+        applied = [param for param in wanted if param not in left]
+        self.written.update({param.name: param.value for param in applied})
+        remaining = await self.write(left, idle_timeout_s, on_progress)
+        return {param.name: answers[param.name] for param in applied} | remaining
 
     async def _upload_pack(
-        self, wanted: tuple[Parameter, ...], patience_s: float, on_progress: OnProgress | None
+        self, wanted: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
         from aerokit.parameters.pack import PACK_PATH, pack_parameters
 
         await self._files.write(
-            PACK_PATH, pack_parameters(wanted), patience_s=patience_s, on_progress=on_progress
+            PACK_PATH, pack_parameters(wanted), idle_timeout_s=idle_timeout_s, on_progress=on_progress
         )
 
-    async def _read_back(self, wanted: tuple[Parameter, ...], patience_s: float) -> dict[str, Answer]:
-        if len(wanted) <= MOST_TO_READ_BACK:
-            return await self.read(_names(wanted), patience_s)
-        await self.download("auto", refresh=True, cache=False, patience_s=patience_s, on_progress=None)
+    async def _read_back(self, wanted: tuple[Parameter, ...], idle_timeout_s: float) -> dict[str, ParameterAnswer]:
+        if len(wanted) <= MAX_READ_BACK:
+            return await self.read(_names(wanted), idle_timeout_s)
+        await self.download("auto", refresh=True, cache=False, idle_timeout_s=idle_timeout_s, on_progress=None)
         table = self.store.table
         return {name: table[name] for name in _names(wanted) if name in table}
 
-    def _is_there(self, wanted: Parameter, answer: Answer | None) -> bool:
-        """Whether a value has arrived; one read back as a number in a float has lost its last bits."""
+    def _was_applied(self, wanted: Parameter, answer: ParameterAnswer | None) -> bool:
+        """Compare; a value that was read as a float lacks its last bits."""
         if not isinstance(answer, Parameter):
             return False
         if self.store.bytewise:
@@ -367,15 +347,15 @@ class ParameterAccess:
         return same_value(float(answer.value), float(wanted.value))
 
 
-class _Keeper:
-    """One download and the file in the cache that spares it."""
+class _CachedList:
+    """The cached list of a vehicle, used if the vehicle's parameter hash has not changed."""
 
-    def __init__(self, access: ParameterAccess, cache: ParameterCache, patience_s: float) -> None:
-        self._access, self._cache, self._patience_s = access, cache, patience_s
+    def __init__(self, access: ParameterAccess, cache: ParameterCache, idle_timeout_s: float) -> None:
+        self._access, self._cache, self._idle_timeout_s = access, cache, idle_timeout_s
         self._hash: int | None = None
 
-    async def begin(self, refresh: bool) -> bool:
-        """Whether the list on disk is that of the vehicle and wanted: then it is the store's now."""
+    async def load_if_current(self, refresh: bool) -> bool:
+        """Load the list into the store if it is current, and return True then."""
         key, store, since = await self._key(), self._access.store, self._access.store.updates
         self._hash = await self._read_hash()
         table = None if refresh or self._hash is None else self._cache.load(key, self._hash)
@@ -384,8 +364,8 @@ class _Keeper:
         store.replace(table, since=since)
         return True
 
-    async def keep(self) -> None:
-        """Write the list to disk, if nothing has changed while it came."""
+    async def save(self) -> None:
+        """Save the downloaded list, unless parameters changed during the download."""
         if self._hash is not None and self._hash == await self._read_hash():
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 
@@ -397,9 +377,9 @@ class _Keeper:
         return vehicle_key(transfers.autopilot.name, transfers.system_id, transfers.version)
 
     async def _read_hash(self) -> int | None:
-        answer = (await self._access.read([HASH_NAME], self._patience_s))[HASH_NAME]
+        answer = (await self._access.read([HASH_NAME], self._idle_timeout_s))[HASH_NAME]
         return int(answer.value) if isinstance(answer, Parameter) else None
 
 
 def _names(parameters: Iterable[Parameter]) -> list[str]:
-    return [each.name for each in parameters]
+    return [parameter.name for parameter in parameters]

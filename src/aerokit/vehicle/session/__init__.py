@@ -1,1 +1,1 @@
-"""Talking to one vehicle: commands, rates, transfers, silence, keys."""
+"""Communication with one vehicle: commands, message rates, transfers, silence, signing keys."""

@@ -1,4 +1,4 @@
-"""Sends any MAV_CMD to one vehicle and awaits its result; one command of a kind at a time."""
+"""Sends any MAV_CMD to one vehicle and awaits its result; equal commands are sent one at a time."""
 
 from __future__ import annotations
 
@@ -18,27 +18,25 @@ if TYPE_CHECKING:
 
     from aerokit.connection.connection import Connection
     from aerokit.mavlink.messages import CommandInt, CommandLong
-    from aerokit.protocols.command import Standing
+    from aerokit.protocols.command import OrderStatus
 
 UNKNOWN = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
-"""What firmware says that does not know a command, or not in the form that it had."""
+"""MAV_RESULTs of firmware that does not support a command, or not in this form."""
+# Nothing is sent again before this many measured round trips, because the answer may still arrive.
 ROUND_TRIPS = 2
-"""Nothing is sent again before so many measured round trips: the answer is still under way."""
-LONGEST_ATTEMPT_S = 5.0
-UNDER_WAY_S = 2.0
-"""An answer that has not come by then was lost."""
+MAX_ATTEMPT_TIMEOUT_S = 5.0
+PENDING_ACK_TIMEOUT_S = 2.0
+"""Seconds after which an expected COMMAND_ACK is considered lost."""
 
 _Key = tuple[int, int]
-"""Component id, command."""
 
 
 class CommandSender:
     """The command protocol with one vehicle (https://mavlink.io/en/services/command.html).
 
-    COMMAND_ACK carries no request id, so two equal commands to one component follow each other; different
-    commands never wait for each other. An order that a newer one has ended makes way at once, and one that ended while
-    it waited is not sent. What a cancelled or unconfirmed command left under way is not taken for the
-    answer to the next one.
+    COMMAND_ACK carries no request id, so equal commands to one component are serialized; different commands never
+    wait for each other. A command of an order that has ended is aborted in favour of a newer one, and is not sent if
+    it ended while waiting. Acks of cancelled and unconfirmed commands are not mistaken for the ack of the next one.
     """
 
     def __init__(
@@ -56,8 +54,8 @@ class CommandSender:
         self._acks_per_command = acks_per_command
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
-        self._standings: dict[_Key, Standing | None] = {}
-        """Of those that run."""
+        # Guards of the running commands.
+        self._standings: dict[_Key, OrderStatus | None] = {}
         self._under_way: dict[_Key, list[float]] = {}
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
@@ -68,7 +66,7 @@ class CommandSender:
         )
 
     def close(self) -> None:
-        """Stop listening to answers: what waits for one, and what is asked for from now on, raises."""
+        """Stop receiving acks; calls that wait for one, and later calls, raise ConnectionClosed."""
         for detach in self._detach:
             detach()
         self._is_closed = True
@@ -83,13 +81,13 @@ class CommandSender:
         attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        standing: Standing | None = None,
+        order_status: OrderStatus | None = None,
         is_sent: bool = False,
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`."""
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
-        options = (attempts, attempt_timeout, progress_timeout, on_progress, standing, is_sent)
+        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status, is_sent)
         return await self._run(message, *options)
 
     async def send_int(
@@ -105,14 +103,12 @@ class CommandSender:
         attempt_timeout: float | None = None,
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
-        standing: Standing | None = None,
+        order_status: OrderStatus | None = None,
     ) -> CommandAck:
         """Send a COMMAND_INT with param1 to param4, x, y, z and return its ACCEPTED ack."""
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
-        return await self._run(
-            message, attempts, attempt_timeout, progress_timeout, on_progress, standing, False
-        )
+        return await self._run(message, attempts, attempt_timeout, progress_timeout, on_progress, order_status, False)
 
     async def send_place(
         self,
@@ -121,55 +117,57 @@ class CommandSender:
         x: int,
         y: int,
         z: float,
-        standing: Standing | None = None,
+        order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a place above the sea: as COMMAND_INT, or COMMAND_LONG where that is not known."""
+        """Send a command with a position above mean sea level: as COMMAND_INT, or COMMAND_LONG if that is not
+        supported.
+        """
         try:
             return await self.send_int(
-                command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, standing=standing, **options
+                command, *params, frame=MavFrame.GLOBAL_INT, x=x, y=y, z=z, order_status=order_status, **options
             )
         except CommandRejected as error:
             is_known = error.result not in UNKNOWN
-            if is_known or (standing is not None and standing.end):
+            if is_known or (order_status is not None and order_status.end):
                 raise
         place = (x * 1e-7, y * 1e-7, z)
         fill = (0.0,) * (4 - len(params))
-        return await self.send_long(command, *params, *fill, *place, standing=standing, **options)
+        return await self.send_long(command, *params, *fill, *place, order_status=order_status, **options)
 
     def send_unconfirmed(self, command: int, *params: float, component_id: int | None = None) -> None:
-        """Send a COMMAND_LONG once and do not wait: for ends of blocks, which must not await."""
+        """Send a COMMAND_LONG once without waiting, for code that must not await."""
         target = self._component_id if component_id is None else component_id
         self._connection.send(command_long(self._system_id, target, command, params))
         self._expect_answers((target, command), self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
-        """Whether it answers us, and not another ground station; targets are 0 in MAVLink 1 and old firmwares."""
+        """Return True if the ack is addressed to us. Targets are 0 in MAVLink 1 and in old firmware."""
         return ack.target_system in (0, self._connection.source_system) and ack.target_component in (
             0,
             self._connection.source_component,
         )
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
-        """What it answered last to a command of ours (MAV_RESULT), also if nobody waited any more."""
+        """Return the last MAV_RESULT of this command, also if its call was cancelled."""
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unknown(self, command: int, component_id: int | None = None) -> bool:
-        """Whether it has said that it does not know a command, or not in the form that it had."""
+        """Return True if the vehicle answered that it does not support the command, or not in this form."""
         return self.last_result(command, component_id) in UNKNOWN
 
     def accepted_at(self, command: int) -> float:
-        """When the autopilot last accepted a command of ours, by an answer that names us; −inf: it has not."""
+        """Return the time of the last ACCEPTED ack that was addressed to us, by the autopilot; −inf without one."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:
-        """What was answered does not count any more."""
+        """Discard the recorded result of this command."""
         key = (self._component_id if component_id is None else component_id, command)
         self._results.pop(key, None)
         self._accepted_at.pop(key, None)
 
     def forget_results(self) -> None:
-        """The vehicle has rebooted: what it knows may be other commands."""
+        """Discard all recorded results, because a rebooted vehicle may support other commands."""
         self._results.clear()
 
     async def _run(
@@ -179,69 +177,72 @@ class CommandSender:
         attempt_timeout: float | None,
         progress_timeout: float,
         on_progress: Callable[[int | None], None] | None,
-        standing: Standing | None,
+        order_status: OrderStatus | None,
         is_sent: bool,
     ) -> CommandAck:
         key = (
             message.target_component or self._component_id,
             message.command,
-        )  # to all: the autopilot answers
+        )  # The autopilot answers commands to all components.
         self._make_way(key)
-        end = "" if standing is None else standing.end
+        end = "" if order_status is None else order_status.end
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
-            if standing is not None and standing.end != end and not is_sent:  # while it waited
-                raise CommandTimeout(f"{command_name(message.command)} was not sent: {standing.end}")
-            answers_to_each = self._acks_of(message.command)
+            # The order ended while the call waited for the lock.
+            if order_status is not None and order_status.end != end and not is_sent:
+                raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
+            acks_per_sending = self._acks_of(message.command)
             earlier = self._take_answers_under_way(key)
             if is_sent:
-                del earlier[-answers_to_each:]
+                del earlier[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
                 own_system=self._connection.source_system,
                 own_component=self._connection.source_component,
                 attempts=attempts,
                 attempt_timeout=attempt_timeout,
-                answers_within_s=self._answers_within_s(),
+                min_timeout_s=self._answers_within_s(),
                 progress_timeout=progress_timeout,
                 on_progress=on_progress,
-                answers_before_ours=len(earlier),
-                answers_to_each=answers_to_each,
-                standing=standing,
+                earlier_answers=len(earlier),
+                acks_per_sending=acks_per_sending,
+                order_status=order_status,
                 is_sent=is_sent,
             )
             run = self._runs[key] = ExchangeRun(self._connection, exchange)
-            self._standings[key] = standing
+            self._standings[key] = order_status
             try:
                 return await run.result()
             except CommandTimeout as error:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
             finally:
                 del self._runs[key], self._standings[key]
-                self._expect_answers(key, exchange.answers_to_come, earlier[exchange.answers :])
+                self._expect_answers(key, exchange.pending_answers, earlier[exchange.answers :])
 
     def _make_way(self, key: _Key) -> None:
-        """An order that has ended keeps no newer one waiting for its answer."""
-        standing = self._standings.get(key)
-        if standing is not None and standing.end:
-            text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {standing.end}"
+        """Abort a running command whose order has ended, so that the newer one need not wait."""
+        order_status = self._standings.get(key)
+        if order_status is not None and order_status.end:
+            text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"
             self._runs[key].abort(CommandTimeout(text))
 
     def _answers_within_s(self) -> float:
-        """A stalled link that comes back has a round trip of all the time it was away: that is no reason to wait."""
-        return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), LONGEST_ATTEMPT_S)
+        """Return the minimum time to wait for an ack. Limited, because the round trip includes the time of a stalled
+        link.
+        """
+        return min(ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
     def _acks_of(self, command: int) -> int:
         return self._acks_per_command.get(command, 1)
 
     def _expect_answers(self, key: _Key, count: int, earlier: Sequence[float] = ()) -> None:
-        """Remember answers that may still arrive, so that the next command of this key ignores them."""
+        """Record acks that may still arrive, so that the next command of this key ignores them."""
         if expected := [*earlier, *[self._connection.now()] * count]:
             self._under_way.setdefault(key, []).extend(expected)
 
     def _take_answers_under_way(self, key: _Key) -> list[float]:
-        oldest = self._connection.now() - UNDER_WAY_S
+        oldest = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return [at for at in self._under_way.pop(key, ()) if at >= oldest]
 
     def _abort(self, error: Exception) -> None:
@@ -249,7 +250,7 @@ class CommandSender:
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Give an answer to the exchange that waits for it; without one, it was one of those under way."""
+        """Deliver an ack to the running exchange; without one, count it as an expected late ack."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)

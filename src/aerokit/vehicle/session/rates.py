@@ -1,4 +1,4 @@
-"""Message rates: subscribing is the request. The vehicle is asked, watched, and asked again when it forgets."""
+"""Message rates: requests the messages that subscribers need, checks that they arrive, and requests them again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import anyio
 
 from aerokit._internal.arguments import check_range
-from aerokit.autopilots.telemetry import STREAMED
+from aerokit.autopilots.telemetry import STREAMED_MESSAGES
 from aerokit.connection.bus import Overflow, Subscription
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import CommandRejected, CommandTimeout
@@ -32,67 +32,67 @@ if TYPE_CHECKING:
 
 WATCH_PERIOD_S = 1.0
 
+# A rate is evaluated over this many watch periods.
 WATCH_WINDOW = 5
-"""A rate is judged over this many watch periods."""
 
 SLOW_FACTOR = 0.5
 
-ASK_AGAIN_S = 5.0
-"""A stream that does not come at all is asked for again this often, rising to the longest."""
+RETRY_INTERVAL_S = 5.0
+"""Seconds until a missing stream is requested again; doubled each time up to the maximum."""
 
-ASK_AGAIN_LONGEST_S = 60.0
+MAX_RETRY_INTERVAL_S = 60.0
 
 AUTOPILOT_DEFAULT = 0.0
 
 SUBSCRIPTION_HZ = 4.0
-"""How fast a streamed message without a default rate is asked for by a subscription that names no rate."""
+"""Rate in Hz of a streamed message without a default rate, for subscriptions that name none."""
 
 
 def subscription_rate_hz(message_type: type[Message]) -> float | None:
-    """The rate that a subscription asks for when it names none; None: the message is sent when there is need for it."""
+    """Return the rate for a subscription that names none; None for messages that are sent on demand."""
     name = message_type.__name__
-    return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED else None)
+    return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED_MESSAGES else None)
 
 
 def check_rate(message_type: type[Message], hz: float) -> None:
-    """Raise InvalidArgument unless such a message can be asked for at ``hz``: above 0, at most 1000."""
+    """Raise InvalidArgument unless the rate is above 0 and at most 1000 Hz."""
     check_range(f"rate_hz of {message_type.NAME}", hz, 0, 1000, above=True)
 
 
 class _Stream:
-    """What is wanted of one message, what was asked and what came."""
+    """State of one message type: the requested rates, the rate asked of the vehicle, and the count received."""
 
     def __init__(self, message_type: type[Message], component_id: int) -> None:
         self.message_type, self._component_id = message_type, component_id
-        self.wishes: dict[object, float] = {}
+        self.requests: dict[object, float] = {}
         self.is_optional = True
-        self.asked_hz: float | None = None
+        self.requested_hz: float | None = None
         self.refused = False
         self.is_slow = False
         self.count = 0
         self.counts: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
-        self.patience_s = ASK_AGAIN_S
-        self.ask_again_at = math.inf
+        self.retry_interval_s = RETRY_INTERVAL_S
+        self.retry_at = math.inf
         self.failures = 0
         self.not_before = -math.inf
         self.detach: Detach | None = None
 
     @property
-    def wanted_hz(self) -> float:
-        """The fastest wish; 0, the autopilot's own rate, when nobody wishes for anything any more."""
-        return max(self.wishes.values(), default=AUTOPILOT_DEFAULT)
+    def needed_hz(self) -> float:
+        """The highest requested rate; 0, the autopilot's own rate, without requests."""
+        return max(self.requests.values(), default=AUTOPILOT_DEFAULT)
 
     @property
     def is_due(self) -> bool:
-        return not self.refused and self.asked_hz != self.wanted_hz
+        return not self.refused and self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:
         return (self.counts[-1] - self.counts[0]) / ((len(self.counts) - 1) * WATCH_PERIOD_S)
 
-    def was_asked(self, now: float, hz: float) -> None:
-        self.asked_hz = hz
+    def mark_requested(self, now: float, hz: float) -> None:
+        self.requested_hz = hz
         self.counts = deque([self.count], maxlen=WATCH_WINDOW + 1)
-        self.ask_again_at = now + self.patience_s if hz > 0 else math.inf
+        self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
 
     def on_frame(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
@@ -100,11 +100,11 @@ class _Stream:
 
 
 class MessageRates:
-    """Keeps one component sending what somebody wants, at the fastest rate that anybody wants it.
+    """Keeps one component sending the requested messages, each at the highest requested rate.
 
-    Asks by MAV_CMD_SET_MESSAGE_INTERVAL, and by REQUEST_DATA_STREAM once the vehicle has said that it does not know
-    that command (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not come, also
-    after a reboot, is asked for again; one that comes too slowly is told as :class:`StreamSlow`.
+    Uses MAV_CMD_SET_MESSAGE_INTERVAL, or REQUEST_DATA_STREAM if the vehicle does not support that command
+    (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not arrive, also after a
+    reboot, is requested again; one that is too slow is reported as :class:`StreamSlow`.
     """
 
     def __init__(
@@ -121,47 +121,47 @@ class MessageRates:
         self._streams: dict[int, _Stream] = {}
         self._dirty = asyncio.Event()
         self._legacy = False
-        self._times_forgotten = 0
+        self._reset_count = 0
 
-    def want(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
-        """Ask for ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
+    def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
+        """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
-        What is optional may never come (a sensor that is not there): that is no event.
+        An optional message may never arrive (a missing sensor) without an event.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
         if stream is None:
             stream = self._streams[message_type.ID] = self._new_stream(message_type)
         stream.is_optional = stream.is_optional and is_optional
-        if stream.refused:  # perhaps not at this rate
-            stream.refused, stream.asked_hz = False, None
+        if stream.refused:  # A refusal may depend on the rate.
+            stream.refused, stream.requested_hz = False, None
         token = object()
-        stream.wishes[token] = hz
+        stream.requests[token] = hz
         self._dirty.set()
 
         def release() -> None:
-            if stream.wishes.pop(token, None) is not None:
+            if stream.requests.pop(token, None) is not None:
                 self._dirty.set()
 
         return release
 
-    def ask_again(self) -> None:
-        """Forget what was asked, as after a reboot, and ask for everything again."""
+    def request_again(self) -> None:
+        """Request everything again, as after a reboot."""
         for stream in self._streams.values():
-            stream.asked_hz, stream.refused, stream.patience_s = None, False, ASK_AGAIN_S
+            stream.requested_hz, stream.refused, stream.retry_interval_s = None, False, RETRY_INTERVAL_S
             stream.failures, stream.not_before = 0, -math.inf
-        self._times_forgotten += 1
+        self._reset_count += 1
         self._dirty.set()
 
     async def run(self) -> None:
-        """Ask for what is wanted until cancelled; :meth:`watch` must run beside it."""
+        """Send the requests until cancelled; :meth:`watch` must run concurrently."""
         while True:
             await self._dirty.wait()
             self._dirty.clear()
-            await self._ask_for_all_due()
+            await self._request_all_due()
 
     async def watch(self) -> None:
-        """Count what comes and judge it once a second, until cancelled."""
+        """Evaluate the received rates once a second, until cancelled."""
         while True:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
@@ -170,7 +170,7 @@ class MessageRates:
                 self._dirty.set()
 
     def close(self) -> None:
-        """Stop counting."""
+        """Stop counting messages."""
         for stream in self._streams.values():
             if stream.detach is not None:
                 stream.detach()
@@ -180,27 +180,25 @@ class MessageRates:
 
     def _new_stream(self, message_type: type[Message]) -> _Stream:
         stream = _Stream(message_type, self._component_id)
-        stream.detach = self._connection.bus.attach_frames(
-            message_type, stream.on_frame, system_id=self._system_id
-        )
+        stream.detach = self._connection.bus.attach_frames(message_type, stream.on_frame, system_id=self._system_id)
         return stream
 
-    async def _ask_for_all_due(self) -> None:
-        """One after the other, the most urgent next: a new wish does not wait for those that are not answered."""
+    async def _request_all_due(self) -> None:
+        """Send one request after another, the most urgent first: a new one does not wait for unanswered ones."""
         while not self._legacy and (stream := self._most_urgent()) is not None:
-            await self._ask_by_command(stream)
+            await self._request_by_command(stream)
         if self._legacy:
-            self._ask_by_group()
+            self._request_by_group()
 
     def _most_urgent(self) -> _Stream | None:
         now = self._connection.now()
         due = (each for each in self._streams.values() if each.is_due and now >= each.not_before)
         return min(due, key=lambda each: (each.failures, each.is_optional), default=None)
 
-    async def _ask_by_command(self, stream: _Stream) -> None:
-        hz = stream.wanted_hz
+    async def _request_by_command(self, stream: _Stream) -> None:
+        hz = stream.needed_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
-        times_forgotten = self._times_forgotten
+        reset_count = self._reset_count
         try:
             await self._commands.send_long(
                 MavCmd.SET_MESSAGE_INTERVAL,
@@ -211,28 +209,29 @@ class MessageRates:
             )
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
-                self._ask_by_group_from_now_on()
+                self._switch_to_groups()
                 return
             self._was_refused(stream, error)
         except CommandTimeout:
-            if times_forgotten == self._times_forgotten:  # a reboot swallowed the others
+            # Otherwise a reboot has reset all streams meanwhile.
+            if reset_count == self._reset_count:
                 stream.failures += 1
-                stream.not_before = self._connection.now() + min(2.0**stream.failures, ASK_AGAIN_LONGEST_S)
+                stream.not_before = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
             return
         stream.failures = 0
-        stream.was_asked(self._connection.now(), hz)
+        stream.mark_requested(self._connection.now(), hz)
 
-    def _ask_by_group_from_now_on(self) -> None:
+    def _switch_to_groups(self) -> None:
         self._legacy = True
         for stream in self._streams.values():
-            stream.asked_hz = None
+            stream.requested_hz = None
 
     def _was_refused(self, stream: _Stream, error: CommandRejected) -> None:
         stream.refused = True
         self._publish_unavailable(stream, result_name(error.result))
 
-    def _ask_by_group(self) -> None:
-        """REQUEST_DATA_STREAM knows groups only, and has no answer: the watch asks again when nothing comes."""
+    def _request_by_group(self) -> None:
+        """Request groups of messages. REQUEST_DATA_STREAM has no ack, so the watch repeats it when nothing arrives."""
         wanted: dict[int, float] = {}
         for stream in self._streams.values():
             if not stream.is_due:
@@ -243,15 +242,15 @@ class MessageRates:
                 self._publish_unavailable(stream, "in no group of REQUEST_DATA_STREAM")
             else:
                 wanted[group] = self._fastest_of(group)
-            stream.was_asked(self._connection.now(), stream.wanted_hz)
+            stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in wanted.items():
-            if hz > 0:  # what nobody here wants any more may have been running before, for somebody else
+            if hz > 0:  # A group that no subscriber needs may have been started by another ground station.
                 rate = math.ceil(hz)
                 self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
 
     def _fastest_of(self, group: int) -> float:
         members = (s for s in self._streams.values() if self._groups.get(s.message_type.ID) == group)
-        return max((stream.wanted_hz for stream in members), default=AUTOPILOT_DEFAULT)
+        return max((stream.needed_hz for stream in members), default=AUTOPILOT_DEFAULT)
 
     def _publish_unavailable(self, stream: _Stream, reason: str) -> None:
         if stream.is_optional:
@@ -263,28 +262,31 @@ class MessageRates:
 
     def _watch(self, stream: _Stream) -> None:
         stream.counts.append(stream.count)
-        if stream.asked_hz is None or stream.asked_hz <= 0 or stream.refused:
+        if stream.requested_hz is None or stream.requested_hz <= 0 or stream.refused:
             return
         if stream.counts[-1] == stream.counts[0]:
-            self._ask_again_if_silent(stream)
+            self._retry_if_silent(stream)
         else:
-            stream.patience_s, stream.ask_again_at = ASK_AGAIN_S, self._connection.now() + ASK_AGAIN_S
-        self._judge_speed(stream)
+            stream.retry_interval_s, stream.retry_at = (
+                RETRY_INTERVAL_S,
+                self._connection.now() + RETRY_INTERVAL_S,
+            )
+        self._check_rate(stream)
 
-    def _ask_again_if_silent(self, stream: _Stream) -> None:
-        if self._connection.now() >= stream.ask_again_at:
-            stream.patience_s = min(2 * stream.patience_s, ASK_AGAIN_LONGEST_S)
-            stream.asked_hz = None
+    def _retry_if_silent(self, stream: _Stream) -> None:
+        if self._connection.now() >= stream.retry_at:
+            stream.retry_interval_s = min(2 * stream.retry_interval_s, MAX_RETRY_INTERVAL_S)
+            stream.requested_hz = None
             self._dirty.set()
 
-    def _judge_speed(self, stream: _Stream) -> None:
-        if stream.asked_hz is None or len(stream.counts) <= WATCH_WINDOW:
+    def _check_rate(self, stream: _Stream) -> None:
+        if stream.requested_hz is None or len(stream.counts) <= WATCH_WINDOW:
             return
         achieved = stream.achieved_hz()
-        expected = SLOW_FACTOR * stream.asked_hz * WATCH_WINDOW * WATCH_PERIOD_S
-        has_just_begun = achieved > 0 and stream.counts[0] == stream.counts[1]
-        if has_just_begun and not stream.is_slow:
-            return  # nothing came at the beginning of the window: that says nothing of its speed since
+        expected = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S
+        has_just_started = achieved > 0 and stream.counts[0] == stream.counts[1]
+        if has_just_started and not stream.is_slow:
+            return  # The stream has just started, so its rate is not known yet.
         was_slow, stream.is_slow = stream.is_slow, achieved * WATCH_WINDOW * WATCH_PERIOD_S < expected - 1
         if achieved == 0 and stream.is_optional:
             return
@@ -294,7 +296,7 @@ class MessageRates:
                     self._connection.now(),
                     self._system_id,
                     stream.message_type.NAME,
-                    stream.asked_hz,
+                    stream.requested_hz,
                     achieved,
                     self._component_id,
                 )
@@ -306,8 +308,8 @@ ItemT = TypeVar("ItemT", bound="Message | Event")
 MessageT = TypeVar("MessageT", bound=Message)
 
 
-class Hearing:
-    """Listens to one component for a program. ``keep`` has a cell end with the talk, ``at_close`` what listens."""
+class ComponentSubscriber:
+    """Subscriptions and cells for one component. ``keep`` registers a cell, ``at_close`` a callback."""
 
     def __init__(
         self,
@@ -332,9 +334,11 @@ class Hearing:
         overflow: Overflow,
         rate_hz: float | None,
         *,
-        whole_system: bool = False,
+        entire_system: bool = False,
     ) -> Subscription[ItemT]:
-        """Messages of this component, or of the ``whole_system``, and events; this component is asked for rates."""
+        """Return a stream of messages of this component, or of the ``entire_system``, and of events; requests the
+        rates.
+        """
         self._connection.check_types(types)
         messages: list[type[Message]] = [each for each in types if issubclass(each, Message)]
         if rate_hz is not None:
@@ -342,21 +346,21 @@ class Hearing:
                 check_rate(message, rate_hz)
 
         def attach(sink: Sink) -> list[Detach]:
-            wanted = sink if whole_system else self._only(sink)
+            wanted = sink if entire_system else self._only(sink)
             detach = self._connection.attach(types, wanted, system_id=self._system_id)
             detach.append(self._connection.on_end(subscription.close))
             for each in messages:
                 hz = subscription_rate_hz(each) if rate_hz is None else rate_hz
                 if hz is not None:
-                    detach.append(self._rates.want(each, hz))
+                    detach.append(self._rates.request(each, hz))
             return detach
 
         subscription: Subscription[ItemT] = Subscription(attach, capacity=capacity, overflow=overflow)
-        subscription._explain_timeout = lambda: self._connection.describe_signatures(self._system_id)
+        subscription._explain_timeout = lambda: self._connection.describe_signature_problems(self._system_id)
         return subscription
 
     def cell(self, message_type: type[MessageT], rate_hz: float | None) -> StateCell[MessageT]:
-        """The latest message of a kind from this component: the same cell each time, at the rate asked for last."""
+        """Return the cell with the latest message of a type; always the same cell, at the last requested rate."""
         cell = self._cells.get(message_type)
         if cell is None:
             self._connection.check_types((message_type,))
@@ -365,13 +369,13 @@ class Hearing:
             rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
         if rate_hz is not None:
             release = self._cell_rates.pop(message_type, None)
-            self._cell_rates[message_type] = self._rates.want(message_type, rate_hz)
+            self._cell_rates[message_type] = self._rates.request(message_type, rate_hz)
             if release is not None:
                 release()
         return cell
 
     def listen(self, message_type: type[MessageT], take: Callable[[MessageT], object]) -> None:
-        """Have its messages of a kind given to ``take``, if the dialect has them, until the vehicle is let go."""
+        """Call ``take`` with each message of a type, if the dialect contains it, until the vehicle's block is left."""
         bus = self._connection.bus
         if bus.dialect.get(message_type.ID) is not None:
             self._at_close(bus.attach(message_type, self._only(take), system_id=self._system_id))
@@ -394,13 +398,11 @@ class Hearing:
         return cell
 
     def _only(self, sink: Callable[..., object]) -> Sink:
-        """Let through what this component says; of events those that name it, or no component."""
+        """Pass only messages of this component, and events about it or about no component."""
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
-            source = (
-                getattr(item, "component_id", self._component_id) if frame is None else frame.component_id
-            )
+            source = getattr(item, "component_id", self._component_id) if frame is None else frame.component_id
             if source == self._component_id:
                 sink(item)
 

@@ -1,4 +1,4 @@
-"""`Talk`: what is sent to one vehicle and heard of it, under one address."""
+"""`VehicleSession`: all communication with one vehicle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import anyio
 
 from aerokit.autopilots import autopilot_for
 from aerokit.connection.cells import Source, StateCell
-from aerokit.connection.tasks import Background
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -19,9 +19,9 @@ from aerokit.events import (
     ArmedChanged,
     ComputerSlept,
     LandedStateChanged,
-    LinkChosen,
     LinkReport,
     LinkRestored,
+    LinkSelected,
     ModeChanged,
     StatusTextReceived,
 )
@@ -34,7 +34,7 @@ from aerokit.mavlink.messages import (
     HomePosition,
 )
 from aerokit.vehicle.session.commands import CommandSender
-from aerokit.vehicle.session.rates import Hearing, MessageRates
+from aerokit.vehicle.session.rates import ComponentSubscriber, MessageRates
 from aerokit.vehicle.session.transfers import Transfers
 from aerokit.vehicle.session.watch import LinkWatch, VehicleWatch
 from aerokit.vehicle.state.telemetry import Telemetry
@@ -50,14 +50,16 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import Heartbeat
 
 
-ASK_AGAIN_S = 3.0
+RETRY_INTERVAL_S = 3.0
 
 EAGER_REQUESTS, EAGER_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Ask until it is known, for as long as the connection is open; a reboot makes it unknown again."""
-    asked_for_modes = False
+    """Request version, home, origin and modes until they are known, while the connection is open, also after a
+    reboot.
+    """
+    has_requested_modes = False
     await _learn_version(commands, telemetry)
     while connection.is_open:
         for message_id, cell in (
@@ -67,13 +69,13 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
         ):
             if not cell.is_known:
                 await _request(commands, message_id)
-        if not asked_for_modes:
-            asked_for_modes = await _request(commands, AvailableModes.ID)
-        await anyio.sleep(ASK_AGAIN_S)
+        if not has_requested_modes:
+            has_requested_modes = await _request(commands, AvailableModes.ID)
+        await anyio.sleep(RETRY_INTERVAL_S)
 
 
 async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
-    """The first transfer waits for what the vehicle can do: ask eagerly, an answer may get lost behind its ack."""
+    """Request the version in short intervals, because the first transfer waits for the capabilities."""
     version = telemetry.version
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
@@ -84,11 +86,9 @@ async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
 
 
 async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
-    """Ask for one message once; whether there was an answer, also that the vehicle does not have it."""
+    """Request one message once; return True if there was an ack, including a refusal."""
     try:
-        await commands.send_long(
-            MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout
-        )
+        await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout)
     except CommandTimeout:
         return False
     except CommandRejected:
@@ -96,24 +96,22 @@ async def _request(commands: CommandSender, message_id: int, *, attempt_timeout:
     return True
 
 
-SETTLE_S = 0.3
-"""How long after a refusal the vehicle's texts about it are waited for."""
+STATUS_TEXT_DELAY_S = 0.3
+"""Seconds to wait for status texts after a refusal."""
 
 ACTION_HZ = 4.0
-"""How fast an action wants to be told what it waits for."""
+"""Rate in Hz of the messages that an action waits for."""
 
 RESULTS_OF_REFUSAL = (MavResult.TEMPORARILY_REJECTED, MavResult.DENIED, MavResult.FAILED)
 
 
-class Talk:
-    """The autopilot of one remote system: its address, its state, its commands, rates and transfers, and its silence.
+class VehicleSession:
+    """The autopilot of one remote system: its address, state, commands, message rates, transfers and silence.
 
-    ``on_reboot`` are called after the vehicle has rebooted.
+    ``on_reboot`` has the callbacks for a reboot of the vehicle.
     """
 
-    def __init__(
-        self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat
-    ) -> None:
+    def __init__(self, connection: Connection, system_id: int, component_id: int, heartbeat: Heartbeat) -> None:
         self.connection: Connection = connection
         self.system_id: int = system_id
         self.component_id: int = component_id
@@ -122,9 +120,7 @@ class Talk:
         self.telemetry: Telemetry = Telemetry(
             connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
         )
-        self.link_quality: StateCell[LinkReport] = StateCell(
-            "link_quality", connection.now, "second of traffic"
-        )
+        self.link_quality: StateCell[LinkReport] = StateCell("link_quality", connection.now, "second of traffic")
         self.commands: CommandSender = CommandSender(
             connection,
             system_id,
@@ -136,14 +132,14 @@ class Talk:
         self.rates: MessageRates = MessageRates(
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
         )
-        self.hearing: Hearing = Hearing(
+        self.subscriber: ComponentSubscriber = ComponentSubscriber(
             connection, system_id, component_id, self.rates, keep=self.keep, at_close=self.at_close
         )
-        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._note_reboot)
+        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
         self.link_watch: LinkWatch = LinkWatch(
-            connection, system_id, component_id, self._on_link_report, self.watch.note_answer
+            connection, system_id, component_id, self._on_link_report, self.watch.on_time_answer
         )
-        self.background: Background = Background(connection.fail)
+        self.background: BackgroundTasks = BackgroundTasks(connection.fail)
         self.transfers: Transfers = Transfers(
             connection,
             system_id,
@@ -160,7 +156,7 @@ class Talk:
         self._detach: list[Detach] = []
         self._ended_by: Exception | None = None
         self.on_reboot: list[Callable[[], None]] = [
-            self.rates.ask_again,
+            self.rates.request_again,
             self.commands.forget_results,
         ]
         self._attach_telemetry()
@@ -168,15 +164,15 @@ class Talk:
     # ------------------------------------------------------------------------- begin and end
 
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
-        """Take the first heartbeat, ask for streams and constants, and watch."""
+        """Process the first heartbeat, request streams and constants, and start the background tasks."""
         self.telemetry.receive(heartbeat)
         for message_type, hz in (self.telemetry.default_rates if rates is None else rates).items():
-            self.rates.want(message_type, hz, is_optional=rates is None)
+            self.rates.request(message_type, hz, is_optional=rates is None)
         for function in (self.rates.run, self.rates.watch, self._run_link_watch, self._learn_constants):
             self.background.start(function, f"aerokit {function.__qualname__}")
 
     def close(self) -> None:
-        """Say and hear nothing more; who waits gets ConnectionClosed."""
+        """Stop sending and receiving; waiting calls raise ConnectionClosed."""
         self.is_closed = True
         self.transfers.is_closed = True
         self._on_end(ConnectionClosed("the block of this vehicle was left"))
@@ -188,38 +184,40 @@ class Talk:
         self.rates.close()
 
     def at_close(self, *functions: Detach) -> None:
-        """Have these called when the vehicle is let go; at once if it was."""
+        """Register callbacks for when the vehicle's block is left; called at once if it was."""
         self._detach += functions
         if self.is_closed:
             for function in functions:
                 function()
 
     def keep(self, cell: StateCell[Any]) -> None:
-        """Have a cell end with the talk, and be forgotten when the vehicle has rebooted."""
+        """Close a cell with the session, and reset it when the vehicle reboots."""
         self._cells.append(cell)
-        self.explain_timeouts(cell)
+        self.add_timeout_hint(cell)
         self.on_reboot.append(cell.forget)
         if self._ended_by is not None:
             cell.close(self._ended_by)
 
-    def explain_timeouts(self, *cells: StateCell[Any]) -> None:
-        """Have who waits for these in vain told of signatures that keep us and the vehicle apart."""
+    def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
+        """Add rejected signatures to the time-out texts of these cells, because they are a likely reason."""
         for cell in cells:
             cell._explain_timeout = self._describe_signatures
 
     def send(self, message: Message) -> None:
-        """Send one message as it is; ConnectionClosed after :meth:`close`."""
+        """Send one message unchanged; ConnectionClosed after :meth:`close`."""
         if self.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
         self.connection.send(message)
 
-    # ------------------------------------------------------------------------------- hearing
+    # ----------------------------------------------------------------------------- receiving
 
     @contextmanager
     def streaming(self, *names: str) -> Iterator[None]:
-        """Have what tells these states sent, also when the program asked for no rates of its own."""
+        """Request the messages of these states for the duration of the block, even if the program disabled default
+        rates.
+        """
         releases = [
-            self.rates.want(message_type, ACTION_HZ, is_optional=True)
+            self.rates.request(message_type, ACTION_HZ, is_optional=True)
             for name in names
             for message_type in self.telemetry.required_messages(name)
         ]
@@ -231,7 +229,7 @@ class Talk:
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
-        """Collect later acks of a command that refuse what an earlier one accepted (PX4 acks some twice)."""
+        """Collect acks that refuse a command after an earlier ack accepted it (PX4 acks some commands twice)."""
         refusals: list[CommandAck] = []
 
         def note(ack: CommandAck) -> None:
@@ -250,16 +248,14 @@ class Talk:
         finally:
             detach()
 
-    async def settle(self) -> None:
-        """Give the vehicle's texts the time to come."""
-        await anyio.sleep(SETTLE_S)
+    async def wait_for_status_texts(self) -> None:
+        """Wait for status texts that explain a refusal."""
+        await anyio.sleep(STATUS_TEXT_DELAY_S)
 
-    def explained(
-        self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()
-    ) -> CommandRejected:
-        """The same refusal with what the vehicle has said of it since then, and these reasons; each once.
+    def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
+        """Return the refusal with the vehicle's status texts since then and these reasons, without duplicates.
 
-        What it says as mere information ("ArduPilot Ready") is no reason.
+        Informational texts ("ArduPilot Ready") are left out.
         """
         texts = [
             each.text
@@ -270,18 +266,18 @@ class Talk:
             str(error).partition("\n")[0],
             command=error.command,
             result=error.result,
-            reasons=self.each_reason_once(*error.reasons, *texts, *reasons),
+            reasons=self.deduplicate_reasons(*error.reasons, *texts, *reasons),
         )
 
-    def each_reason_once(self, *texts: str) -> tuple[str, ...]:
-        """ArduPilot says the same as "PreArm: …" and as "Arm: …"."""
+    def deduplicate_reasons(self, *texts: str) -> tuple[str, ...]:
+        """Remove duplicates: ArduPilot sends the same text as "PreArm: …" and as "Arm: …"."""
         reasons: dict[str, str] = {}
         for text in texts:
             reasons.setdefault(self.autopilot.arming_reason(text) or text, text)
         return tuple(reasons.values())
 
     def texts_since(self, at: float) -> tuple[str, ...]:
-        """What the vehicle said (STATUSTEXT) since this time on the loop's clock, oldest first."""
+        """Return the status texts (STATUSTEXT) received since this time of the loop's clock, oldest first."""
         return tuple(each.text for each in self.telemetry.texts_since(at))
 
     @property
@@ -290,26 +286,22 @@ class Talk:
         return self.connection.now() - self.watch.last_heartbeat_at
 
     def describe_link(self) -> str:
-        """One line on how well the vehicle is heard, for error texts."""
+        """Return one line about the link's quality, for error texts."""
         received, lost = self.connection.counts(self.system_id)
-        loss = (
-            f"{100 * lost / (received + lost):.0f} % of its frames lost"
-            if received + lost
-            else "nothing heard"
-        )
+        loss = f"{100 * lost / (received + lost):.0f} % of its frames lost" if received + lost else "nothing received"
         signatures = self._describe_signatures()
         why = f"{signatures}; " if signatures else ""
         texts = self.texts_since(self.connection.now() - 10.0)
-        said = f", it said: {'; '.join(texts[-3:])}" if texts else ""
+        said = f", status texts: {'; '.join(texts[-3:])}" if texts else ""
         return f"{why}last heartbeat {self.heartbeat_age:.1f} s ago, {loss}{said}"
 
     def _describe_signatures(self) -> str:
-        return self.connection.describe_signatures(self.system_id)
+        return self.connection.describe_signature_problems(self.system_id)
 
     # -------------------------------------------------------------------------------- events
 
     def publish(self, event_type: type[Event], *fields: Any) -> None:
-        """Tell who listens to events of this vehicle."""
+        """Publish an event of this vehicle on the bus."""
         self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
 
     def _attach_telemetry(self) -> None:
@@ -324,7 +316,7 @@ class Talk:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
             self._detach.append(detach)
         telemetry, publish = self.telemetry, self.publish
-        self.explain_timeouts(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
+        self.add_timeout_hint(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
         self._detach += [
             telemetry.mode.observe(lambda old, new: publish(ModeChanged, old and old.name, new.name)),
             telemetry.armed.observe(lambda _, new: publish(ArmedChanged, new)),
@@ -332,21 +324,21 @@ class Talk:
             telemetry.status_text.observe(
                 lambda _, new: publish(StatusTextReceived, new.severity, new.text), every_arrival=True
             ),
-            bus.attach_event(LinkRestored, lambda _: self.rates.ask_again()),
-            bus.attach_event(LinkChosen, self._on_link_chosen),
+            bus.attach_event(LinkRestored, lambda _: self.rates.request_again()),
+            bus.attach_event(LinkSelected, self._on_link_chosen),
             bus.attach_event(ComputerSlept, self._on_computer_slept),
             self.connection.on_end(self._on_end),
         ]
 
-    def _on_link_chosen(self, event: LinkChosen) -> None:
-        """An autopilot keeps rates for each of its ports."""
+    def _on_link_chosen(self, event: LinkSelected) -> None:
+        """Request all streams again, because an autopilot keeps separate rates for each of its ports."""
         if event.system_id == self.system_id and event.before is not None:
-            self.rates.ask_again()
+            self.rates.request_again()
 
     def _on_computer_slept(self, event: ComputerSlept) -> None:
         self.watch.last_heartbeat_at -= event.seconds
         for cell in (*self.telemetry.cells.values(), *self._cells):
-            cell._grow_older(event.seconds)
+            cell._add_age(event.seconds)
 
     def _on_link_report(self, report: LinkReport) -> None:
         self.link_quality.set(report, Source(self.system_id, self.component_id, "link"))
@@ -361,7 +353,7 @@ class Talk:
     async def _learn_constants(self) -> None:
         await learn_constants(self.connection, self.commands, self.telemetry)
 
-    def _note_reboot(self) -> None:
+    def _on_reboot(self) -> None:
         self.telemetry.forget()
         for each in self.on_reboot:
             each()

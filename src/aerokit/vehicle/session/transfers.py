@@ -1,4 +1,4 @@
-"""``Transfers``: what parameters, missions, files and logs of one vehicle share: its timing, its features, its end."""
+"""``Transfers``: timing, capabilities and lifetime shared by parameters, missions, files and logs of one vehicle."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
     from aerokit.connection.cells import StateCell
     from aerokit.connection.connection import Connection
-    from aerokit.connection.tasks import Background
+    from aerokit.connection.tasks import BackgroundTasks
     from aerokit.protocols.exchange import Exchange
 
 ResultT = TypeVar("ResultT")
@@ -28,22 +28,22 @@ VERSION_TIMEOUT_S = 3.0
 IN_BACKGROUND_S = 5.0
 
 
-class Talking(Protocol):
-    """What a part needs of the talk with the autopilot, or with another component."""
+class Messaging(Protocol):
+    """The interface of a session, with the autopilot or another component, that transfers depend on."""
 
     on_reboot: list[Callable[[], None]]
 
     @property
     def transfers(self) -> Transfers:
-        """What its exchanges go through."""
+        """Runs the exchanges of this session."""
         ...
 
     def at_close(self, *functions: Detach) -> None:
-        """Have these called when the vehicle is let go."""
+        """Register callbacks for when the vehicle's block is left."""
 
 
 class Transfers:
-    """Runs exchanges with the autopilot of one vehicle, and knows what that autopilot can do."""
+    """Runs exchanges with the autopilot of one vehicle and provides its capabilities."""
 
     def __init__(
         self,
@@ -53,20 +53,20 @@ class Transfers:
         *,
         autopilot: Autopilot,
         version: StateCell[AutopilotVersion],
-        background: Background,
+        background: BackgroundTasks,
         describe: Callable[[], str],
         round_trip_s: Callable[[], float | None] = lambda: None,
         send_command: Callable[..., Awaitable[object]] | None = None,
     ) -> None:
         self.connection = connection
         self.began_at: float = connection.now()
-        """When the talk with the vehicle began: numbers that must not be those of a program before count from here."""
+        """Start of the session. Sequence numbers are derived from it, so that they differ from an earlier program's."""
         self.system_id: int = system_id
         self.component_id: int = component_id
         self.autopilot = autopilot
         self.background = background
         self.round_trip: RoundTrip = RoundTrip()
-        """Measured by whatever was transferred before, at first by what keeps the clocks together."""
+        """Round trip measured by previous transfers, initially by TIMESYNC."""
         self.is_closed: bool = False
         self._send_command = send_command
         self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
@@ -74,8 +74,8 @@ class Transfers:
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
-        A time-out of the exchange comes out with what the link is like added to its text; ``timeout`` seconds for all
-        of it end in :class:`OperationTimeout`. Cancellation ends it at once.
+        A time-out of the exchange gets a description of the link; exceeding ``timeout`` seconds raises
+        :class:`OperationTimeout`. Cancellation ends it at once.
         """
         if self.is_closed:
             raise ConnectionClosed("the block of this vehicle was left; nothing was sent")
@@ -86,7 +86,7 @@ class Transfers:
             except OperationTimeout as error:
                 self._explain(error)
                 raise
-            if isinstance(result, dict):  # an answer for each name
+            if isinstance(result, dict):  # One answer for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
                         self._explain(answer)
@@ -98,11 +98,11 @@ class Transfers:
     def _measure_link(self) -> None:
         seconds = self._round_trip_s() if self.round_trip.smoothed_s is None else None
         if seconds is not None:
-            self.round_trip.measured(seconds)
+            self.round_trip.add_sample(seconds)
 
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
-        """Seconds for all of a block; then :class:`OperationTimeout`. None: no limit."""
+        """Limit the duration of a block in seconds; raises :class:`OperationTimeout`. None: no limit."""
         try:
             with anyio.fail_after(timeout):
                 yield
@@ -112,7 +112,7 @@ class Transfers:
             raise OperationTimeout(f"not done within {timeout:g} s; {self._describe()}") from None
 
     def command_in_background(self, command: int, *params: float) -> None:
-        """Send a command that makes things better, with nobody waiting; its failure is nobody's."""
+        """Send an optional command without waiting; a failure is ignored."""
         send = self._send_command
 
         async def order() -> None:
@@ -125,17 +125,19 @@ class Transfers:
 
     @property
     def version(self) -> AutopilotVersion | None:
-        """What the autopilot said of itself, None while it has not."""
+        """The autopilot's version, None while unknown."""
         return self._version.latest
 
     @property
     def known_capabilities(self) -> int | None:
-        """MAV_PROTOCOL_CAPABILITY bits of the autopilot, None while it has not told them."""
+        """MAV_PROTOCOL_CAPABILITY bits of the autopilot, None while unknown."""
         version = self._version.latest
         return None if version is None else version.capabilities
 
     async def capabilities(self) -> int | None:
-        """MAV_PROTOCOL_CAPABILITY bits of the autopilot; None when it does not tell within a few seconds."""
+        """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few
+        seconds.
+        """
         if not self._version.is_known:
             with anyio.move_on_after(VERSION_TIMEOUT_S):
                 await self._version.wait_until(lambda _: True)

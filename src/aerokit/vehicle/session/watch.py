@@ -1,4 +1,4 @@
-"""Watches one vehicle and its link: silence, reboots, loss, delay and rate, told as events."""
+"""Monitors one vehicle and its link: silence, reboots, packet loss, delay and data rate, published as events."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.connection.cells import StateCell
-from aerokit.connection.link_state import LinkStateWatch
-from aerokit.connection.loop_watch import PERIOD_S
+from aerokit.connection.heartbeats import LinkStateTracker
+from aerokit.connection.loop_watch import CHECK_INTERVAL_S
 from aerokit.errors import LinkLost
 from aerokit.events import (
     SILENT_AFTER_S,
     LinkInterrupted,
     LinkReport,
-    VehicleBack,
     VehicleRebooted,
+    VehicleRecovered,
     VehicleSilent,
 )
 from aerokit.mavlink.messages import Attitude, GlobalPositionInt, Heartbeat, SystemTime, Timesync
@@ -31,21 +31,23 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.mavlink.frame import Frame
 
+# Reordered messages decrease the time since boot by less than this, a reboot by more, unless it was very
+# recent.
 REBOOT_STEP_MS = 3000
-"""Reordered messages go back in time by less than this, a reboot by more, unless it had just booted."""
-REBOOT_SEEN_S = 0.2
-"""So long, and in at least two messages, must the new time run before it is believed: one late message is no reboot."""
-LATE_MS = 2000
-"""Once the vehicle has accepted to reboot: it boots for longer than this, and no message is so late."""
+# The decreased time must persist for this long, and in at least two messages; one delayed message is no
+# reboot.
+REBOOT_CONFIRM_S = 0.2
+# After an accepted reboot command: booting takes longer than this, and no message is delayed by as much.
+MIN_REBOOT_STEP_MS = 2000
 CLOCK_SPAN_S = 5.0
 REPORT_PERIOD_S = 1.0
 TIMESYNC_PERIOD_S = 2.0
-QUESTIONS = 64
-"""So many questions may be under way; what is older is taken for lost."""
+# Maximum number of open TIMESYNC requests; older ones are considered lost.
+MAX_OPEN_REQUESTS = 64
 
 
 class VehicleWatch:
-    """Tells when the heartbeats of one vehicle stop and come back, and when it has rebooted."""
+    """Detects silence, return and reboot of one vehicle."""
 
     reboots: int
 
@@ -61,11 +63,11 @@ class VehicleWatch:
         self.last_heartbeat_at: float = connection.now()
         self._heartbeat_read_at = connection.now()
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
-        self._state_watch = LinkStateWatch(
+        self._state_watch = LinkStateTracker(
             self.link_state, connection.bus, system_id=system_id, component_id=component_id
         )
-        self._state_watch.heard(connection.now())
-        self._is_told_silent = self._has_ended = False
+        self._state_watch.record_activity(connection.now())
+        self._is_reported_silent = self._has_ended = False
         self.reboots = 0
         self._times: dict[str, tuple[int, float]] = {}
         self._first_time: tuple[int, float] | None = None
@@ -87,34 +89,34 @@ class VehicleWatch:
 
     @property
     def is_silent(self) -> bool:
-        """Whether no heartbeat comes any more: for more than 3.5 seconds, or because the link has gone."""
-        return self._is_told_silent or self._has_ended or self.silent_for_s > SILENT_AFTER_S
+        """True if no heartbeat was received for more than 3.5 seconds, or the link is lost."""
+        return self._is_reported_silent or self._has_ended or self.silent_for_s > SILENT_AFTER_S
 
     @property
     def silent_for_s(self) -> float:
-        """Seconds in which no heartbeat was read.
+        """Seconds since a heartbeat was processed.
 
-        It may be older than that (:attr:`last_heartbeat_at`) when the loop was kept from reading: a pause of ours does
-        not make the vehicle silent.
+        :attr:`last_heartbeat_at` may be older if the event loop was blocked: a pause of this program is no silence of
+        the vehicle.
         """
         return self._connection.now() - self._heartbeat_read_at
 
     def end(self, error: Exception) -> None:
-        """Nothing will be heard any more."""
+        """Mark the link as lost."""
         self._has_ended = True
-        self._state_watch.lost(self._connection.now(), is_told=isinstance(error, LinkLost))
+        self._state_watch.mark_lost(self._connection.now(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop monitoring."""
         self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
         for detach in self._detach:
             detach()
 
     def boot_time_ms(self, now: float) -> float | None:
-        """The vehicle's time since boot at ``now``, by what its messages said last; None when they said nothing.
+        """Return the vehicle's time since boot at ``now``, extrapolated from its last message; None without one.
 
-        A simulation may be faster than time.
+        Considers the speed of a simulation.
         """
         if "time_boot_ms" not in self._times or self._first_time is None:
             return None
@@ -124,33 +126,33 @@ class VehicleWatch:
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
-        """The vehicle has accepted to reboot: in the block it is noticed even if it had just booted before."""
+        """Detect a reboot within the block even if the vehicle had booted very recently."""
         self._expects_reboot = True
         try:
             yield
         finally:
             self._expects_reboot = False
 
-    def note_answer(self, asked_at: float, milliseconds: int) -> None:
-        """The vehicle's time since boot, as told in answer to a question of ours.
+    def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
+        """Process the time since boot from an answer to our TIMESYNC request.
 
-        Asked after another answer had come, it tells an earlier time only if it has rebooted: that needs no patience,
-        and holds however fast a simulation runs.
+        A request sent after the previous answer can only return an earlier time after a reboot, so no confirmation is
+        needed, however fast a simulation runs.
         """
         before_at, before = self._last_answer
-        if asked_at <= before_at:
+        if requested_at <= before_at:
             return
         self._last_answer = (self._connection.now(), milliseconds)
         if milliseconds < before:
             self._has_rebooted("TIMESYNC", milliseconds)
 
     def check(self) -> None:
-        """Publish VehicleSilent when heartbeats have stopped; called once a second."""
+        """Publish VehicleSilent if heartbeats have stopped; called once a second."""
         now = self._connection.now()
         silent_for = self.silent_for_s
         self._state_watch.check(now)
-        if silent_for > SILENT_AFTER_S and not self._is_told_silent:
-            self._is_told_silent = True
+        if silent_for > SILENT_AFTER_S and not self._is_reported_silent:
+            self._is_reported_silent = True
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
@@ -160,26 +162,26 @@ class VehicleWatch:
         now = self._connection.now()
         silent_for, self._heartbeat_read_at = self.silent_for_s, now
         self.last_heartbeat_at = frame.received_at
-        self._state_watch.heard(now)
-        if self._is_told_silent:
-            self._is_told_silent = False
-            self._connection.bus.publish(VehicleBack(now, self._system_id, silent_for))
+        self._state_watch.record_activity(now)
+        if self._is_reported_silent:
+            self._is_reported_silent = False
+            self._connection.bus.publish(VehicleRecovered(now, self._system_id, silent_for))
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
-        self._state_watch.lost(event.at)
+        self._state_watch.mark_lost(event.at)
 
     def _on_boot_time(self, frame: Frame) -> None:
-        """``time_boot_ms`` is the payload's beginning."""
+        """Read ``time_boot_ms`` at the start of the payload."""
         if frame.component_id == self._component_id:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
 
     def _on_system_time(self, frame: Frame) -> None:
-        """``time_boot_ms`` comes after ``time_unix_usec``."""
+        """Read ``time_boot_ms`` behind ``time_unix_usec``."""
         if frame.component_id == self._component_id:
             self._note_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Answers to our own questions come also from a vehicle that streams nothing (yet)."""
+        """Process answers to our requests, which also a vehicle without streams sends."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._note_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
@@ -187,8 +189,9 @@ class VehicleWatch:
     def _note_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
         before, then = self._times.get(clock, (milliseconds, now))
-        late = 1000 * (frame.received_at - then) - (milliseconds - before)  # at least: it may have come later
-        if self._expects_reboot and late > LATE_MS:
+        # A lower bound, because the earlier message may have been delayed as well.
+        late = 1000 * (frame.received_at - then) - (milliseconds - before)
+        if self._expects_reboot and late > MIN_REBOOT_STEP_MS:
             self._has_rebooted(clock, milliseconds)
         elif milliseconds + REBOOT_STEP_MS >= before:
             self._times[clock] = (milliseconds, now)
@@ -200,13 +203,13 @@ class VehicleWatch:
             self._has_rebooted(clock, milliseconds)
 
     def _is_confirmed(self, clock: str, milliseconds: int) -> bool:
-        """Whether the earlier time has been running for a while, with nothing of the later time in between."""
+        """Return True if the decreased time has persisted, with no message of the previous time in between."""
         now = self._connection.now()
         first, since = self._candidates.setdefault(clock, (milliseconds, now))
         if milliseconds < first:
             self._candidates[clock] = (milliseconds, now)
             return False
-        return milliseconds > first and now - since >= REBOOT_SEEN_S
+        return milliseconds > first and now - since >= REBOOT_CONFIRM_S
 
     def _has_rebooted(self, clock: str, milliseconds: int) -> None:
         now = self._connection.now()
@@ -220,7 +223,7 @@ class VehicleWatch:
 class LinkWatch:
     """Measures the link to one vehicle once a second: loss by sequence numbers, delay by TIMESYNC, rates by counting.
 
-    See https://mavlink.io/en/services/timesync.html; ArduPilot and PX4 both answer.
+    See https://mavlink.io/en/services/timesync.html; ArduPilot and PX4 both support it.
     """
 
     def __init__(
@@ -234,8 +237,8 @@ class LinkWatch:
         self._connection, self._system_id, self._component_id = connection, system_id, component_id
         self._on_report, self._on_answer = on_report, on_answer
         self._round_trip_s: float | None = None
-        self._asked: deque[int] = deque(maxlen=QUESTIONS)
-        self._ask_at = connection.now()
+        self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
+        self._next_request_at = connection.now()
         self._before = self._count()
         self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
 
@@ -245,40 +248,40 @@ class LinkWatch:
 
     @property
     def round_trip_s(self) -> float | None:
-        """The last round trip in seconds; None before the first answer."""
+        """The last round trip in seconds; None before the first one."""
         return self._round_trip_s
 
     async def run(self, on_tick: Callable[[], None]) -> None:
-        """Report once a second until cancelled or the connection ends; ``on_tick`` is called as often."""
-        self.ask()
-        self._ask_at = self._connection.now()  # once more with the first report
+        """Report once a second until cancelled or the connection ends; calls ``on_tick`` each time."""
+        self.request_time()
+        self._next_request_at = self._connection.now()  # Ask once more with the first report.
         while self._connection.is_open:
             await anyio.sleep(REPORT_PERIOD_S)
             if self._connection.is_open:
-                if self._connection.now() >= self._ask_at:
-                    self.ask()
+                if self._connection.now() >= self._next_request_at:
+                    self.request_time()
                 self._report()
                 on_tick()
 
-    def ask(self) -> None:
-        """Ask for the vehicle's time now, besides every two seconds."""
+    def request_time(self) -> None:
+        """Request the vehicle's time now, in addition to every two seconds."""
         now = self._connection.now()
-        self._ask_at = now + TIMESYNC_PERIOD_S
-        self._asked.append(int(now * 1e9))
-        self._connection.send(Timesync(0, self._asked[-1]), to=self._system_id)
+        self._next_request_at = now + TIMESYNC_PERIOD_S
+        self._open_requests.append(int(now * 1e9))
+        self._connection.send(Timesync(0, self._open_requests[-1]), to=self._system_id)
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Take the answer to our question; questions of the vehicle and answers to others are not ours.
+        """Process the answer to our request; requests of the vehicle and answers to others are ignored.
 
-        Nor are the answers of its other components, such as a companion computer, which may be the first ones.
+        Answers of its other components, such as a companion computer, are ignored as well; they may arrive first.
         """
         frame = message.received_frame
         if frame is None or frame.component_id != self._component_id:
             return
-        if message.tc1 != 0 and message.ts1 in self._asked:
-            self._asked.remove(message.ts1)
+        if message.tc1 != 0 and message.ts1 in self._open_requests:
+            self._open_requests.remove(message.ts1)
             now = self._connection.now()
-            if now - frame.received_at < PERIOD_S:  # else it had waited for us
+            if now - frame.received_at < CHECK_INTERVAL_S:  # Otherwise this program was late in reading it.
                 self._round_trip_s = now - message.ts1 / 1e9
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 

@@ -1,1 +1,1 @@
-"""What a vehicle is heard to be: each state declared once, decoded when somebody looks, kept in a cell."""
+"""State of a vehicle: each state is declared once, decoded on access, and kept in a cell."""

@@ -1,4 +1,4 @@
-"""What a vehicle does and how it fares: mode, health, mission, texts."""
+"""State values and decoders: mode, health, mission, status texts."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ EARLIEST_UNIX_S = 1_000_000_000
 
 
 class SystemTime(Snapshot):
-    """``unix_s`` is UTC in seconds since 1970, None while the vehicle does not know it."""
+    """The vehicle's clock. ``unix_s`` is UTC in seconds since 1970, None while the vehicle does not know it."""
 
     unix_s: float | None
     since_boot_s: float
 
 
 class SensorHealth(Snapshot):
-    """SYS_STATUS (https://mavlink.io/en/messages/common.html#SYS_STATUS).
+    """Sensor health from SYS_STATUS (https://mavlink.io/en/messages/common.html#SYS_STATUS).
 
-    ``present``, ``enabled`` and ``healthy`` are MAV_SYS_STATUS_SENSOR bits. ``failing`` names what should
-    work and does not. ``prearm_checks_pass`` is None where the vehicle does not say. ``load_percent`` is the
-    processor's.
+    ``present``, ``enabled`` and ``healthy`` are MAV_SYS_STATUS_SENSOR bits. ``failing`` has the names of enabled but
+    unhealthy sensors. ``prearm_checks_pass`` is None if the vehicle does not report it. ``load_percent`` is the load
+    of the processor.
     """
 
     present: int
@@ -72,15 +72,15 @@ class SensorHealth(Snapshot):
 
     @property
     def blocks_arming(self) -> tuple[str, ...]:
-        """What is failing, unless the checks pass all the same: then the vehicle does not mind."""
+        """The failing sensors, or none if the pre-arm checks pass nevertheless."""
         return () if self.prearm_checks_pass else self.failing
 
 
 class EstimatorHealth(Snapshot):
-    """What the state estimator says of itself: EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
+    """State estimator health from EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4).
 
-    ``message`` is the name of the message, ``flags`` its flags, ``missing`` what a flight by position still
-    needs, in words. Ratios are innovations by their limits: below 1 is good. Accuracies are in metres, one
+    ``message`` is the name of the message, ``flags`` its flags, ``missing`` the estimates that flight by position
+    still needs. Ratios are innovations divided by their limits: below 1 is good. Accuracies are in metres, one
     standard deviation.
     """
 
@@ -98,32 +98,32 @@ class EstimatorHealth(Snapshot):
 
     @property
     def has_attitude(self) -> bool:
-        """Whether the attitude is good."""
+        """True if the attitude estimate is good."""
         return bool(self.flags & 1)
 
     @property
     def has_horizontal_velocity(self) -> bool:
-        """Whether the horizontal velocity is good."""
+        """True if the horizontal velocity estimate is good."""
         return bool(self.flags & 2)
 
     @property
     def has_relative_position(self) -> bool:
-        """Whether the position relative to where it began is good."""
+        """True if the position relative to the starting point is good."""
         return bool(self.flags & 8)
 
     @property
     def has_absolute_position(self) -> bool:
-        """Whether the position on the globe is good."""
+        """True if the global position estimate is good."""
         return bool(self.flags & 16)
 
     @property
     def has_altitude(self) -> bool:
-        """Whether the altitude is good."""
+        """True if the altitude estimate is good."""
         return bool(self.flags & 32)
 
 
 class MissionProgress(Snapshot):
-    """The current mission item, counted from 0, and how many there are; None: not told, or no mission.
+    """The current mission item, counted from 0, and the number of items; None: not reported, or no mission.
 
     ``state`` is a MISSION_STATE (1 no mission, 2 not started, 3 active, 4 paused, 5 complete), 0 unknown.
     """
@@ -134,16 +134,16 @@ class MissionProgress(Snapshot):
 
 
 class StatusText(Snapshot):
-    """What the vehicle said; ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" is a lost part."""
+    """One status text; ``severity`` is a MAV_SEVERITY, 0 emergency to 7 debug. "…" marks a lost part."""
 
     severity: int
     text: str
     at: float = 0.0
-    """When it was complete, in seconds on the event loop's clock."""
+    """Time at which it was complete, in seconds of the event loop's clock."""
 
     @property
     def is_error(self) -> bool:
-        """Whether it is an error or worse."""
+        """True for severity ERROR or worse."""
         return self.severity <= MavSeverity.ERROR
 
     def __str__(self) -> str:
@@ -157,14 +157,14 @@ def mode(message: messages.Heartbeat, context: Context) -> Mode:
 
 
 def current_mode(message: messages.CurrentMode, context: Context) -> Mode | None:
-    """The same sooner; it lacks what HEARTBEAT says beside the number."""
+    """Return the flight mode of CURRENT_MODE, which is sent before the next HEARTBEAT but lacks ``base_mode``."""
     if not message.custom_mode or context.before is None:
         return None
     return context.autopilot.mode(message.custom_mode, context.base_mode, context.mode_names)
 
 
 def armed(message: messages.Heartbeat) -> bool:
-    """Whether the motors are armed."""
+    """Return True if the motors are armed."""
     return is_armed(message.base_mode)
 
 
@@ -186,13 +186,13 @@ def landed_state(message: messages.ExtendedSysState) -> int | None:
 
 
 def landed_state_of_heartbeat(message: messages.Heartbeat, context: Context) -> int | None:
-    """What some autopilots' HEARTBEAT says of it."""
+    """Return the landed state that some autopilots encode in HEARTBEAT."""
     told = context.autopilot.landed_state_of(message)
     return None if told is None else MavLandedState(told)
 
 
 def version(message: messages.AutopilotVersion, context: Context) -> AutopilotVersion:
-    """Firmware and hardware."""
+    """Return firmware and hardware versions."""
     return context.autopilot.version_of(message)
 
 
@@ -202,13 +202,13 @@ def capabilities(message: messages.AutopilotVersion) -> int:
 
 
 def system_time(message: messages.SystemTime) -> SystemTime:
-    """UTC, unless it still lies in the last century, and time since boot."""
+    """Return time since boot, and UTC unless it is before 2000."""
     unix_s = message.time_unix_usec / 1e6
     return SystemTime(unix_s if unix_s > EARLIEST_UNIX_S else None, message.time_boot_ms / 1e3)
 
 
 def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
-    """What works and what does not, in the autopilot's reading of the bits."""
+    """Return the sensor health as the autopilot defines the bits."""
     bits = (
         message.onboard_control_sensors_present,
         message.onboard_control_sensors_enabled,
@@ -223,7 +223,7 @@ def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth
 
 
 def ekf_health(message: messages.EkfStatusReport, context: Context) -> EstimatorHealth:
-    """ArduPilot's estimator."""
+    """Return the estimator health of ArduPilot."""
     return EstimatorHealth(
         message.NAME,
         message.flags,
@@ -238,7 +238,7 @@ def ekf_health(message: messages.EkfStatusReport, context: Context) -> Estimator
 
 
 def estimator_health(message: messages.EstimatorStatus, context: Context) -> EstimatorHealth:
-    """PX4's estimator."""
+    """Return the estimator health of PX4."""
     return EstimatorHealth(
         message.NAME,
         message.flags,
@@ -255,7 +255,9 @@ def estimator_health(message: messages.EstimatorStatus, context: Context) -> Est
 
 
 def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
-    """Without a mission ``total`` is UINT16_MAX; 0 means that the vehicle does not tell it."""
+    """Return the mission progress. Without a mission ``total`` is UINT16_MAX; 0 means that the vehicle does not
+    report it.
+    """
     state = member(MissionState, message.mission_state)
     if message.total == U16:
         return MissionProgress(None, None, state)
@@ -263,5 +265,5 @@ def mission_progress(message: messages.MissionCurrent) -> MissionProgress:
 
 
 def mission_reached(message: messages.MissionItemReached) -> int:
-    """The number of the item."""
+    """Return the index of the item."""
     return message.seq

@@ -1,4 +1,4 @@
-"""What a vehicle has on board: receivers, batteries, range finders, outputs."""
+"""State values and decoders: satellite receivers, batteries, range finders, outputs, gimbals."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ LOOKING_DOWN = 25
 
 GPS_FIX_TYPE_3D = 3
 
+# Maximum value of a cell; a pack of more than 65.5 V occupies several "cells" with it.
 FULL_CELL = 0xFFFE
-"""The most a cell can say; a pack of more than 65.5 V fills several "cells" with it."""
 
 INVALID_QUALITY = 1
 
@@ -62,9 +62,9 @@ OUTPUTS_PER_PORT = 16
 
 
 class RangeFinder(Snapshot):
-    """One distance sensor. ``distance_m`` is None when the reading is invalid.
+    """One distance sensor. ``distance_m`` is None if the reading is invalid.
 
-    ``orientation`` is a MAV_SENSOR_ORIENTATION, 25 looks down. ``quality_percent`` None: not told.
+    ``orientation`` is a MAV_SENSOR_ORIENTATION, 25 is down. ``quality_percent`` is None if not reported.
     """
 
     id: int
@@ -78,8 +78,8 @@ class RangeFinder(Snapshot):
 class GpsReceiver(Snapshot):
     """One satellite receiver: 0 is GPS_RAW_INT, 1 is GPS2_RAW.
 
-    ``fix_type`` is a GPS_FIX_TYPE (0 no receiver, 1 no fix, 2 2D, 3 3D, 4 DGPS, 5 RTK float, 6 RTK fixed).
-    The place is None before a fix. Accuracies are one standard deviation.
+    ``fix_type`` is a GPS_FIX_TYPE (0 no receiver, 1 no fix, 2 2D, 3 3D, 4 DGPS, 5 RTK float, 6 RTK fixed). The
+    position is None before a fix. Accuracies are one standard deviation.
     """
 
     index: int
@@ -99,14 +99,14 @@ class GpsReceiver(Snapshot):
 
     @property
     def has_3d_fix(self) -> bool:
-        """Whether it has a fix in three dimensions, or a better one."""
+        """True for a 3D fix or better."""
         return GPS_FIX_TYPE_3D <= self.fix_type <= 8
 
 
 class Battery(Snapshot):
-    """One battery. ``cell_voltages_v`` is empty when cells are not measured one by one.
+    """One battery. ``cell_voltages_v`` is empty if cells are not measured individually.
 
-    ``charge_state`` is a MAV_BATTERY_CHARGE_STATE (1 OK, 2 low, 3 critical …), 0 when it is not told.
+    ``charge_state`` is a MAV_BATTERY_CHARGE_STATE (1 OK, 2 low, 3 critical …), 0 if not reported.
     """
 
     id: int
@@ -122,7 +122,7 @@ class Battery(Snapshot):
 
 
 class Power(Snapshot):
-    """The supply of the board and of its servos in volts, and MAV_POWER_STATUS bits; None: not measured."""
+    """Supply voltages of the board and of its servos, and MAV_POWER_STATUS bits; None: not measured."""
 
     board_v: float | None
     servos_v: float | None
@@ -143,7 +143,7 @@ class ServoOutputs(Snapshot):
 
 
 class Vibration(Snapshot):
-    """Vibration levels in m/s² and how often each accelerometer reached its limit since boot."""
+    """Vibration levels in m/s², and the clipping count of each accelerometer since boot."""
 
     x_m_s2: float
     y_m_s2: float
@@ -152,7 +152,7 @@ class Vibration(Snapshot):
 
 
 def distance_sensors(message: messages.DistanceSensor, context: Context) -> tuple[RangeFinder, ...]:
-    """Those known before, with this one in its place."""
+    """Return the known sensors, with this one replaced or added."""
     quality = message.signal_quality
     is_valid = quality != INVALID_QUALITY
     sensor = RangeFinder(
@@ -167,17 +167,17 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
-    """ArduPilot's older message about the one that looks down."""
+    """Return the downward sensor of ArduPilot's older message."""
     return _with(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
-    """The receivers known before, with the first in its place."""
+    """Return the known receivers, with the first one replaced or added."""
     return _with(context.before, _gps_receiver(message, 0), _index_of)
 
 
 def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver, ...]:
-    """The receivers known before, with the second in its place."""
+    """Return the known receivers, with the second one replaced or added."""
     return _with(context.before, _gps_receiver(message, 1), _index_of)
 
 
@@ -203,7 +203,7 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 
 def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Battery, ...]:
-    """Those known before, with this one in its place; cells 11 to 14 are 0 where there are none."""
+    """Return the known batteries, with this one replaced or added; cells 11 to 14 are 0 if absent."""
     cells = [mv for mv in message.voltages if mv != U16]
     cells += [mv for mv in message.voltages_ext if mv not in (0, U16)]
     is_pack = len(cells) == 1 or FULL_CELL in cells
@@ -223,7 +223,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """The little that SYS_STATUS says of the first battery; None when that is nothing."""
+    """Return the first battery from SYS_STATUS; None if the message has no data about it."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = unless(message.battery_remaining, -1)
     if voltage is None and remaining is None:
@@ -233,26 +233,24 @@ def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery
 
 
 def current(centiampere: int, autopilot: Autopilot) -> float | None:
-    """Amperes, None for what this autopilot sends when it does not know."""
+    """Return amperes; None for the autopilot's value for unknown."""
     return None if centiampere in autopilot.unknown_currents_ca else centiampere / 100
 
 
 def power(message: messages.PowerStatus) -> Power:
-    """Supply voltages; 0 stands for none."""
-    return Power(
-        scaled(message.Vcc, 0, 1000), scaled(message.Vservo, 0, 1000), member(MavPowerStatus, message.flags)
-    )
+    """Return the supply voltages; 0 means not measured."""
+    return Power(scaled(message.Vcc, 0, 1000), scaled(message.Vservo, 0, 1000), member(MavPowerStatus, message.flags))
 
 
 def rc_channels(message: messages.RcChannels) -> RcChannels:
-    """As many channels as the receiver has."""
+    """Return the channels that the receiver has."""
     count = min(message.chancount, 18)
     channels = _CHANNELS(message)[:count]
     return RcChannels(tuple([None if us == U16 else us for us in channels]), unless(message.rssi, U8))
 
 
 def servo_outputs(message: messages.ServoOutputRaw, context: Context) -> ServoOutputs:
-    """Those known before, with the sixteen of this port in their place, or eight in MAVLink 1."""
+    """Return the known outputs, with the sixteen of this port replaced (eight in MAVLink 1)."""
     frame = message.received_frame
     outputs: tuple[int, ...] = _SERVOS(message)[: 8 if frame is not None and frame.version == 1 else 16]
     before: tuple[int, ...] = () if context.before is None else context.before.outputs_us
@@ -268,7 +266,7 @@ def vibration(message: messages.Vibration) -> Vibration:
 
 
 def _with(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
-    """The items in the order of their numbers, with this one in the place of the former of its number."""
+    """Return the items sorted by key, with this one replaced or added."""
     number = key(item)
     return tuple(sorted((item, *(each for each in items or () if key(each) != number)), key=key))
 
@@ -287,17 +285,17 @@ YAW_IN_VEHICLE_FRAME = GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME.value
 
 YAW_IN_EARTH_FRAME = GimbalDeviceFlags.YAW_IN_EARTH_FRAME.value
 
+# Sine of the pitch at which roll and yaw rotate about the same axis.
 STRAIGHT = 0.99999
-"""Sine of a pitch at which roll and yaw turn about the same axis."""
 
 
 class GimbalAttitude(Snapshot):
-    """Where it points, in degrees, None for what is not told: ``pitch_deg`` (0 level, −90 straight down) and
-    ``roll_deg`` from the horizon, ``yaw_deg`` 0 to 360 clockwise from north, ``yaw_from_nose_deg`` −180 to 180
-    clockwise from the vehicle's nose.
+    """Attitude of a gimbal in degrees, None if not reported.
 
-    While the vehicle's heading is not known, the yaw of a gimbal that tells it so is from the nose; of MOUNT_STATUS
-    (ArduPilot before 4.3) it is that number, whatever it counts from.
+    ``pitch_deg`` (0 level, −90 straight down) and ``roll_deg`` are from the horizon, ``yaw_deg`` 0 to 360 clockwise
+    from north, ``yaw_from_nose_deg`` −180 to 180 clockwise from the vehicle's nose. While the vehicle's heading is
+    unknown, the yaw of a gimbal that reports it relative to north is from the nose; for MOUNT_STATUS (ArduPilot
+    before 4.3) it is the raw number, whatever its reference.
     """
 
     pitch_deg: float | None
@@ -307,14 +305,14 @@ class GimbalAttitude(Snapshot):
 
 
 def from_status(message: MountStatus) -> GimbalAttitude:
-    """Of MOUNT_STATUS: the numbers as they are."""
+    """Return the attitude of MOUNT_STATUS, unconverted."""
     return GimbalAttitude(message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0)
 
 
 def from_orientation(message: MountOrientation, heading: float | None) -> GimbalAttitude:
-    """Of MOUNT_ORIENTATION; its yaw is the vehicle's, and the one from north may be missing in it.
+    """Return the attitude of MOUNT_ORIENTATION, whose yaw from north may be missing.
 
-    ``heading``: where the vehicle's nose points, degrees; while it is not known, yaw is from there.
+    ``heading``: the vehicle's heading in degrees; while unknown, yaw is from the nose.
     """
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _compass(message.yaw_absolute)
@@ -326,16 +324,14 @@ def from_orientation(message: MountOrientation, heading: float | None) -> Gimbal
 
 
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
-    """Of GIMBAL_DEVICE_ATTITUDE_STATUS.
+    """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    ``heading``: where the vehicle's nose points, degrees, for a gimbal that tells its yaw from there and does not
-    tell what is in between; while neither is known, yaw is from the nose.
+    ``heading``: the vehicle's heading in degrees, for a gimbal that reports yaw from the nose without the difference
+    to north; while neither is known, yaw is from the nose.
     """
     pitch, roll, yaw = _euler(message.q)
-    tells_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(
-        message.delta_yaw
-    )
-    if tells_delta and message.delta_yaw:  # 0 is also what PX4 says when it does not know
+    has_delta = message.flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME) and math.isfinite(message.delta_yaw)
+    if has_delta and message.delta_yaw:  # PX4 also sends 0 when the difference is unknown.
         nose: float | None = math.degrees(message.delta_yaw)
     else:
         nose = heading
@@ -353,7 +349,7 @@ def _is_from_nose(flags: int) -> bool:
 
 
 def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
-    """Pitch, roll, yaw in degrees; of a camera that looks straight up or down all turning is yaw."""
+    """Return pitch, roll, yaw in degrees; for a camera that points straight up or down all rotation is yaw."""
     length = math.sqrt(sum(each * each for each in q))
     if not length > 0:
         return math.nan, math.nan, math.nan
@@ -371,7 +367,7 @@ def _euler(q: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def _known(degrees: float) -> float | None:
-    """To hundredths, as MOUNT_STATUS has them: the noise of 32 bits is not worth showing."""
+    """Round to hundredths, the resolution of MOUNT_STATUS."""
     return round(degrees, 2) + 0.0 if math.isfinite(degrees) else None
 
 

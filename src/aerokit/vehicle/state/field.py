@@ -1,7 +1,7 @@
-"""`Told`: how a state is declared: which messages tell it, by which decoder, and which of them is asked for.
+"""`StateField`: declares a state: the messages that report it, their decoders, and the ones to request.
 
-Values are immutable, in SI units and degrees, the unit in the name. A number that the standard marks as unknown
-(UINT16_MAX, −1, NaN …) is None, never a number. Angles are degrees, lengths metres, speeds metres per second;
+Values are immutable, in SI units and degrees, with the unit in the name. A number that the standard defines as
+unknown (UINT16_MAX, −1, NaN …) becomes None. Angles are in degrees, lengths in metres, speeds in metres per second;
 directions are clockwise from north; ``down`` is positive downwards.
 """
 
@@ -28,22 +28,22 @@ MESSAGE_IDS = {row[0]: message_id for message_id, row in messages.INDEX.items()}
 
 
 def message_type(class_name: str) -> type[Message]:
-    """The message class of this name."""
+    """Return the message class of this name."""
     found: type[Message] = getattr(messages, class_name)
     return found
 
 
-class By(Generic[T]):
-    """One message that tells a state.
+class MessageSource(Generic[T]):
+    """One message that reports a state.
 
     Args:
-        message: name of its class; a name, so that not all messages are imported.
-        decode: gives the value, or None when the message does not know it; None: the telemetry itself does it.
-        knowing: ``decode`` is given what else is known (``reading.Context``), too.
-        hz: the rate that it is asked for when a program asks for nothing special.
-        second_best: it counts only while no better message has told the state lately.
-        instead: some autopilots send this one instead of the first.
-        one_of: the field that says which one of several it speaks of; each of them counts.
+        message: name of its class, so that not all messages are imported.
+        decode: returns the value, or None if the message does not have it; None: handled by the telemetry itself.
+        needs_context: ``decode`` takes a :class:`Context` as well.
+        hz: the default rate to request.
+        fallback: used only while no better message has reported the state recently.
+        alternative: some autopilots send this message alternative of the first one.
+        instance_field: the field that distinguishes several instances, each of which counts.
     """
 
     def __init__(
@@ -51,69 +51,67 @@ class By(Generic[T]):
         message: str,
         decode: Callable[..., T | None] | None,
         *,
-        knowing: bool = False,
+        needs_context: bool = False,
         hz: float | None = None,
-        second_best: bool = False,
-        instead: bool = False,
-        one_of: str | None = None,
+        fallback: bool = False,
+        alternative: bool = False,
+        instance_field: str | None = None,
     ) -> None:
         if message not in MESSAGE_IDS:
             raise ValueError(f"{message} is no message class")
         self.message: str = message
         self.decode = decode
-        self.knowing: bool = knowing
+        self.needs_context: bool = needs_context
         self.hz: float | None = hz
-        self.second_best: bool = second_best
-        self.instead: bool = instead
-        self.one_of: str | None = one_of
+        self.fallback: bool = fallback
+        self.alternative: bool = alternative
+        self.instance_field: str | None = instance_field
 
 
 class _HasCells(Protocol):
-    def _cell_of(self, name: str) -> StateCell[Any]:
-        """The cell of this name."""
-        ...
+    def _cell_of(self, name: str) -> StateCell[Any]: ...
 
 
-class Told(Generic[T]):
-    """A state that messages tell, in a class that declares states: the declaration on the class, a cell on an object.
+class StateField(Generic[T]):
+    """A state reported by messages: a declaration on the class, a cell on its instances.
 
     Args:
-        sources: what tells it, the best first.
-        waits_for: what is named when nothing has come; the messages that are asked for by default.
-        at_once: it is worked out when the message comes, not when somebody looks.
+        sources: the messages that report it, the best first.
+        waits_for: shown in error texts while it is unknown; default: the requested messages.
+        eager: decode when the message arrives, not on the first access.
     """
 
     name: str
 
-    def __init__(self, *sources: By[T], waits_for: str = "", at_once: bool = False) -> None:
+    def __init__(self, *sources: MessageSource[T], waits_for: str = "", eager: bool = False) -> None:
         if not sources:
             raise ValueError("a state needs a message that tells it")
         self.sources = sources
-        self.at_once: bool = at_once
+        self.eager: bool = eager
         self._waits_for = waits_for
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
     @overload
-    def __get__(self, instance: None, owner: type) -> Told[T]: ...
+    def __get__(self, instance: None, owner: type) -> StateField[T]: ...
     @overload
     def __get__(self, instance: _HasCells, owner: type) -> StateCell[T]: ...
-    def __get__(self, instance: _HasCells | None, owner: type) -> Told[T] | StateCell[T]:
+    def __get__(self, instance: _HasCells | None, owner: type) -> StateField[T] | StateCell[T]:
         if instance is None:
             return self
         cell: StateCell[T] = instance._cell_of(self.name)
-        instance.__dict__[self.name] = cell  # found there from now on
+        instance.__dict__[self.name] = cell  # Later accesses find it in the instance.
         return cell
 
-    def asked_of(self, autopilot: Autopilot) -> list[type[Message]]:
-        """The messages to ask this autopilot for when a program wants the state."""
-        names = [each.message for each in self.sources[:1]] + [e.message for e in self.sources if e.instead]
+    def requested_from(self, autopilot: Autopilot) -> list[type[Message]]:
+        """Return the messages to request from this autopilot for this state."""
+        names = [each.message for each in self.sources[:1]] + [e.message for e in self.sources if e.alternative]
         return [kind for kind in map(message_type, names) if autopilot.sends(kind)]
 
     def waits_for(self, autopilot: Autopilot) -> str:
-        """The messages that it comes from, for error texts."""
-        return self._waits_for or " or ".join(kind.NAME for kind in self.asked_of(autopilot))
+        """Return the messages that report it, for error texts."""
+        return self._waits_for or " or ".join(kind.NAME for kind in self.requested_from(autopilot))
 
 
 U8, U16 = 0xFF, 0xFFFF
@@ -122,13 +120,11 @@ I16 = 0x7FFF
 
 
 class Context:
-    """What a decoder may know beside the message; ``before`` is the latest value of the state that it decodes."""
+    """Additional input of a decoder; ``before`` is the latest value of the state."""
 
     __slots__ = ("autopilot", "base_mode", "before", "home_is_known", "mode_names")
 
-    def __init__(
-        self, autopilot: Autopilot, mode_names: Mapping[int, str], home_is_known: Callable[[], bool]
-    ) -> None:
+    def __init__(self, autopilot: Autopilot, mode_names: Mapping[int, str], home_is_known: Callable[[], bool]) -> None:
         self.autopilot: Autopilot = autopilot
         self.mode_names: Mapping[int, str] = mode_names
         self.home_is_known: Callable[[], bool] = home_is_known
@@ -137,38 +133,38 @@ class Context:
 
 
 def member(enum: type[int], value: int) -> int:
-    """The enum's member, or the number itself when the enum does not know it."""
+    """Return the enum's member, or the number itself if the enum does not contain it."""
     return enum._value2member_map_.get(value, value)  # type: ignore[attr-defined,no-any-return]
 
 
 def finite(value: float) -> float | None:
-    """The number, None for NaN and infinity."""
+    """Return the number, None for NaN and infinity."""
     return value if math.isfinite(value) else None
 
 
 def unless(value: int, unknown: int) -> int | None:
-    """The number, None when it is the one that stands for unknown."""
+    """Return the number, None if it is the value for unknown."""
     return None if value == unknown else value
 
 
 def scaled(value: int, unknown: int, divisor: int) -> float | None:
-    """The number by ``divisor``, None when it is the one that stands for unknown."""
+    """Return the number divided by ``divisor``, None if it is the value for unknown."""
     return None if value == unknown else value / divisor
 
 
-LOOK_S = 5.0
-"""So often, in seconds, they are worked out although nobody looks: a value that a later message does not have any more
-(a position without a fix) is known from before."""
+# Maximum time in seconds until a frame is decoded even if the value is not read, because a later frame may
+# lack a value that this one has (a position without a fix).
+MAX_DECODE_DELAY_S = 5.0
 
 _HEADER_LENGTH = 9
 
 
 class StreamedMessage:
-    """One kind of message of one vehicle's autopilot. It keeps the latest frame, and works it out when it is looked at.
+    """One message type of a vehicle's autopilot. Keeps the latest frame and decodes it on access.
 
-    ``number_at``: where in the payload the byte is that says which one of several it speaks of; each of them is kept.
-    While one of ``cells`` is watched, each frame is worked out (``apply(frame, message)``) as it comes. Frames come on
-    the loop's thread; any thread may look. ``lock`` keeps the threads apart.
+    ``instance_at``: offset in the payload of the byte that distinguishes several instances, each of which is kept.
+    While one of ``cells`` has observers, each frame is decoded (``apply(frame, message)``) as it arrives. Frames
+    arrive in the loop's thread; any thread may read. ``lock`` protects the state.
     """
 
     __slots__ = (
@@ -186,39 +182,41 @@ class StreamedMessage:
         self,
         component_id: int,
         cells: Sequence[StateCell[object]],
-        number_at: int | None,
+        instance_at: int | None,
         apply: Callable[[Frame, Message | None], None],
         lock: threading.RLock,
     ) -> None:
         self._component_id, self._cells, self._apply, self._lock = component_id, cells, apply, lock
-        self._number_at = None if number_at is None else number_at + _HEADER_LENGTH
+        self._number_at = None if instance_at is None else instance_at + _HEADER_LENGTH
         self._look_at = -math.inf
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
-        """The frames that were not worked out yet, by the number of what they speak of."""
+        """Frames that are not decoded yet, by instance."""
 
     def take(self, frame: Frame, message: Message | None = None) -> None:
-        """Take a frame of the vehicle's system; only those of its autopilot count. ``message``: if it is decoded."""
+        """Process a frame of the vehicle's system, and ``message`` if it is decoded; ignores other components."""
         if frame.component_id != self._component_id:
             return
         if self._is_watched or frame.received_at >= self._look_at:
-            self._look_at = frame.received_at + LOOK_S
-            with self._lock:  # never left to another thread: who waits for it is told on this one
+            self._look_at = frame.received_at + MAX_DECODE_DELAY_S
+            # Observers must be called in the loop's thread, so the decoding is not left to another one.
+            with self._lock:
                 self.catch_up()
                 self._apply(frame, message)
             return
-        number_at = self._number_at
-        if number_at is None:
+        instance_at = self._number_at
+        if instance_at is None:
             self.pending[0] = frame if message is None else message
         else:
-            number = frame.body[number_at] if len(frame.body) > number_at else 0
+            number = frame.body[instance_at] if len(frame.body) > instance_at else 0
             self.pending[number] = frame if message is None else message
 
     def catch_up(self) -> None:
-        """Work out what has come, in the order in which it came."""
+        """Decode the pending frames in the order of their arrival."""
         with self._lock:
             waiting: list[tuple[Frame, Message | None]] = []
-            # None is left first: who works one out may look at the value before, and come here again.
+            # Removed only after decoding: the decoder may read the previous value, which calls this function
+            # again.
             while self.pending:
                 came = self.pending.popitem()[1]
                 if isinstance(came, Frame):
@@ -230,11 +228,11 @@ class StreamedMessage:
                 self._apply(frame, message)
 
     def watchers_changed(self) -> None:
-        """Somebody begins or ends to wait for what is in the cells."""
+        """Switch between decoding on arrival and on access when observers come and go."""
         self._is_watched = any(cell._is_watched for cell in self._cells)
 
     def forget(self) -> None:
-        """What has come does not count any more."""
+        """Discard the pending frames."""
         with self._lock:
             self.pending.clear()
             self._look_at = -math.inf

@@ -1,4 +1,4 @@
-"""Where a vehicle is and how it moves."""
+"""State values and decoders: position, velocity, attitude, wind."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ __all__ = [
     "wind_of_covariance",
 ]
 
+# Positions within 0.01 degrees of 0°N 0°E are treated as missing.
 NOWHERE = 100_000
-"""Within 0.01 degrees of 0°N 0°E nothing is believed."""
 SAME_ALTITUDE_MM = 100
 
 
 class Home(Snapshot):
-    """Where the vehicle returns to (HOME_POSITION); ``north_m`` … are from the origin, None: not told."""
+    """The home position (HOME_POSITION); ``north_m`` … are from the origin, None if not reported."""
 
     latitude_deg: float
     longitude_deg: float
@@ -57,12 +57,12 @@ class Home(Snapshot):
 
     @property
     def position(self) -> Position:
-        """The place as a target without an altitude, so that going there keeps the present one."""
+        """The place as a target without an altitude, so that going there keeps the present altitude."""
         return Position(self.latitude_deg, self.longitude_deg)
 
 
 class LocalPosition(Snapshot):
-    """Metres from the estimator's origin, and velocity in m/s (LOCAL_POSITION_NED)."""
+    """Position in metres from the estimator's origin, and velocity in m/s (LOCAL_POSITION_NED)."""
 
     north_m: float
     east_m: float
@@ -86,15 +86,15 @@ class Velocity(Snapshot):
 
     @property
     def course_deg(self) -> float:
-        """Direction of the horizontal movement, 0 to 360."""
+        """Direction of the horizontal movement, 0 to 360 degrees."""
         return geo.wrap_360(math.degrees(math.atan2(self.east_m_s, self.north_m_s)))
 
 
 class Attitude(Snapshot):
-    """Attitude in degrees and turn rates about the body's axes in degrees per second.
+    """Attitude in degrees and turn rates about the body axes in degrees per second.
 
-    ``roll_deg`` right side down, ``pitch_deg`` nose up, ``yaw_deg`` −180 to 180 clockwise from north; a rate
-    is None when it is not told.
+    ``roll_deg`` right side down, ``pitch_deg`` nose up, ``yaw_deg`` −180 to 180 clockwise from north; a rate is None
+    if not reported.
     """
 
     roll_deg: float
@@ -113,7 +113,7 @@ class Attitude(Snapshot):
         z: float,
         rates_deg_s: tuple[float | None, float | None, float | None],
     ) -> Self:
-        """The attitude of a quaternion from earth (north, east, down) to body axes, w first."""
+        """Return the attitude of a quaternion from earth (north, east, down) to body axes, w first."""
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -121,7 +121,7 @@ class Attitude(Snapshot):
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """The same attitude as w, x, y, z."""
+        """The same attitude as a quaternion w, x, y, z."""
         halves = (math.radians(angle) / 2 for angle in (self.roll_deg, self.pitch_deg, self.yaw_deg))
         (cr, sr), (cp, sp), (cy, sy) = ((math.cos(half), math.sin(half)) for half in halves)
         return (
@@ -133,7 +133,7 @@ class Attitude(Snapshot):
 
 
 class Wind(Snapshot):
-    """``direction_deg`` is where it comes from, 0 to 360; speeds in m/s, ``down_m_s`` None when not told."""
+    """Wind speed in m/s; ``direction_deg`` (0 to 360) is where it comes from, ``down_m_s`` None if not reported."""
 
     speed_m_s: float
     direction_deg: float
@@ -141,9 +141,9 @@ class Wind(Snapshot):
 
 
 def place(latitude: int, longitude: int) -> tuple[float, float] | None:
-    """Degrees from 1e-7 degrees; None where there is no fix yet, and for what is no place on earth.
+    """Return degrees from 1e-7 degrees; None without a fix, and for a place that is not on earth.
 
-    Without a fix, autopilots say 0, 0, or a place near it: ArduPlane was seen to reckon its way from there.
+    Without a fix, autopilots report 0, 0 or a place near it: ArduPlane was observed to dead-reckon from there.
     """
     if abs(latitude) < NOWHERE and abs(longitude) < NOWHERE:
         return None
@@ -153,9 +153,9 @@ def place(latitude: int, longitude: int) -> tuple[float, float] | None:
 
 
 def position(message: messages.GlobalPositionInt, context: Context) -> Position | None:
-    """The position, None before the first fix.
+    """Return the position, None before the first fix.
 
-    Until home is set, ``relative_alt`` is no more than the altitude above the sea once again.
+    Until home is set, ``relative_alt`` equals the altitude above mean sea level.
     """
     where = place(message.lat, message.lon)
     if where is None:
@@ -165,54 +165,54 @@ def position(message: messages.GlobalPositionInt, context: Context) -> Position 
 
 
 def global_velocity(message: messages.GlobalPositionInt) -> Velocity | None:
-    """Velocity over ground, None before the first fix."""
+    """Return the velocity over ground, None before the first fix."""
     if place(message.lat, message.lon) is None:
         return None
     return Velocity(message.vx / 100, message.vy / 100, message.vz / 100)
 
 
 def heading_deg(message: messages.GlobalPositionInt) -> float | None:
-    """Where the nose points, 0 to below 360."""
+    """Return the heading, 0 to below 360."""
     return None if message.hdg == U16 else message.hdg / 100 % 360
 
 
 def local_position(message: messages.LocalPositionNed) -> LocalPosition:
-    """Position and velocity in the local frame."""
+    """Return position and velocity in the local frame."""
     return LocalPosition(message.x, message.y, message.z, message.vx, message.vy, message.vz)
 
 
 def local_velocity(message: messages.LocalPositionNed) -> Velocity:
-    """The velocity alone."""
+    """Return the velocity only."""
     return Velocity(message.vx, message.vy, message.vz)
 
 
 def heading_of_hud(message: messages.VfrHud) -> float:
-    """The same in whole degrees."""
+    """Return the heading in whole degrees."""
     return float(message.heading % 360)
 
 
 def ground_speed_m_s(message: messages.VfrHud) -> float:
-    """Ground speed."""
+    """Return the ground speed."""
     return message.groundspeed
 
 
 def air_speed_m_s(message: messages.VfrHud) -> float | None:
-    """Air speed; PX4 without a sensor says NaN."""
+    """Return the airspeed; NaN of PX4 without a sensor becomes None."""
     return finite(message.airspeed)
 
 
 def climb_m_s(message: messages.VfrHud) -> float:
-    """Climb rate."""
+    """Return the climb rate."""
     return message.climb
 
 
 def throttle_percent(message: messages.VfrHud) -> float:
-    """Throttle."""
+    """Return the throttle."""
     return float(message.throttle)
 
 
 def attitude(message: messages.Attitude) -> Attitude:
-    """Euler angles and rates."""
+    """Return Euler angles and rates."""
     degrees = math.degrees
     return Attitude(
         degrees(message.roll),
@@ -225,7 +225,7 @@ def attitude(message: messages.Attitude) -> Attitude:
 
 
 def attitude_of_quaternion(message: messages.AttitudeQuaternion) -> Attitude:
-    """The same from a quaternion."""
+    """Return the attitude from a quaternion."""
     rates = (
         math.degrees(message.rollspeed),
         math.degrees(message.pitchspeed),
@@ -235,7 +235,7 @@ def attitude_of_quaternion(message: messages.AttitudeQuaternion) -> Attitude:
 
 
 def home(message: messages.HomePosition) -> Home | None:
-    """Where it returns to."""
+    """Return the home position; None if its coordinates are invalid."""
     where = place(message.latitude, message.longitude)
     if where is None:
         return None
@@ -243,18 +243,18 @@ def home(message: messages.HomePosition) -> Home | None:
 
 
 def origin(message: messages.GpsGlobalOrigin) -> Position | None:
-    """Where the local frame has its zero."""
+    """Return the origin of the local frame."""
     where = place(message.latitude, message.longitude)
     return None if where is None else Position(*where, message.altitude / 1e3)
 
 
 def wind(message: messages.Wind) -> Wind:
-    """ArduPilot tells where the wind comes from."""
+    """Return the wind of ArduPilot, which reports where it comes from."""
     return Wind(message.speed, geo.wrap_360(message.direction), finite(message.speed_z))
 
 
 def wind_of_covariance(message: messages.WindCov) -> Wind | None:
-    """PX4 tells the wind's own vector, which points where it goes."""
+    """Return the wind of PX4, which reports the vector in which the air moves."""
     if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
         return None
     comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))

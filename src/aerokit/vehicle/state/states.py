@@ -1,8 +1,8 @@
-"""Every state of a vehicle, declared once.
+"""All states of a vehicle, each declared once.
 
-A new one is a value and its decoder (``movement.py``, ``equipment.py``, ``condition.py``) and a declaration here, with
-its documentation below it. Its cell, the attribute on both vehicles, what is asked for, decoding on demand and the
-table in docs/states.md follow from that.
+To add one: write its value and decoder (``movement.py``, ``equipment.py``, ``condition.py``) and declare it here,
+with its documentation below. Its cell, the attribute of both vehicle classes, its requested rate and the table in
+docs/states.md follow from that.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from aerokit.vehicle.state.equipment import (
     ServoOutputs,
     Vibration,
 )
-from aerokit.vehicle.state.field import By, Told
+from aerokit.vehicle.state.field import MessageSource, StateField
 from aerokit.vehicle.state.movement import Attitude, Home, LocalPosition, Velocity, Wind
 
 if TYPE_CHECKING:
@@ -39,177 +39,188 @@ if TYPE_CHECKING:
 
 
 class States:
-    """Every cell gives ``.value`` (ValueUnknownError before the first), ``.latest`` (None before), ``.age`` in seconds,
-    ``.source`` (who said it), ``.fresh(within=s)``, ``await .wait_until(predicate, held_for=s)``, ``.changes()``.
+    """State cells: each has ``.value`` (ValueUnknownError before the first), ``.latest`` (None before), ``.age`` in
+    seconds, ``.source``, ``.fresh(within=s)``, ``await .wait_until(predicate, held_for=s)`` and ``.changes()``.
     """
 
-    mode: Told[Mode] = Told(
-        By("Heartbeat", condition.mode, knowing=True),
-        By("CurrentMode", condition.current_mode, knowing=True, hz=1.0),
-        at_once=True,
+    mode: StateField[Mode] = StateField(
+        MessageSource("Heartbeat", condition.mode, needs_context=True),
+        MessageSource("CurrentMode", condition.current_mode, needs_context=True, hz=1.0),
+        eager=True,
     )
-    """Flight mode by HEARTBEAT; ``vehicle.mode.value.name`` is its name."""
+    """Flight mode (HEARTBEAT); ``vehicle.mode.value.name`` is its name."""
 
-    system_status: Told[int] = Told(By("Heartbeat", condition.system_status), at_once=True)
-    """MAV_STATE by HEARTBEAT: 3 standby, 4 active, 5 critical, 6 emergency."""
+    system_status: StateField[int] = StateField(MessageSource("Heartbeat", condition.system_status), eager=True)
+    """MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency (HEARTBEAT)."""
 
-    # After mode and system_status: whoever observes it has the whole HEARTBEAT.
-    armed: Told[bool] = Told(By("Heartbeat", condition.armed), at_once=True)
-    """Whether the motors are armed, by HEARTBEAT."""
+    # After mode and system_status, so that its observers see the whole HEARTBEAT.
+    armed: StateField[bool] = StateField(MessageSource("Heartbeat", condition.armed), eager=True)
+    """True if the motors are armed (HEARTBEAT)."""
 
-    vtol_state: Told[int] = Told(By("ExtendedSysState", condition.vtol_state, hz=5.0), at_once=True)
+    vtol_state: StateField[int] = StateField(
+        MessageSource("ExtendedSysState", condition.vtol_state, hz=5.0), eager=True
+    )
     """MAV_VTOL_STATE: 1 to fixed wing, 2 to multicopter, 3 multicopter, 4 fixed wing (EXTENDED_SYS_STATE)."""
 
-    landed_state: Told[int] = Told(
-        By("ExtendedSysState", condition.landed_state, hz=5.0),
-        By("Heartbeat", condition.landed_state_of_heartbeat, knowing=True, second_best=True),
-        at_once=True,
+    landed_state: StateField[int] = StateField(
+        MessageSource("ExtendedSysState", condition.landed_state, hz=5.0),
+        MessageSource("Heartbeat", condition.landed_state_of_heartbeat, needs_context=True, fallback=True),
+        eager=True,
     )
     """MAV_LANDED_STATE: 1 on the ground, 2 in the air, 3 taking off, 4 landing (EXTENDED_SYS_STATE)."""
 
-    attitude: Told[Attitude] = Told(
-        By("Attitude", movement.attitude, hz=10.0),
-        By("AttitudeQuaternion", movement.attitude_of_quaternion),
+    attitude: StateField[Attitude] = StateField(
+        MessageSource("Attitude", movement.attitude, hz=10.0),
+        MessageSource("AttitudeQuaternion", movement.attitude_of_quaternion),
     )
     """Roll, pitch, yaw in degrees, turn rates, quaternion (ATTITUDE, ATTITUDE_QUATERNION)."""
 
-    heading_deg: Told[float] = Told(
-        By("GlobalPositionInt", movement.heading_deg, hz=10.0),
-        By("VfrHud", movement.heading_of_hud, second_best=True),
+    heading_deg: StateField[float] = StateField(
+        MessageSource("GlobalPositionInt", movement.heading_deg, hz=10.0),
+        MessageSource("VfrHud", movement.heading_of_hud, fallback=True),
         waits_for="GLOBAL_POSITION_INT or VFR_HUD",
     )
-    """Where the nose points, 0 to 360 degrees clockwise from north (GLOBAL_POSITION_INT, VFR_HUD)."""
+    """Heading, 0 to 360 degrees clockwise from north (GLOBAL_POSITION_INT, VFR_HUD)."""
 
-    position: Told[Position] = Told(
-        By("GlobalPositionInt", movement.position, knowing=True, hz=10.0),
+    position: StateField[Position] = StateField(
+        MessageSource("GlobalPositionInt", movement.position, needs_context=True, hz=10.0),
         waits_for="GLOBAL_POSITION_INT with a fix",
     )
-    """Latitude, longitude in degrees, altitude above sea and above home in metres (GLOBAL_POSITION_INT)."""
+    """Latitude and longitude in degrees, altitude above sea and above home in metres (GLOBAL_POSITION_INT)."""
 
-    velocity: Told[Velocity] = Told(
-        By("GlobalPositionInt", movement.global_velocity, hz=10.0),
-        By("LocalPositionNed", movement.local_velocity, second_best=True),
+    velocity: StateField[Velocity] = StateField(
+        MessageSource("GlobalPositionInt", movement.global_velocity, hz=10.0),
+        MessageSource("LocalPositionNed", movement.local_velocity, fallback=True),
         waits_for="GLOBAL_POSITION_INT with a fix",
     )
     """Velocity over ground in m/s, north, east, down (GLOBAL_POSITION_INT)."""
 
-    local_position: Told[LocalPosition] = Told(By("LocalPositionNed", movement.local_position, hz=10.0))
+    local_position: StateField[LocalPosition] = StateField(
+        MessageSource("LocalPositionNed", movement.local_position, hz=10.0)
+    )
     """Metres and m/s north, east, down of the estimator's origin (LOCAL_POSITION_NED)."""
 
-    ground_speed_m_s: Told[float] = Told(By("VfrHud", movement.ground_speed_m_s, hz=5.0))
+    ground_speed_m_s: StateField[float] = StateField(MessageSource("VfrHud", movement.ground_speed_m_s, hz=5.0))
     """Ground speed in m/s (VFR_HUD)."""
 
-    air_speed_m_s: Told[float] = Told(
-        By("VfrHud", movement.air_speed_m_s, hz=5.0), waits_for="VFR_HUD with an air speed"
+    air_speed_m_s: StateField[float] = StateField(
+        MessageSource("VfrHud", movement.air_speed_m_s, hz=5.0), waits_for="VFR_HUD with an air speed"
     )
     """Air speed in m/s (VFR_HUD)."""
 
-    climb_m_s: Told[float] = Told(By("VfrHud", movement.climb_m_s, hz=5.0))
+    climb_m_s: StateField[float] = StateField(MessageSource("VfrHud", movement.climb_m_s, hz=5.0))
     """Climb rate in m/s, up is positive (VFR_HUD)."""
 
-    throttle_percent: Told[float] = Told(By("VfrHud", movement.throttle_percent, hz=5.0))
+    throttle_percent: StateField[float] = StateField(MessageSource("VfrHud", movement.throttle_percent, hz=5.0))
     """Throttle, 0 to 100 (VFR_HUD)."""
 
-    gps: Told[tuple[GpsReceiver, ...]] = Told(
-        By("GpsRawInt", equipment.first_gps, knowing=True, hz=2.0),
-        By("Gps2Raw", equipment.second_gps, knowing=True),
+    gps: StateField[tuple[GpsReceiver, ...]] = StateField(
+        MessageSource("GpsRawInt", equipment.first_gps, needs_context=True, hz=2.0),
+        MessageSource("Gps2Raw", equipment.second_gps, needs_context=True),
     )
-    """Every satellite receiver, the first one first (GPS_RAW_INT, GPS2_RAW)."""
+    """All satellite receivers, the first one first (GPS_RAW_INT, GPS2_RAW)."""
 
-    batteries: Told[tuple[Battery, ...]] = Told(
-        By("BatteryStatus", equipment.batteries, knowing=True, hz=1.0, one_of="id"),
-        By("SysStatus", equipment.main_battery, knowing=True, second_best=True),
+    batteries: StateField[tuple[Battery, ...]] = StateField(
+        MessageSource("BatteryStatus", equipment.batteries, needs_context=True, hz=1.0, instance_field="id"),
+        MessageSource("SysStatus", equipment.main_battery, needs_context=True, fallback=True),
         waits_for="BATTERY_STATUS or SYS_STATUS",
     )
-    """Every battery (BATTERY_STATUS, else SYS_STATUS)."""
+    """All batteries (BATTERY_STATUS, else SYS_STATUS)."""
 
-    power: Told[Power] = Told(By("PowerStatus", equipment.power, hz=1.0))
+    power: StateField[Power] = StateField(MessageSource("PowerStatus", equipment.power, hz=1.0))
     """Supply of the board and of its servos in volts (POWER_STATUS)."""
 
-    sensors: Told[SensorHealth] = Told(By("SysStatus", condition.sensor_health, knowing=True, hz=2.0))
+    sensors: StateField[SensorHealth] = StateField(
+        MessageSource("SysStatus", condition.sensor_health, needs_context=True, hz=2.0)
+    )
     """Health of the sensors and the pre-arm checks (SYS_STATUS)."""
 
-    estimator: Told[EstimatorHealth] = Told(
-        By("EkfStatusReport", condition.ekf_health, knowing=True, hz=2.0),
-        By("EstimatorStatus", condition.estimator_health, knowing=True, hz=2.0, instead=True),
+    estimator: StateField[EstimatorHealth] = StateField(
+        MessageSource("EkfStatusReport", condition.ekf_health, needs_context=True, hz=2.0),
+        MessageSource("EstimatorStatus", condition.estimator_health, needs_context=True, hz=2.0, alternative=True),
     )
     """Health of the state estimator (EKF_STATUS_REPORT, ESTIMATOR_STATUS)."""
 
-    home: Told[Home] = Told(By("HomePosition", movement.home), at_once=True)
-    """Where it returns to (HOME_POSITION)."""
+    home: StateField[Home] = StateField(MessageSource("HomePosition", movement.home), eager=True)
+    """Home position: the place to return to (HOME_POSITION)."""
 
-    origin: Told[Position] = Told(By("GpsGlobalOrigin", movement.origin), at_once=True)
+    origin: StateField[Position] = StateField(MessageSource("GpsGlobalOrigin", movement.origin), eager=True)
     """Origin of the estimator's local frame (GPS_GLOBAL_ORIGIN)."""
 
-    rc_channels: Told[RcChannels] = Told(By("RcChannels", equipment.rc_channels, hz=2.0))
+    rc_channels: StateField[RcChannels] = StateField(MessageSource("RcChannels", equipment.rc_channels, hz=2.0))
     """Remote control, pulse widths in µs (RC_CHANNELS)."""
 
-    servo_outputs: Told[ServoOutputs] = Told(
-        By("ServoOutputRaw", equipment.servo_outputs, knowing=True, hz=2.0, one_of="port")
+    servo_outputs: StateField[ServoOutputs] = StateField(
+        MessageSource("ServoOutputRaw", equipment.servo_outputs, needs_context=True, hz=2.0, instance_field="port")
     )
     """Outputs to motors and servos, pulse widths in µs (SERVO_OUTPUT_RAW)."""
 
-    wind: Told[Wind] = Told(
-        By("Wind", movement.wind, hz=1.0), By("WindCov", movement.wind_of_covariance, hz=1.0, instead=True)
+    wind: StateField[Wind] = StateField(
+        MessageSource("Wind", movement.wind, hz=1.0),
+        MessageSource("WindCov", movement.wind_of_covariance, hz=1.0, alternative=True),
     )
-    """Wind speed in m/s and where it comes from in degrees (WIND, WIND_COV)."""
+    """Wind speed in m/s and the direction it comes from in degrees (WIND, WIND_COV)."""
 
-    range_finders: Told[tuple[RangeFinder, ...]] = Told(
-        By("DistanceSensor", equipment.distance_sensors, knowing=True, hz=5.0, one_of="id"),
-        By("Rangefinder", equipment.range_finder, knowing=True, second_best=True),
+    range_finders: StateField[tuple[RangeFinder, ...]] = StateField(
+        MessageSource("DistanceSensor", equipment.distance_sensors, needs_context=True, hz=5.0, instance_field="id"),
+        MessageSource("Rangefinder", equipment.range_finder, needs_context=True, fallback=True),
     )
-    """Every distance sensor (DISTANCE_SENSOR, RANGEFINDER)."""
+    """All distance sensors (DISTANCE_SENSOR, RANGEFINDER)."""
 
-    vibration: Told[Vibration] = Told(By("Vibration", equipment.vibration, hz=1.0))
+    vibration: StateField[Vibration] = StateField(MessageSource("Vibration", equipment.vibration, hz=1.0))
     """Vibration levels in m/s² (VIBRATION)."""
 
-    system_time: Told[SystemTime] = Told(By("SystemTime", condition.system_time, hz=1.0))
+    system_time: StateField[SystemTime] = StateField(MessageSource("SystemTime", condition.system_time, hz=1.0))
     """The vehicle's clock (SYSTEM_TIME)."""
 
-    version: Told[AutopilotVersion] = Told(
-        By("AutopilotVersion", condition.version, knowing=True), at_once=True
+    version: StateField[AutopilotVersion] = StateField(
+        MessageSource("AutopilotVersion", condition.version, needs_context=True), eager=True
     )
     """Firmware and hardware (AUTOPILOT_VERSION)."""
 
-    capabilities: Told[int] = Told(By("AutopilotVersion", condition.capabilities), at_once=True)
+    capabilities: StateField[int] = StateField(MessageSource("AutopilotVersion", condition.capabilities), eager=True)
     """MAV_PROTOCOL_CAPABILITY bits (AUTOPILOT_VERSION)."""
 
-    mission_current: Told[MissionProgress] = Told(By("MissionCurrent", condition.mission_progress, hz=1.0))
+    mission_current: StateField[MissionProgress] = StateField(
+        MessageSource("MissionCurrent", condition.mission_progress, hz=1.0)
+    )
     """Current mission item (MISSION_CURRENT)."""
 
-    mission_reached: Told[int] = Told(By("MissionItemReached", condition.mission_reached), at_once=True)
-    """The mission item that was reached last (MISSION_ITEM_REACHED)."""
+    mission_reached: StateField[int] = StateField(
+        MessageSource("MissionItemReached", condition.mission_reached), eager=True
+    )
+    """The last mission item reached (MISSION_ITEM_REACHED)."""
 
-    status_text: Told[StatusText] = Told(By("Statustext", None), at_once=True)
-    """The last thing it said (STATUSTEXT, chunks joined)."""
+    status_text: StateField[StatusText] = StateField(MessageSource("Statustext", None), eager=True)
+    """The last status text (STATUSTEXT, chunks joined)."""
 
     def _cell_of(self, name: str) -> StateCell[Any]:
         raise NotImplementedError
 
 
-STATES: Mapping[str, Told[Any]] = {
-    name: value for name, value in vars(States).items() if isinstance(value, Told)
+STATES: Mapping[str, StateField[Any]] = {
+    name: value for name, value in vars(States).items() if isinstance(value, StateField)
 }
 """Name → declaration."""
 
 
-def _by_message() -> dict[str, list[tuple[Told[Any], By[Any]]]]:
-    found: dict[str, list[tuple[Told[Any], By[Any]]]] = {}
+def _by_message() -> dict[str, list[tuple[StateField[Any], MessageSource[Any]]]]:
+    found: dict[str, list[tuple[StateField[Any], MessageSource[Any]]]] = {}
     for told in STATES.values():
         for source in told.sources:
             found.setdefault(source.message, []).append((told, source))
     return found
 
 
-SOURCES: Mapping[str, list[tuple[Told[Any], By[Any]]]] = _by_message()
-"""Name of a message class → the states that it tells, and how."""
+SOURCES: Mapping[str, list[tuple[StateField[Any], MessageSource[Any]]]] = _by_message()
+"""Name of a message class → the states that it reports, and how."""
 
-LAZY = tuple(name for name, rows in SOURCES.items() if not any(told.at_once for told, _ in rows))
-"""Messages that are worked out when somebody looks at one of their states."""
+LAZY = tuple(name for name, rows in SOURCES.items() if not any(told.eager for told, _ in rows))
+"""Messages that are decoded on access to one of their states."""
 
 DEFAULT_RATES_HZ: Mapping[str, float] = {
     name: max(source.hz for _, source in rows if source.hz is not None)
     for name, rows in SOURCES.items()
     if any(source.hz is not None for _, source in rows)
 }
-"""Name of a message class → how fast it should come when nobody asks for another rate."""
+"""Name of a message class → default rate in Hz."""

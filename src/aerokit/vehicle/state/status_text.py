@@ -1,4 +1,4 @@
-"""STATUSTEXT: chunks joined, padding taken off, the last ones remembered to explain failures."""
+"""STATUSTEXT: joins chunks, removes padding, and keeps recent texts to explain failures."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["StatusTextAssembler"]
 CHUNK_LENGTH = 50
 CHUNK_TIMEOUT_S = 2.0
 REMEMBERED = 64
-LONGEST = 20
-"""Chunks of one text; more are taken for garbage and told as they are."""
-MOST_OPEN = 16
-"""Texts that may be under way at a time, over all components."""
+# Maximum chunks of one text; a longer text is invalid and passed on in parts.
+MAX_CHUNKS = 20
+# Maximum number of incomplete texts of all components.
+MAX_OPEN = 16
 ELLIPSIS = "…"
 
 _Sender = tuple[int, int]
@@ -29,9 +29,8 @@ _Sender = tuple[int, int]
 class StatusTextAssembler:
     """Joins the chunks of long texts (https://mavlink.io/en/messages/common.html#STATUSTEXT).
 
-    A text ends with the first chunk that is not full. When a chunk is missing, or the end does not come
-    within two seconds, what is there is told with "…" in the place of what is not. Tabs and spaces at the end
-    are taken off.
+    A text ends with the first chunk that is not full. If a chunk is missing, or the end does not arrive within two
+    seconds, the text is passed on with "…" in place of the missing part. Trailing tabs and spaces are removed.
     """
 
     def __init__(self) -> None:
@@ -39,7 +38,7 @@ class StatusTextAssembler:
         self._recent: deque[StatusText] = deque(maxlen=REMEMBERED)
 
     def receive(self, message: Statustext, now: float) -> list[StatusText]:
-        """Take one message and return the texts that are complete now."""
+        """Process one message and return the texts that are complete now."""
         late = self.expire(now)
         chunk = _bytes_of(message)
         if message.id == 0:
@@ -50,18 +49,18 @@ class StatusTextAssembler:
         return late + texts
 
     def expire(self, now: float) -> list[StatusText]:
-        """Give up on texts whose next chunk has not come for two seconds, and return what there is."""
+        """Return the texts whose next chunk has not arrived for two seconds, as they are."""
         late = [key for key, text in self._open.items() if now - text.touched_at > CHUNK_TIMEOUT_S]
         texts = [self._open.pop(key).cut(now) for key in late]
         self._recent.extend(texts)
         return texts
 
     def recent(self, since: float = float("-inf")) -> tuple[StatusText, ...]:
-        """The last texts (64 at most) that came at or after ``since``, oldest first."""
+        """Return the last texts (64 at most) received at or after ``since``, oldest first."""
         return tuple(text for text in self._recent if text.at >= since)
 
     def clear(self) -> None:
-        """Forget texts under way and texts remembered."""
+        """Discard incomplete and recent texts."""
         self._open.clear()
         self._recent.clear()
 
@@ -70,24 +69,24 @@ class StatusTextAssembler:
         text = self._open.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
             if message.chunk_seq == text.next_seq - 1 and text.last_chunk == chunk:
-                return  # the same frame by another way
+                return  # The same frame, received by another link.
             yield self._open.pop(key).cut(now)
             text = None
         if text is None:
             text = self._open_text(key, message.severity)
         text.add(message.chunk_seq, chunk, now)
-        if len(chunk) < CHUNK_LENGTH or text.next_seq >= LONGEST:
+        if len(chunk) < CHUNK_LENGTH or text.next_seq >= MAX_CHUNKS:
             yield self._open.pop(key).whole(now)
 
     def _open_text(self, key: tuple[_Sender, int], severity: int) -> _OpenText:
-        while len(self._open) >= MOST_OPEN:
+        while len(self._open) >= MAX_OPEN:
             del self._open[next(iter(self._open))]
         text = self._open[key] = _OpenText(severity)
         return text
 
 
 class _OpenText:
-    """The chunks of one text so far; there is one at least."""
+    """The chunks received of one text, at least one."""
 
     last_chunk: bytes
     touched_at: float
@@ -116,7 +115,7 @@ def _sender(message: Statustext) -> _Sender:
 
 
 def _bytes_of(message: Statustext) -> bytes:
-    """The text as it was sent: a character of several bytes may stand on the edge of two chunks."""
+    """Return the text as sent: a multi-byte character may be split between two chunks."""
     frame = message.received_frame
     data = message.text.encode() if frame is None else frame.payload[1 : 1 + CHUNK_LENGTH]
     return data.split(b"\0")[0]

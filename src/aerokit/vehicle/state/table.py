@@ -1,4 +1,4 @@
-"""The table of all states in docs/states.md: ``python -m aerokit.vehicle.state.table > docs/states.md``."""
+"""Generates the table of all states in docs/states.md: ``python -m aerokit.vehicle.state.table > docs/states.md``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aerokit.vehicle.state import states
 from aerokit.vehicle.state.field import message_type
 
 if TYPE_CHECKING:
-    from aerokit.vehicle.state.field import Told
+    from aerokit.vehicle.state.field import StateField
 
 HEAD = """# What a vehicle tells
 
@@ -27,7 +27,7 @@ source first, and with the rate at which the vehicle is asked for them unless `c
 
 
 def documentation() -> dict[str, tuple[str, str]]:
-    """Name → type and documentation of each state, as they stand in the source."""
+    """Return name → type and documentation of each state, from the source."""
     (body,) = (
         node.body
         for node in ast.parse(Path(states.__file__).read_text(encoding="utf-8")).body
@@ -38,21 +38,20 @@ def documentation() -> dict[str, tuple[str, str]]:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
             text = str(below.value.value) if is_text else ""  # type: ignore[attr-defined]
-            kind = ast.unparse(node.annotation).removeprefix("Told[").removesuffix("]")
+            kind = ast.unparse(node.annotation).removeprefix("StateField[").removesuffix("]")
             found[node.target.id] = (kind, text)
     return found
 
 
 def rendered() -> str:
-    """The whole page."""
+    """Return the whole page."""
     texts = documentation()
     return HEAD + "".join(_row(name, *texts[name], told) for name, told in states.STATES.items())
 
 
-def _row(name: str, kind: str, text: str, told: Told[Any]) -> str:
+def _row(name: str, kind: str, text: str, told: StateField[Any]) -> str:
     sources = ", ".join(
-        f"{message_type(each.message).NAME}{f' at {each.hz:g} Hz' if each.hz else ''}"
-        for each in told.sources
+        f"{message_type(each.message).NAME}{f' at {each.hz:g} Hz' if each.hz else ''}" for each in told.sources
     )
     return f"| `{name}` | `{kind}` | {text.partition(' (')[0].rstrip('.')} | {sources} |\n"
 

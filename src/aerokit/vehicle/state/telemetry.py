@@ -1,4 +1,4 @@
-"""`Telemetry`: the state cells of one vehicle, and what each message does to them."""
+"""`Telemetry`: the state cells of one vehicle, and how messages update them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.connection.cells import Source, StateCell
-from aerokit.connection.components import is_autopilot
+from aerokit.connection.heartbeats import is_autopilot
 from aerokit.mavlink.message import offset_of
-from aerokit.vehicle.state.field import MESSAGE_IDS, By, Context, StreamedMessage, message_type
+from aerokit.vehicle.state.field import MESSAGE_IDS, Context, MessageSource, StreamedMessage, message_type
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
 from aerokit.vehicle.state.status_text import StatusTextAssembler
 
@@ -23,20 +23,19 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.state.condition import StatusText
 
-BETTER_SOURCE_S = 2.0
-"""For so long the second-best source of a value keeps quiet after the best one."""
-MOST_MODE_NAMES = 256
+# Seconds for which a fallback message is ignored after a better one.
+FALLBACK_DELAY_S = 2.0
+MAX_MODE_NAMES = 256
 
 Handler = Callable[[Any, Source], None]
 
 
 class Telemetry(States):
-    """All state cells of one vehicle, and what each message does to them.
+    """All state cells of one vehicle, updated by its messages.
 
-    Only messages of system ``system_id``, component ``component_id`` (the autopilot) change anything; messages that
-    the program built itself are let through. ``handles`` has the entry point for each message id, ``streams`` those
-    that frames of streamed messages are given to. ``clock`` gives seconds; without ``autopilot`` the first HEARTBEAT
-    says which it is.
+    Only messages of system ``system_id``, component ``component_id`` (the autopilot) are processed; messages built by
+    the program itself are accepted. ``handles`` has the handler for each message id, ``streams`` those that take
+    frames of streamed messages. ``clock`` returns seconds; without ``autopilot`` the first HEARTBEAT determines it.
     """
 
     autopilot: Autopilot
@@ -54,7 +53,7 @@ class Telemetry(States):
         self.autopilot = autopilot or Autopilot(0)
         self._knows_autopilot = autopilot is not None
         self._clock = clock
-        self._lock = threading.RLock()  # any thread may look, and what is looked at is worked out then
+        self._lock = threading.RLock()  # Any thread may read a cell, which decodes the pending frame.
         self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
         self._mode_names: dict[int, str] = {}
@@ -74,37 +73,37 @@ class Telemetry(States):
 
     @property
     def handles(self) -> Mapping[int, Callable[[Any], None]]:
-        """Message id → what takes a message of this kind."""
+        """Message id → handler of the message."""
         return self._handlers
 
     @property
     def streams(self) -> Mapping[int, StreamedMessage]:
-        """Message id → what takes frames of this kind: they are worked out when somebody looks at their cells."""
+        """Message id → handler of frames, which are decoded on access to their cells."""
         return self._streams
 
     def accepts(self, frame: Frame) -> bool:
-        """Whether this is the vehicle's own autopilot talking."""
+        """Return True if the frame is from the vehicle's autopilot."""
         return frame.system_id == self.system_id and frame.component_id == self.component_id
 
     def receive(self, message: Message) -> None:
-        """Take any message; those that say nothing about the state are passed over."""
+        """Process any message; messages without state are ignored."""
         handler = self._handlers.get(message.ID)
         if handler is not None:
             handler(message)
 
     def expire(self, now: float) -> None:
-        """Tell status texts whose ends have not come; call it about once a second."""
-        self._tell(self._texts.expire(now), self._source("Statustext"))
+        """Pass on status texts whose end has not arrived; call it about once a second."""
+        self._publish_texts(self._texts.expire(now), self._source("Statustext"))
 
     def forget(self) -> None:
-        """Make everything unknown again, as after a reboot; texts are remembered."""
+        """Make all states unknown, as after a reboot; status texts are kept."""
         for stream in self._streams.values():
             stream.forget()
         for cell in self._cells.values():
             cell.forget()
 
     def close(self, error: BaseException) -> None:
-        """Nothing will come any more: whoever waits gets ``error``."""
+        """End all waits with ``error``."""
         for cell in self._cells.values():
             cell.close(error)
 
@@ -117,32 +116,34 @@ class Telemetry(States):
 
     @property
     def mode_names(self) -> Mapping[int, str]:
-        """custom_mode → name of the modes that the vehicle told by AVAILABLE_MODES and no table knows."""
+        """custom_mode → name of modes from AVAILABLE_MODES that no table contains."""
         return self._mode_names
 
     @property
     def default_rates(self) -> Mapping[type[Message], float]:
-        """Message class → Hz, for a program that asks for nothing special."""
+        """Message class → default rate in Hz."""
         known = {message_type(name): hz for name, hz in DEFAULT_RATES_HZ.items()}
         return {message: hz for message, hz in known.items() if self.autopilot.sends(message)}
 
     def required_messages(self, name: str) -> tuple[type[Message], ...]:
-        """The messages to ask for when a program wants the cell of this name."""
-        return tuple(STATES[name].asked_of(self.autopilot))
+        """Return the messages to request for the cell of this name."""
+        return tuple(STATES[name].requested_from(self.autopilot))
 
     @property
     def is_armed(self) -> bool:
-        """Whether the last heartbeat says armed; False before the first, and after a reboot until the next one."""
+        """True if the last heartbeat reports armed; False before the first one, and after a reboot until the next
+        one.
+        """
         return self.armed.latest is True
 
     @property
-    def is_surely_disarmed(self) -> bool:
-        """Whether the last heartbeat says disarmed; False while it is not known."""
+    def is_confirmed_disarmed(self) -> bool:
+        """True if the last heartbeat reports disarmed; False while the state is unknown."""
         return self.armed.latest is False
 
     @property
     def is_vtol(self) -> bool:
-        """Whether it can hover and cruise on wings: EXTENDED_SYS_STATE tells a VTOL state."""
+        """True for a VTOL vehicle, which can hover and cruise on wings (EXTENDED_SYS_STATE reports a VTOL state)."""
         return bool(self.vtol_state.latest)
 
     @property
@@ -152,12 +153,12 @@ class Telemetry(States):
         return "unknown" if mode is None else mode.name
 
     def is_in(self, mode: Mode) -> bool:
-        """Whether the last heartbeat told this mode."""
+        """Return True if the last heartbeat reported this mode."""
         latest = self.mode.latest
         return latest is not None and latest.custom_mode == mode.custom_mode
 
     def texts_since(self, at: float) -> tuple[StatusText, ...]:
-        """What the vehicle said since then (64 texts at most), oldest first."""
+        """Return the status texts received since then (64 at most), oldest first."""
         return self._texts.recent(at)
 
     # -------------------------------------------------------------------------- the machinery
@@ -166,7 +167,7 @@ class Telemetry(States):
         return self._cells[name]
 
     def _time_of_arrival(self) -> float:
-        """Of the message that is being worked out."""
+        """Return the reception time of the message being decoded."""
         return self._clock() if self._arrived_at is None else self._arrived_at
 
     def _source(self, class_name: str) -> Source:
@@ -184,7 +185,7 @@ class Telemetry(States):
         return take
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Every value is as old as the frame that it came in, whichever way it is decoded."""
+        """Process a message: a value is as old as the frame that it was received in, whenever it is decoded."""
         before, self._arrived_at = self._arrived_at, None if frame is None else frame.received_at
         try:
             handler(message, source)
@@ -192,27 +193,27 @@ class Telemetry(States):
             self._arrived_at = before
 
     def _handler(self, class_name: str) -> Handler:
-        """What a message of this class does."""
+        """Return the handler for a message class."""
         by_itself: Mapping[str, Handler] = {
             "AvailableModes": self._on_available_modes,
             "Statustext": self._on_status_text,
         }
         if class_name in by_itself:
             return by_itself[class_name]
-        tellers = [self._teller(self._cells[told.name], each) for told, each in SOURCES[class_name]]
+        handlers = [self._handler_for(self._cells[told.name], each) for told, each in SOURCES[class_name]]
 
         def handler(message: Any, source: Source) -> None:
-            for teller in tellers:
-                teller(message, source)
+            for handler in handlers:
+                handler(message, source)
 
         def on_heartbeat(message: Any, source: Source) -> None:
             if self._is_of_autopilot(message):
                 handler(message, source)
 
-        return on_heartbeat if class_name == "Heartbeat" else tellers[0] if len(tellers) == 1 else handler
+        return on_heartbeat if class_name == "Heartbeat" else handlers[0] if len(handlers) == 1 else handler
 
-    def _teller(self, cell: StateCell[Any], by: By[Any]) -> Handler:
-        """What one message says of one thing; None when it does not know it."""
+    def _handler_for(self, cell: StateCell[Any], by: MessageSource[Any]) -> Handler:
+        """Return the handler that updates one cell from one message; a value of None is ignored."""
         decode, context = by.decode, self._context
         assert decode is not None
 
@@ -221,19 +222,19 @@ class Telemetry(States):
             if value is not None:
                 cell.set(value, source)
 
-        def tell_knowing(message: Any, source: Source) -> None:
+        def update_with_context(message: Any, source: Source) -> None:
             context.before = cell.latest
             value = decode(message, context)
             if value is not None:
                 cell.set(value, source)
 
-        teller = tell_knowing if by.knowing else tell
+        handler = update_with_context if by.needs_context else tell
 
-        def tell_unless_better(message: Any, source: Source) -> None:
+        def update_unless_better(message: Any, source: Source) -> None:
             if not self._has_better(cell, source):
-                teller(message, source)
+                handler(message, source)
 
-        return tell_unless_better if by.second_best else teller
+        return update_unless_better if by.fallback else handler
 
     def _streamed(self, class_name: str, handler: Handler) -> StreamedMessage:
         source, kind = self._source(class_name), message_type(class_name)
@@ -245,22 +246,22 @@ class Telemetry(States):
 
         rows = SOURCES[class_name]
         cells = [self._cells[told.name] for told, _ in rows]
-        one_of = next((each.one_of for _, each in rows if each.one_of is not None), None)
-        number_at = None if one_of is None else offset_of(kind, one_of)
-        return StreamedMessage(self.component_id, cells, number_at, apply, self._lock)
+        instance_field = next((each.instance_field for _, each in rows if each.instance_field is not None), None)
+        instance_at = None if instance_field is None else offset_of(kind, instance_field)
+        return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
     def _has_better(self, cell: StateCell[Any], source: Source) -> bool:
-        """Whether another message has told this value lately; that one is the better source."""
+        """Return True if a better message has reported this value recently."""
         return (
             cell.source is not None
             and cell.source.message != source.message
-            and self._time_of_arrival() - cell.updated_at < BETTER_SOURCE_S
+            and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
         )
 
     # ------------------------------------------------------------------- what is not one value
 
     def _is_of_autopilot(self, heartbeat: messages.Heartbeat) -> bool:
-        """Whether it is not of a ground station or a companion that took the autopilot's ids."""
+        """Return False for the heartbeat of a ground station or companion that uses the autopilot's ids."""
         if not is_autopilot(heartbeat):
             return False
         if not self._knows_autopilot:
@@ -276,15 +277,13 @@ class Telemetry(States):
 
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
-        if name is not None and (
-            message.custom_mode in self._mode_names or len(self._mode_names) < MOST_MODE_NAMES
-        ):
+        if name is not None and (message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # When it was read: a text that explains a refusal must not seem older than the command that was refused.
-        self._tell(self._texts.receive(message, self._clock()), source)
+        # Stamped when read, so that a text that explains a refusal is not older than the refused command.
+        self._publish_texts(self._texts.receive(message, self._clock()), source)
 
-    def _tell(self, texts: Iterable[StatusText], source: Source) -> None:
+    def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
             self.status_text.set(text, source)

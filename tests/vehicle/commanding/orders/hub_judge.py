@@ -1,18 +1,18 @@
-"""What must never be at a hub: what it has passed on to the vehicle, held against what the program has sent."""
+"""Rules that a hub must never break: compares what it passed to the vehicle with what the program sent."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from order_air import Crossing
+from order_air import TrafficEntry
 from order_flights import Flown
 from order_hub import HubSky
 
-from aerokit.hub.outgoing import ORDERS_WAIT_S, Kind, kind_of
-from aerokit.hub.switch import LOOK_AT_LEAST_EVERY_S
+from aerokit.hub.message_rules import ORDER_MAX_AGE_S, MessageKind, kind_of
+from aerokit.hub.switch import MAX_POLL_INTERVAL_S
 from aerokit.vehicle.commanding.order import QUESTIONS
 
-LATE_S = ORDERS_WAIT_S + LOOK_AT_LEAST_EVERY_S + 0.001
+ARM_WATCH_S = ORDER_MAX_AGE_S + MAX_POLL_INTERVAL_S + 0.001
 ROUNDING_S = 1e-6
 
 
@@ -23,18 +23,18 @@ def hub_faults(flown: Flown) -> list[str]:
     return list(_passed_on(sky))
 
 
-def orders_in(crossings: list[Crossing]) -> list[Crossing]:
+def orders_in(crossings: list[TrafficEntry]) -> list[TrafficEntry]:
     """Those that change what a vehicle does or keeps."""
     return [
         each
         for each in crossings
-        if kind_of(each.message.NAME, is_for_one=True) is Kind.ORDER
+        if kind_of(each.message.NAME, is_for_one=True) is MessageKind.ORDER
         and getattr(each.message, "command", None) not in QUESTIONS
     ]
 
 
 def _passed_on(sky: HubSky) -> Iterator[str]:
-    written: dict[bytes, list[Crossing]] = {}
+    written: dict[bytes, list[TrafficEntry]] = {}
     for each in orders_in(sky.sent):
         written.setdefault(each.raw, []).append(each)
     newest = -1
@@ -48,7 +48,7 @@ def _passed_on(sky: HubSky) -> Iterator[str]:
             yield f"{what} was passed on once more"
             continue
         written[each.raw].remove(before[0])
-        if each.at - before[0].arrives_at > LATE_S:
+        if each.at - before[0].arrives_at > ARM_WATCH_S:
             yield f"{what} was kept for {each.at - before[0].arrives_at:.2f} s"
         if before[0].number < newest:
             yield f"{what} was passed on after a newer one"

@@ -1,4 +1,4 @@
-"""What happens in a flight of the order table: drawn by seeds."""
+"""Events of one flight of the order table, drawn by seed."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ import random
 from dataclasses import dataclass, replace
 
 from call_table import Row
-from order_air import Silence, Weather
+from order_air import Disturbances, Silence
 from order_airs import TwoLinks
 from order_hub import Side, ThroughHub, Ways
 
 RIGHT_AFTER_S = 0.001
-"""What is sent with the call has left by then."""
+"""Seconds after which everything sent with the call has left."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What happens: all times are seconds since the order was given."""
+    """Events of one flight; all times are seconds since the order was given."""
 
     row: Row
     autopilot: str
-    weather: Weather
+    disturbances: Disturbances
     pilot_at: float | None = None
-    """When somebody else acts: turns the mode switch; on the ground, disarms, unless ``by_switch``."""
+    """Another party acts: turns the mode switch; on the ground, disarms, unless ``by_switch``."""
     by_switch: bool = False
     failsafe_at: float | None = None
-    """When the vehicle returns by itself."""
+    """The vehicle returns by itself."""
     state_at: float | None = None
-    """When HEARTBEAT begins to tell a failsafe (MAV_STATE_CRITICAL) in the mode that there was."""
+    """HEARTBEAT starts to report a failsafe (MAV_STATE_CRITICAL) in the present mode."""
     station_failsafe: bool = False
-    """Whether it returns when it does not hear the ground station."""
+    """True if the vehicle returns when it loses the ground station."""
     cancel_at: float | None = None
     two: TwoLinks | None = None
     """None: over one link."""
@@ -39,15 +39,15 @@ class Case:
 
     @property
     def quiet_until(self) -> float:
-        """When what is in the air has passed."""
-        outage = 0.0 if self.weather.outage is None else self.weather.outage[1]
+        """The time at which all events are over."""
+        outage = 0.0 if self.disturbances.outage is None else self.disturbances.outage[1]
         return max(outage, 0.0 if self.hub is None else self.hub.quiet_until)
 
 
 def random_case(row: Row, autopilot: str, seed: int) -> Case:
     """Lost answers × lost copies × delays × pilot × failsafe × outage, by a seed."""
     dice = random.Random(f"{row.name} {row.command} {autopilot} {seed}")
-    weather = Weather(
+    disturbances = Disturbances(
         command=row.command,
         lost_acks=dice.choice((0, 1, 1, 2, 9)),
         lost_commands=dice.choice((0, 0, 1, 2)),
@@ -55,15 +55,15 @@ def random_case(row: Row, autopilot: str, seed: int) -> Case:
     )
     if dice.random() < 0.35:
         begin = round(dice.uniform(0.0, 5.0), 2)
-        weather.outage = (begin, begin + round(dice.uniform(1.0, 14.0), 2))
+        disturbances.outage = (begin, begin + round(dice.uniform(1.0, 14.0), 2))
     elif dice.random() < 0.15:
-        weather.stall = (0.0, round(dice.uniform(1.0, 8.0), 2))
+        disturbances.stall = (0.0, round(dice.uniform(1.0, 8.0), 2))
     happens = dice.random()
     later = random.Random(f"a failsafe {row.name} {row.command} {autopilot} {seed}")
     return Case(
         row,
         autopilot,
-        weather,
+        disturbances,
         state_at=round(later.uniform(0.05, 6.0), 2) if happens >= 0.6 and later.random() < 0.5 else None,
         pilot_at=round(dice.uniform(0.05, 6.0), 2) if happens < 0.45 else None,
         failsafe_at=round(dice.uniform(0.05, 6.0), 2) if 0.45 <= happens < 0.6 else None,
@@ -83,7 +83,7 @@ def random_case_over_two(row: Row, autopilot: str, seed: int) -> Case:
     lasts_s = dice.choice((float("inf"), float("inf"), round(dice.uniform(0.5, 8.0), 2)))
     silence = Silence(begin_s, begin_s + lasts_s, is_one_way=dice.random() < 0.5)
     two = TwoLinks(silence, is_copied=dice.random() < 0.5)
-    return replace(case, weather=replace(case.weather, stall=None), two=two)
+    return replace(case, disturbances=replace(case.disturbances, stall=None), two=two)
 
 
 def random_case_through_hub(row: Row, autopilot: str, seed: int) -> Case:
@@ -105,5 +105,5 @@ def random_case_through_hub(row: Row, autopilot: str, seed: int) -> Case:
         silence=Silence(begin_s, dice.choice((math.inf, trouble[1])), is_one_way=dice.random() < 0.5),
     )
     if ways != "one":
-        case = replace(case, weather=replace(case.weather, stall=None))
+        case = replace(case, disturbances=replace(case.disturbances, stall=None))
     return replace(case, hub=hub)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import anyio
 from call_table import Row
-from order_air import Air, Crossing
+from order_air import Air, TrafficEntry
 from order_cases import Case, random_case
 from order_flights import WATCH_S, Flown, Simulated, go_to_place, set_up, somebody_acts, take_over
 from order_judge import faults, orders_in
@@ -20,7 +20,7 @@ from order_table import ARM, ROWS, SET_MODE
 
 import aerokit
 from aerokit.errors import AerokitError
-from aerokit.fleets.events import PolicyOrdered
+from aerokit.fleets.events import PolicyApplied
 from aerokit.fleets.fleet import Fleet
 from aerokit.fleets.policy import FleetResult, PolicyName
 from aerokit.mavlink import FrameEncoder
@@ -30,10 +30,10 @@ from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.testing import run_virtual
 
 AUTOPILOTS = {"a": "ardupilot", "b": "px4", "c": "ardupilot"}
-"""By the network of each."""
-POLICIES: tuple[PolicyName, ...] = ("hold_others", "land_others", "return_others", "go_on")
+"""Autopilot by network."""
+POLICIES: tuple[PolicyName, ...] = ("hold_others", "land_others", "return_others", "continue_others")
 OWN = ("BRAKE", "LOITER"), ("LAND", "LAND"), ("RTL", "RTL")
-"""What the policies, and stopping, may bring about, on ArduCopter and on PX4."""
+"""Modes that the policies, and stopping, may bring about, on ArduCopter and on PX4."""
 
 
 async def _go_to(fleet: Fleet) -> FleetResult:
@@ -52,7 +52,7 @@ ACTIONS: dict[str, Callable[[Fleet], Awaitable[FleetResult]]] = {
 
 @dataclass(frozen=True)
 class FleetCase:
-    """What happens."""
+    """Events of one flight of a fleet."""
 
     action: str
     policy: PolicyName
@@ -63,13 +63,13 @@ class FleetCase:
 
 
 def random_fleet_case(action: str, policy: PolicyName, seed: int) -> FleetCase:
-    """Each member's own weather, pilot and failsafe, as in the table of one; who cancels, cancels all."""
+    """Draw disturbances, pilot and failsafe for each member; a cancellation concerns all."""
     dice = random.Random(f"a fleet {action} {policy} {seed}")
     members = {}
     for name, autopilot in AUTOPILOTS.items():
         case = random_case(_row(action, autopilot), autopilot, dice.randrange(10_000))
-        if dice.random() < 0.4:  # somebody has to be well, or no policy is of use
-            case = replace(case, pilot_at=None, failsafe_at=None, weather=replace(case.weather, outage=None))
+        if dice.random() < 0.4:  # At least one member must be healthy for the policies to matter.
+            case = replace(case, pilot_at=None, failsafe_at=None, disturbances=replace(case.disturbances, outage=None))
         members[name] = replace(case, cancel_at=None)
     cancel_at = round(dice.uniform(0.05, 12.0), 2) if dice.random() < 0.2 else None
     of_others = dice.choice(tuple(AUTOPILOTS)) if dice.random() < 0.4 else ""
@@ -77,7 +77,7 @@ def random_fleet_case(action: str, policy: PolicyName, seed: int) -> FleetCase:
 
 
 def _row(action: str, autopilot: str) -> Row:
-    """The row, with what the policies may bring about."""
+    """Return the row, with the modes of the policies."""
     row = next(each for each in ROWS if each.name == action and autopilot in each.on)
     copter, px4 = row.modes
     return replace(row, modes=((*copter, *(each[0] for each in OWN)), (*px4, *(each[1] for each in OWN))))
@@ -89,20 +89,15 @@ def faults_of(case: FleetCase) -> list[str]:
 
 
 async def _fly(case: FleetCase) -> list[str]:
-    cases = {name: replace(each, weather=replace(each.weather)) for name, each in case.members.items()}
+    cases = {name: replace(each, disturbances=replace(each.disturbances)) for name, each in case.members.items()}
     vehicles = {name: set_up(each) for name, each in cases.items()}
     async with AsyncExitStack() as stack:
-        airs = {
-            name: Air(await stack.enter_async_context(simulated_link(each)))
-            for name, each in vehicles.items()
-        }
-        fleet = await stack.enter_async_context(
-            aerokit.fleet(dict(airs), count=len(airs), on_error=case.policy)
-        )
-        with fleet.events(PolicyOrdered) as news:
+        airs = {name: Air(await stack.enter_async_context(simulated_link(each))) for name, each in vehicles.items()}
+        fleet = await stack.enter_async_context(aerokit.fleet(dict(airs), count=len(airs), on_error=case.policy))
+        with fleet.events(PolicyApplied) as news:
             flown = await _give(case, cases, vehicles, airs, fleet)
-            ordered: list[PolicyOrdered] = []
-            while isinstance(each := news.get_nowait(), PolicyOrdered):
+            ordered: list[PolicyApplied] = []
+            while isinstance(each := news.get_nowait(), PolicyApplied):
                 ordered.append(each)
     found = list(_of_the_policy(case, ordered))
     for name, one in flown.items():
@@ -111,14 +106,14 @@ async def _fly(case: FleetCase) -> list[str]:
             continue
         one.fresh_at = tuple(each.at for each in ordered if f"{name}/1" in each.orders)
         if one.fresh_at and case.policy != "hold_others":
-            # which goes on, also when cancelled
+            # It continues, also when cancelled.
             one.error = AerokitError("the policy had another order for it")
         found += [f"{name}: {fault}" for fault in faults(one)]
     return found
 
 
-def _of_the_policy(case: FleetCase, ordered: list[PolicyOrdered]) -> Iterator[str]:
-    """It orders what it says, of each member once."""
+def _of_the_policy(case: FleetCase, ordered: list[PolicyApplied]) -> Iterator[str]:
+    """Return the orders of the policy, one for each member."""
     said = {"hold_others": "hold", "land_others": "land", "return_others": "return"}.get(case.policy)
     told = [(member, order) for each in ordered for member, order in each.orders.items()]
     for member, order in told:
@@ -147,7 +142,7 @@ async def _give(
     given_at = loop.time()
     acted = {}
     for name, each in cases.items():
-        airs[name].weather = each.weather
+        airs[name].disturbances = each.disturbances
         airs[name].begin()
         acted[name] = somebody_acts(each, vehicles[name])
     errors: dict[str, BaseException] = {}
@@ -178,7 +173,7 @@ async def _give(
 
 
 async def fly_by_another_station(vehicle: Simulated, air: Air) -> None:
-    """It arms, takes off and goes on by hand; this program has ordered nothing."""
+    """Arm, take off and fly manually by another station; this program has given no order."""
     station, seconds = FrameEncoder(200, 190), 40.0  # it boots, and gets its position
     is_px4 = isinstance(vehicle, SimulatedPx4)
     if is_px4:
@@ -196,13 +191,13 @@ async def fly_by_another_station(vehicle: Simulated, air: Air) -> None:
 
 
 def _not_compared(acted: list[tuple[float, str]]) -> BaseException | None:
-    """What was true when one had done it need not be when all have: somebody else may have taken it by then."""
+    """Return members that are not compared: another party may have taken one over before the others were done."""
     return AerokitError("somebody else has acted") if acted else None
 
 
 @dataclass
 class Judged:
-    """What crossed until the judge looked: what is sent when the block is left is not of this order."""
+    """Traffic until the evaluation; commands sent when the block is left do not belong to this order."""
 
-    sent: list[Crossing]
-    heartbeats: list[Crossing]
+    sent: list[TrafficEntry]
+    heartbeats: list[TrafficEntry]

@@ -1,4 +1,4 @@
-"""One flight of the order table: a vehicle in its place, an order, the weather, and somebody else who acts."""
+"""One flight of the order table: a vehicle, an order, bad disturbances, and another party that acts."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sim.px4.modes import POSITION, RTL
-from aerokit.sim.track import true_point
 from aerokit.testing import run_virtual
+from aerokit.testing.track import true_point
 from aerokit.transport import Link
 
 Simulated = SimulatedCopter | SimulatedPx4
 
 RATES: dict[type[Message], float] = {GlobalPositionInt: 4.0}
 WATCH_S, WATCH_ARMING_S = 8.0, 18.0
-"""So long after the order's end it is looked what becomes of it: an order to arm may come late."""
+"""Seconds of observation after the order's end, because an arm command may arrive late."""
 
 
 @dataclass
 class Flown:
-    """What came of it."""
+    """Result of one flight."""
 
     case: Case
     vehicle: Simulated
@@ -45,9 +45,9 @@ class Flown:
     told_at_end: tuple[str, bool]
     """Mode and armed as the program knew them when the call ended."""
     acted: list[tuple[float, str]]
-    """When somebody else acted, on the program's clock, and in which mode the vehicle was then."""
+    """Time at which another party acted, on the program's clock, and the mode of the vehicle then."""
     fresh_at: tuple[float, ...] = ()
-    """When a newer order was given for the program: by the policy of a fleet."""
+    """Time at which the policy of a fleet gave a newer order."""
 
     @property
     def is_armed_at_end(self) -> bool:
@@ -61,7 +61,7 @@ def mode_of(vehicle: Simulated) -> str:
 
 def fly(case: Case) -> Flown:
     """Fly it on virtual time."""
-    return run_virtual(_fly(replace(case, weather=replace(case.weather))))
+    return run_virtual(_fly(replace(case, disturbances=replace(case.disturbances))))
 
 
 async def go_to_place(place: str, vehicle: Simulated, program: aerokit.Vehicle) -> None:
@@ -91,7 +91,7 @@ def take_over(vehicle: Simulated) -> None:
 
 
 def turn_switch(vehicle: Simulated) -> None:
-    """To a mode that is flown by hand."""
+    """Turn the switch to a manually flown mode."""
     if isinstance(vehicle, SimulatedCopter):
         vehicle.set_mode(CopterMode.ALT_HOLD)
     else:
@@ -106,7 +106,7 @@ def _return(vehicle: Simulated) -> None:
 
 
 def run_the_battery_down(vehicle: Simulated) -> None:
-    """What flies is under a failsafe from now on: ArduCopter only warns, PX4 holds first and returns 5 s later."""
+    """Trigger a battery failsafe in flight: ArduCopter only warns, PX4 holds first and returns 5 s later."""
     vehicle.battery.percent = 6.0
     if isinstance(vehicle, SimulatedPx4):
         vehicle.parameters["COM_LOW_BAT_ACT"] = 3.0
@@ -128,7 +128,7 @@ def _act(case: Case, vehicle: Simulated) -> None:
 
 
 def somebody_acts(case: Case, vehicle: Simulated) -> list[tuple[float, str]]:
-    """From now on, at the times of the case; what is returned fills: see :attr:`Flown.acted`."""
+    """Run the events of the case, and record them in :attr:`Flown.acted`."""
     loop = asyncio.get_running_loop()
     acted: list[tuple[float, str]] = []
 
@@ -171,7 +171,7 @@ async def _fly(case: Case) -> Flown:
 
 @asynccontextmanager
 async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[Sky, Link | aerokit.Connection]]:
-    """What is between them, and what the program connects to."""
+    """Return the links between program and vehicle."""
     if case.hub is not None:
         async with through_hub(vehicle, case.hub) as through:
             yield through
@@ -187,7 +187,7 @@ async def _under(case: Case, vehicle: Simulated) -> AsyncIterator[tuple[Sky, Lin
 async def _give(case: Case, vehicle: Simulated, air: Sky, program: aerokit.Vehicle) -> Flown:
     loop = asyncio.get_running_loop()
     await go_to_place(case.row.place, vehicle, program)
-    air.weather = case.weather
+    air.disturbances = case.disturbances
     air.begin()
     given_at = loop.time()
     acted = somebody_acts(case, vehicle)

@@ -1,11 +1,11 @@
-"""What must never be: each rule of docs/reliability.md held against what crossed the air."""
+"""Rules that must never be broken: checks each rule of docs/reliability.md against the recorded traffic."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
 
-from order_air import Crossing, Seen
+from order_air import Seen, TrafficEntry
 from order_flights import WATCH_S, Flown, mode_of
 from order_table import ARM, REPOSITION, SET_MODE
 
@@ -21,18 +21,18 @@ from aerokit.mavlink.messages import (
     SetPositionTargetGlobalInt,
     SetPositionTargetLocalNed,
 )
-from aerokit.vehicle.commanding.arbiter import FIRST_HEARTBEAT_S
+from aerokit.vehicle.commanding.arbiter import ARM_HEARTBEAT_DELAY_S
 from aerokit.vehicle.commanding.order import CHANGED_BY_COMMAND, FAILSAFE_STATES, QUESTIONS
 
 ENDS_FLIGHT = ("disarm", "land", "return_to_launch")
-KNOWN_S = 2.6
+MODE_MAX_AGE_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
-HEARD_S = 4.0
-"""So long after an outage it is known what the vehicle does, and told to hold."""
+OUTAGE_RECOVERY_S = 4.0
+"""Seconds after an outage until the vehicle's state is known and it is told to hold."""
 PX4_LOITER = 4 << 16 | 3 << 24
 COPTER_AUTO, COPTER_GUIDED, COPTER_BRAKE = 3, 4, 17
-FIRST_S = 0.01
-"""What is sent so soon after the call is the order itself."""
+INITIAL_SEND_S = 0.01
+"""A command sent this soon after the call is the order itself."""
 
 
 def faults(flown: Flown) -> list[str]:
@@ -49,12 +49,12 @@ def faults(flown: Flown) -> list[str]:
     ]
 
 
-def _orders(flown: Flown) -> Iterator[Crossing]:
+def _orders(flown: Flown) -> Iterator[TrafficEntry]:
     return orders_in(flown.air)
 
 
-def orders_in(air: Seen) -> Iterator[Crossing]:
-    """What was sent that changes something."""
+def orders_in(air: Seen) -> Iterator[TrafficEntry]:
+    """Return the sent messages that change something."""
     for each in air.sent:
         command = getattr(each.message, "command", None)
         is_command = isinstance(each.message, (CommandLong, CommandInt)) and command not in QUESTIONS
@@ -67,18 +67,18 @@ State = tuple[int, bool, bool]
 
 
 def _told(flown: Flown, since: int, until: int) -> list[State]:
-    """The states that HEARTBEAT told between these two crossings."""
+    """Return the states that HEARTBEAT reported between two recorded messages."""
     told = [_state(each) for each in flown.air.heartbeats if since < each.number < until]
     return [(mode, armed, False) for mode, armed, _ in told] if _ends_flight(flown) else told
 
 
 def _ends_flight(flown: Flown) -> bool:
-    """Whether it lands, returns or disarms: that is meant under a failsafe, too."""
+    """Return True if it lands, returns or disarms, which is intended during a failsafe as well."""
     modes = flown.case.row.modes[flown.case.autopilot == "px4"]
     return flown.case.row.name in ENDS_FLIGHT or (bool(modes) and set(modes) <= {"LAND", "RTL"})
 
 
-def _state(heard: Crossing) -> State:
+def _state(heard: TrafficEntry) -> State:
     beat = heard.message
     assert isinstance(beat, Heartbeat)
     return beat.custom_mode, is_armed(beat.base_mode), beat.system_status in FAILSAFE_STATES
@@ -91,7 +91,9 @@ def _key(message: Message) -> object:
 
 
 def _sent_again(flown: Flown) -> Iterator[str]:
-    """The same order again: only after a HEARTBEAT since, and all since the first sending tell the same as before."""
+    """A repetition needs a HEARTBEAT since, and all HEARTBEATs since the first transmission report the previous
+    state.
+    """
     first: dict[object, int] = {}
     last: dict[object, int] = {}
     for each in _orders(flown):
@@ -108,8 +110,8 @@ def _sent_again(flown: Flown) -> Iterator[str]:
 
 
 def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
-    """What was given up may come into force late: it is held again then. PX4 told to stop by DO_REPOSITION may be in
-    its mode for holding all the time: that is not the effect.
+    """Return True if the effect may already be reported. An abandoned order may take effect late, and is held again
+    then; a PX4 stopped by DO_REPOSITION may be in its hold mode all the time, which is not the effect.
     """
     if not isinstance(message, CommandLong):
         return False
@@ -128,30 +130,28 @@ def _may_be_told(flown: Flown, message: Message, told: State) -> bool:
 
 
 def _sent_blind(flown: Flown) -> Iterator[str]:
-    """What is left of an order is not sent into a silence."""
+    """The rest of an order is not sent into a silence."""
     for each in _orders(flown):
         given = (flown.given_at, *flown.fresh_at)
-        is_late = not any(0 <= each.at - at <= FIRST_S for at in given)
-        if is_late and not any(each.at - KNOWN_S <= told.at <= each.at for told in flown.air.heartbeats):
+        is_late = not any(0 <= each.at - at <= INITIAL_SEND_S for at in given)
+        if is_late and not any(each.at - MODE_MAX_AGE_S <= told.at <= each.at for told in flown.air.heartbeats):
             yield f"{_s(flown, each)} was sent blind"
 
 
 def _taken_back(flown: Flown) -> Iterator[str]:
-    """Once somebody else's mode was told, nothing that steers is sent."""
+    """After another party's mode was reported, nothing that steers is sent."""
     taken = _taken(flown)
     if taken is None or not flown.case.row.steers:
         return
     for each in flown.air.sent:
         command = getattr(each.message, "command", None)
-        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(
-            each.message, (SetMode, *SETPOINTS)
-        )
+        steers = command in CHANGED_BY_COMMAND.keys() - {ARM} or isinstance(each.message, (SetMode, *SETPOINTS))
         if steers and each.number > taken.number:
             yield f"{_s(flown, each)} was sent after somebody else's mode: {_s(flown, taken)}"
 
 
-def _taken(flown: Flown) -> Crossing | None:
-    """The HEARTBEAT by which the program could know that somebody else steers, or that a failsafe is active."""
+def _taken(flown: Flown) -> TrafficEntry | None:
+    """Return the HEARTBEAT by which the program could know about a takeover or a failsafe."""
     own = set(flown.case.row.modes[flown.case.autopilot == "px4"])
     told = flown.air.heartbeats
     assert isinstance(told[0].message, Heartbeat)
@@ -175,7 +175,7 @@ def _taken(flown: Flown) -> Crossing | None:
 
 
 def _untrue(flown: Flown) -> Iterator[str]:
-    """What returned well was true when it returned."""
+    """A successful call was true when it returned."""
     if flown.error is not None:
         return
     mode, armed = flown.told_at_end
@@ -191,28 +191,21 @@ def _untrue(flown: Flown) -> Iterator[str]:
 
 
 def _armed_late(flown: Flown) -> Iterator[str]:
-    """An order to arm that was given up leaves nothing armed that is known to have been armed by it."""
+    """An abandoned arm command leaves nothing armed that it is known to have armed."""
     if flown.case.row.name != "arm" or flown.error is None or not flown.is_armed_at_end:
         return
-    weather, until = flown.case.weather, flown.given_at + FIRST_HEARTBEAT_S
-    is_answered = not weather.lost_acks and weather.outage is None and not (flown.case.two or flown.case.hub)
+    disturbances, until = flown.case.disturbances, flown.given_at + ARM_HEARTBEAT_DELAY_S
+    is_answered = not disturbances.lost_acks and disturbances.outage is None and not (flown.case.two or flown.case.hub)
     is_told = any(_state(each)[1] for each in flown.air.heartbeats if flown.given_at < each.at <= until)
     if is_answered or (is_told and not flown.acted):
         yield f"arm ended with {flown.error!r} and the vehicle is armed"
 
 
 def _left_flying(flown: Flown) -> Iterator[str]:
-    """What was given up, and nobody else has taken, holds; also when it was silent then."""
+    """An abandoned flight without a takeover holds, also if it was silent then."""
     row, given_up = flown.case.row, isinstance(flown.error, (asyncio.CancelledError, OperationTimeout))
-    is_heard = flown.given_at + flown.case.quiet_until < flown.ended_at + WATCH_S - HEARD_S
-    if (
-        row.holds
-        and given_up
-        and is_heard
-        and _taken(flown) is None
-        and not flown.acted
-        and flown.is_armed_at_end
-    ):
+    is_heard = flown.given_at + flown.case.quiet_until < flown.ended_at + WATCH_S - OUTAGE_RECOVERY_S
+    if row.holds and given_up and is_heard and _taken(flown) is None and not flown.acted and flown.is_armed_at_end:
         wanted = "LOITER" if flown.case.autopilot == "px4" else "BRAKE"
         was_ordered = row.place != "armed" or flown.vehicle.altitude_m > 1.0
         if was_ordered and mode_of(flown.vehicle) != wanted and _is_reached(flown):
@@ -220,7 +213,7 @@ def _left_flying(flown: Flown) -> Iterator[str]:
 
 
 def _sent_afterwards(flown: Flown) -> Iterator[str]:
-    """A transfer or a setting that was given up sends nothing more."""
+    """An abandoned transfer or setting sends nothing more."""
     if flown.case.row.steers or flown.case.row.ends_later or flown.case.row.name == "arm":
         return
     for each in flown.air.sent:
@@ -230,7 +223,7 @@ def _sent_afterwards(flown: Flown) -> Iterator[str]:
 
 
 def _is_reached(flown: Flown) -> bool:
-    """Whether the vehicle got anything of it."""
+    """Return True if the vehicle received any of it."""
     return any(not each.is_lost for each in _orders(flown))
 
 
@@ -239,9 +232,7 @@ def _endless(flown: Flown) -> Iterator[str]:
         yield f"it took {flown.ended_at - flown.given_at:.0f} s"
 
 
-def _s(flown: Flown, each: Crossing) -> str:
+def _s(flown: Flown, each: TrafficEntry) -> str:
     message = each.message.to_dict()
-    what = " ".join(
-        f"{key}={value:g}" for key, value in message.items() if isinstance(value, (int, float)) and value
-    )
+    what = " ".join(f"{key}={value:g}" for key, value in message.items() if isinstance(value, (int, float)) and value)
     return f"{each.at - flown.given_at:.2f} s: {each.message.NAME} {what}"

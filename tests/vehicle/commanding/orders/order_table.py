@@ -1,4 +1,4 @@
-"""Every order of docs/reliability.md: how it is given, where, and what it may bring about."""
+"""Every order of docs/reliability.md: how it is given, where, and the modes that it may bring about."""
 
 from __future__ import annotations
 
@@ -24,9 +24,7 @@ async def _fly_setpoints(vehicle: aerokit.Vehicle) -> None:
 async def upload(vehicle: aerokit.Vehicle) -> None:
     here = vehicle.position.value
     places = [here.offset(north_m=20.0 * number) for number in range(1, 4)]
-    items = [
-        missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places
-    ]
+    items = [missions.waypoint(each.latitude_deg, each.longitude_deg, altitude_relative_m=20) for each in places]
     mission = missions.Mission(items)
     await vehicle.mission.upload(mission, method="items")
 

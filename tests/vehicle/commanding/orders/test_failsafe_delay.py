@@ -17,13 +17,13 @@ FAILSAFE_DELAY_S = 5.0
 
 
 async def _in_the_delay(flight: Flight | Px4Flight) -> None:
-    """The battery is low, and HEARTBEAT has told so."""
+    """Return a flight whose battery is low, and HEARTBEAT has reported it."""
     run_the_battery_down(flight.px4 if isinstance(flight, Px4Flight) else flight.copter)
     await flight.vehicle.system_status.wait_until(lambda state: state == MavState.CRITICAL, timeout=3)
     flight.wire.forget()
 
 
-async def test_go_to_cancelled_in_the_delay_leaves_the_failsafe_alone() -> None:
+async def test_go_to_cancelled_before_failsafe_action_keeps_failsafe() -> None:
     async with open_px4() as flight, anyio.create_task_group() as tasks:
         await flight.take_off()
         with anyio.CancelScope() as scope:
@@ -41,7 +41,7 @@ async def test_go_to_cancelled_in_the_delay_leaves_the_failsafe_alone() -> None:
         assert mode_of(flight.px4) in ("RTL", "LAND")
 
 
-async def test_set_point_stream_in_the_delay_ends_without_a_hold() -> None:
+async def test_setpoint_stream_before_failsafe_action_ends_without_hold() -> None:
     async with open_px4() as flight:
         await flight.take_off()
         with pytest.raises(SetpointStreamStopped, match=r"left OFFBOARD for LOITER$"):
@@ -55,7 +55,7 @@ async def test_set_point_stream_in_the_delay_ends_without_a_hold() -> None:
 
 
 @pytest.mark.parametrize("name", ["land", "return_to_launch"])
-async def test_landing_goes_on_under_a_failsafe(name: str) -> None:
+async def test_land_during_failsafe_continues(name: str) -> None:
     async with in_the_air() as flight, anyio.create_task_group() as tasks:
         tasks.start_soon(getattr(flight.vehicle, name))
         await anyio.sleep(1.5)
@@ -64,7 +64,7 @@ async def test_landing_goes_on_under_a_failsafe(name: str) -> None:
     assert not flight.copter.motors.is_armed or flight.copter.altitude_m < 0.5
 
 
-async def test_order_given_under_a_failsafe_is_obeyed() -> None:
+async def test_order_during_failsafe_is_executed() -> None:
     async with in_the_air() as flight:
         await _in_the_delay(flight)
         await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=20))

@@ -1,4 +1,4 @@
-"""The order table by a fleet of three, each in its own air: no rule is broken by any of them, nor by the policy.
+"""The order table for a fleet of three, each on a link of its own: no member and no policy breaks a rule.
 
 `nox -s orders -- SEEDS` flies every action with every policy and many seeds.
 """
@@ -13,14 +13,12 @@ from test_orders import IS_SESSION, SEEDS
 from aerokit.fleets.policy import PolicyName
 
 EVERY = [(action, policy) for action in ACTIONS for policy in POLICIES]
-FLOWN, SEEDS_EACH = (
-    (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*each) for each in EVERY[::2]], 4), 1)
-)
+FLOWN, SEEDS_EACH = (EVERY, SEEDS) if IS_SESSION else (sampled([pytest.param(*each) for each in EVERY[::2]], 4), 1)
 """Few of them in the tests, all of them in the session."""
 
 
 @pytest.mark.parametrize("seed", range(SEEDS_EACH))
 @pytest.mark.parametrize(("action", "policy"), FLOWN)
-def test_no_rule_is_broken(action: str, policy: PolicyName, seed: int) -> None:
-    """Nothing is sent twice, blind or against a pilot, by the action or by the policy; what is told is true."""
+def test_order_table_no_rule_is_broken(action: str, policy: PolicyName, seed: int) -> None:
+    """Neither the action nor the policy sends anything twice, blindly or against a pilot; reported results are true."""
     assert faults_of(case := random_fleet_case(action, policy, seed)) == [], case

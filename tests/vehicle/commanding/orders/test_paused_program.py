@@ -28,7 +28,7 @@ async def main(address, what):
     async with aerokit.connect(address) as vehicle:
         await vehicle.wait_ready(); await vehicle.arm(); await vehicle.take_off(8)
         sent, ages = [], []
-        vehicle.connection.tap_sent(
+        vehicle.connection.observe_sent_frames(
             lambda raw: sent.append(STANDARD.decode(Framer().receive(raw, 0.0)[0]).to_dict().get("command")))
         vehicle.armed.observe(lambda *_: ages.append(vehicle.armed.age), every_arrival=True)
         print("flying", flush=True)
@@ -51,18 +51,16 @@ asyncio.run(main(*sys.argv[1:]))
 
 
 def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
-    """What became of it, and the mode that the vehicle is in at the end."""
+    """Return the outcome, and the mode of the vehicle at the end."""
     copter = SimulatedCopter(boot_time_s=0.0, parameters={"FS_GCS_ENABLE": 1.0})
     with served([copter], f"{scheme}:127.0.0.1:0", speedup=1.0) as address:
         here = address.replace("udpin:", "udpout:")
-        program = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, here, what], stdout=subprocess.PIPE, text=True
-        )
+        program = subprocess.Popen([sys.executable, "-c", PROGRAM, here, what], stdout=subprocess.PIPE, text=True)
         with program:
             try:
                 assert program.stdout is not None
                 assert program.stdout.readline() == "flying\n"
-                time.sleep(1.5)  # the order is under way
+                time.sleep(1.5)  # The order is in progress.
                 os.kill(program.pid, signal.SIGSTOP)
                 time.sleep(PAUSE_S)
                 os.kill(program.pid, signal.SIGCONT)
@@ -75,13 +73,13 @@ def fly(scheme: str, what: str) -> tuple[str, list[int], float, str, str]:
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are stopped by signals")
 @pytest.mark.exhaustive  # twenty seconds of real time
 @pytest.mark.parametrize("cases", [CASES[:1], CASES[1:]], ids=["one", "others"])
-def test_stopped_program_leaves_the_failsafe_alone(cases: list[tuple[str, str]]) -> None:
+def test_blocked_program_keeps_failsafe(cases: list[tuple[str, str]]) -> None:
     """All of them at once, since they wait for the failsafe most of the time."""
     with ThreadPoolExecutor(len(cases)) as pool:
         flown = dict(zip(cases, pool.map(lambda case: fly(*case), cases), strict=True))
     for (scheme, what), (error, sent, oldest_s, told, mode) in flown.items():
         where = f"{what} over {scheme}: {flown[scheme, what]}"
         assert error is not None, where
-        assert len(sent) == (what != "stream"), where  # what was sent before the pause
+        assert len(sent) == (what != "stream"), where  # Sent before the pause.
         assert oldest_s > PAUSE_S - 1.5, where  # HEARTBEATs that waited are called as old as they are
         assert told == mode == RTL, where

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import anyio
 import pytest
 from exhaustive import sampled
-from order_air import Air, Crossing, Weather
+from order_air import Air, Disturbances, TrafficEntry
 from order_flights import RATES, Simulated, mode_of, take_over
 
 import aerokit
@@ -29,7 +29,7 @@ COMMANDS = (176, 192, 400, 20)
 
 
 def kind_of(message: Message) -> Hashable:
-    """What a message orders; None: nothing that steers or arms."""
+    """Return the subject of a message; None: it neither steers nor arms."""
     if isinstance(message, SetPositionTargetLocalNed):
         return "set-point"
     if isinstance(message, CommandInt):
@@ -45,7 +45,7 @@ def kind_of(message: Message) -> Hashable:
 
 @dataclass(frozen=True)
 class Choice:
-    """One order of a program, and what it may send, on ArduCopter and on PX4; empty: it does not steer."""
+    """One order of a program, and its messages on ArduCopter and on PX4; empty: it does not steer."""
 
     name: str
     give: Callable[[aerokit.Vehicle], Awaitable[object]]
@@ -91,7 +91,7 @@ async def _fly(seed: int, is_px4: bool) -> None:
         air = Air(link)
         async with aerokit.connect(air, rates=RATES) as vehicle:
             await _climb(simulated, vehicle)
-            air.weather = _weather(dice)
+            air.disturbances = _weather(dice)
             air.begin()
             taken_at = dice.choice((None, dice.uniform(0.1, 5.0)))
             if taken_at is not None:
@@ -116,8 +116,8 @@ async def _climb(simulated: Simulated, vehicle: aerokit.Vehicle) -> None:
     assert mode_of(simulated) in ("GUIDED", "LOITER")
 
 
-def _weather(dice: random.Random) -> Weather:
-    weather = Weather(
+def _weather(dice: random.Random) -> Disturbances:
+    disturbances = Disturbances(
         command=dice.choice(COMMANDS),
         lost_acks=dice.choice((0, 1, 9)),
         lost_commands=dice.choice((0, 1, 2)),
@@ -125,8 +125,8 @@ def _weather(dice: random.Random) -> Weather:
     )
     if dice.random() < 0.3:
         begin = dice.uniform(0.0, 4.0)
-        weather.outage = begin, begin + dice.uniform(1.0, 8.0)
-    return weather
+        disturbances.outage = begin, begin + dice.uniform(1.0, 8.0)
+    return disturbances
 
 
 async def _give_some(dice: random.Random, vehicle: aerokit.Vehicle, air: Air, given: list[Given]) -> None:
@@ -147,7 +147,7 @@ async def _give_some(dice: random.Random, vehicle: aerokit.Vehicle, air: Air, gi
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _judge(sent: Crossing, given: list[Given], told: Crossing | None, is_px4: bool, story: str) -> None:
+def _judge(sent: TrafficEntry, given: list[Given], told: TrafficEntry | None, is_px4: bool, story: str) -> None:
     kind = kind_of(sent.message)
     if kind is None:
         return
@@ -159,17 +159,17 @@ def _judge(sent: Crossing, given: list[Given], told: Crossing | None, is_px4: bo
         return
     steering = [each for each in given if each.choice.sends[is_px4]]
     newest = steering[-1]
-    at_once = [each for each in steering if each.at == newest.at]
-    allowed = HOLD[is_px4].union(*(each.choice.sends[is_px4] for each in at_once))
+    eager = [each for each in steering if each.at == newest.at]
+    allowed = HOLD[is_px4].union(*(each.choice.sends[is_px4] for each in eager))
     assert kind in allowed, f"an order that was overruled: {about}"
     is_against_the_pilot = told is not None and newest.at < told.at and sent.number > told.number
     own = [each.at for each in given if each.choice.name == "command"]
     if told is not None and own and told.at - own[-1] < MODE_GRACE_S:
-        return  # any mode is taken for its effect: docs/reliability.md says so
+        return  # Any mode counts as its effect, see docs/reliability.md.
     assert kind == "set-point" or not is_against_the_pilot, f"after the pilot was told: {about}"
 
 
 @pytest.mark.parametrize("is_px4", [False, True], ids=["ardupilot", "px4"])
 @pytest.mark.parametrize("seed", sampled(range(4 * SEEDS), 3))
-def test_only_the_newest_order_is_sent(seed: int, is_px4: bool) -> None:
+def test_posted_orders_only_newest_is_sent(seed: int, is_px4: bool) -> None:
     run_virtual(_fly(seed, is_px4))

@@ -1,4 +1,4 @@
-// The attitude indicator. What is old is grey; what is unknown is not drawn as level.
+// The attitude indicator. Old attitudes are grey; without an attitude, no horizon is drawn.
 
 export function drawAttitude(canvas, attitude, isOld) {
   const ratio = window.devicePixelRatio || 1;

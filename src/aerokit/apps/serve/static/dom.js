@@ -1,4 +1,4 @@
-// Elements and numbers. Texts of vehicles become text nodes, never HTML: nothing here or elsewhere sets innerHTML.
+// Elements and numbers. Texts of vehicles become text nodes, never HTML: no script sets innerHTML.
 
 export function element(tag, properties = {}, ...children) {
   const made = document.createElement(tag);
@@ -21,13 +21,13 @@ export function number(value, digits = 1, unit = "") {
   return unit ? `${text} ${unit}` : text;
 }
 
-// the unit that a name ends with, the longer endings first, and how many digits such a value is shown with
+// Suffix of a name, unit, digits, and label; longer suffixes first.
 const UNITS = [
   ["_rate_deg_s", "°/s", 1, " rate"], ["_m_s2", "m/s²", 2], ["_m_s", "m/s", 2], ["_per_s", "/s"], ["_deg", "°", 1], ["_percent", "%"], ["_mah", "mAh"],
   ["_wh", "Wh", 1], ["_hz", "Hz", 1], ["_us", "µs"], ["_m", "m", 2], ["_v", "V", 2], ["_a", "A", 2], ["_c", "°C", 1], ["_s", "s", 1],
 ];
 
-// "north_m_s" is the label "north", and how to show a value in its unit: "-0.12 m/s"
+// Splits "north_m_s" into the label "north", the unit "m/s" and the number of digits.
 export function unitOf(name) {
   const [ending, unit, digits, rest = ""] = UNITS.find(([each]) => name.endsWith(each)) ?? ["", "", undefined];
   const label = (name.slice(0, name.length - ending.length) + rest).replaceAll("_", " ");
@@ -42,7 +42,7 @@ export function age(seconds) {
   return `${(seconds / 3600).toFixed(1)} h`;
 }
 
-// how old a value may be that comes several times a second, or once, before it is shown as old
+// Class of a value that is normally updated at least once a second, by its age.
 export function staleness(seconds) {
   if (seconds === undefined || seconds === null) return "unknown";
   return seconds > 10 ? "very-old" : seconds > 3 ? "old" : "";

@@ -1,4 +1,4 @@
-// The page: keeps what the stream tells and shows it.
+// The page: stores the messages of the stream, and shows them.
 
 import { drawAttitude } from "./attitude.js";
 import { age, byId, element, number, show } from "./dom.js";
@@ -16,15 +16,15 @@ const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();
 const missions = new MissionPanel(draw);
 const texts = new TextPanel();
-const given = new OrderPanel();
+const orderList = new OrderPanel();
 const orders = new Orders(byId("orders"), {
-  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, given: note,
+  vehicle: selected, seenAt: () => page.atSeconds, pick: () => pick(!map.isPicking), toast, record,
 });
 const parameters = new ParameterPanel((id, parameter) => { if (!page.isReadOnly) orders.setParameter(id, parameter); });
 
 // ------------------------------------------------------------------------------------------- panels
 
-const TABS = [["State", table], ["Mission", missions], ["Parameters", parameters], ["Messages", texts], ["Orders", given]];
+const TABS = [["State", table], ["Mission", missions], ["Parameters", parameters], ["Messages", texts], ["Orders", orderList]];
 let tab = table;
 const tabButtons = TABS.map(([name, panel]) => element("button", { type: "button", role: "tab", onclick: () => open(panel) }, name));
 byId("tabs").append(...tabButtons);
@@ -79,8 +79,8 @@ function showVehicles() {
 // ------------------------------------------------------------------------------------------- the map
 
 function heightNow() {
-  const told = selected() && selected().states.position;
-  const height = told && told.value.altitude_relative_m;
+  const position = selected() && selected().states.position;
+  const height = position && position.value.altitude_relative_m;
   return typeof height === "number" ? Math.max(1, Math.round(height)) : 10;
 }
 
@@ -88,7 +88,7 @@ function pick(isOn) {
   map.isPicking = isOn && Boolean(selected());
   byId("map").classList.toggle("picking", map.isPicking);
   byId("hint").hidden = !map.isPicking;
-  if (map.isPicking) show(byId("hint"), `click where vehicle ${page.selected} is to go`);
+  if (map.isPicking) show(byId("hint"), `click the target position for vehicle ${page.selected}`);
 }
 
 function onMap(vehicle) {
@@ -125,7 +125,7 @@ function drawNow() {
   tab.show(vehicle, page.receivedAt);
   const attitude = vehicle && vehicle.states.attitude;
   drawAttitude(byId("attitude"), attitude && attitude.value, ageOf(attitude, page.receivedAt) > 3);
-  const going = given.running(page.selected, "go_to");
+  const going = orderList.running(page.selected, "go_to");
   const plan = { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null };
   map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, going && going.arguments);
   byId("follow").setAttribute("aria-pressed", String(map.follows !== null));
@@ -138,41 +138,41 @@ function toast(text, kind) {
   setTimeout(() => made.remove(), kind === "failed" ? 15000 : 5000);
 }
 
-const toldOf = new Set();
+const announced = new Set();
 
-function note(record, isNew = true) {
-  const before = given.records.get(record.key);
+function record(order, isNew = true) {
+  const before = orderList.records.get(order.key);
   if (before && before.state !== "running") return;
-  given.note(record);
-  if (record.state !== "running" && record.order === "set_parameter" && record.result) {
-    parameters.changed(record.system_id, record.arguments.name, record.result.value);
+  orderList.record(order);
+  if (order.state !== "running" && order.order === "set_parameter" && order.result) {
+    parameters.changed(order.system_id, order.arguments.name, order.result.value);
   }
-  if (isNew && !toldOf.has(record.key + record.state)) {
-    toldOf.add(record.key + record.state);
-    const why = record.problem ? `: ${record.problem.detail}` : "";
-    toast(`Vehicle ${record.system_id}: ${orderText(record)}: ${record.state === "running" ? "ordered" : record.state}${why}`, record.state);
+  if (isNew && !announced.has(order.key + order.state)) {
+    announced.add(order.key + order.state);
+    const why = order.problem ? `: ${order.problem.detail}` : "";
+    toast(`Vehicle ${order.system_id}: ${orderText(order)}: ${order.state === "running" ? "ordered" : order.state}${why}`, order.state);
   }
   draw();
 }
 
 // ------------------------------------------------------------------------------------------- the stream
 
-function heard(message) {
+function onMessage(message) {
   if (message.type === "state") {
     page.receivedAt = performance.now();
     page.atSeconds = message.at_s;
     page.vehicles = new Map(message.vehicles.map((each) => [each.system_id, each]));
-    for (const each of message.vehicles) if (each.states.position) map.note(each.system_id, each.states.position.value);
+    for (const each of message.vehicles) if (each.states.position) map.addPoint(each.system_id, each.states.position.value);
     if (page.selected === undefined && page.vehicles.size) choose(Math.min(...page.vehicles.keys()));
     else if (selected() && page.modesOf !== page.selected) loadModes(page.selected);
   } else if (message.type === "event") {
     texts.add(message);
     if (message.event === "ParameterChanged") parameters.changed(message.system_id, message.name, message.after);
-  } else if (message.type === "order") note(message);
+  } else if (message.type === "order") record(message);
   else if (message.type === "hello") {
     page.isReadOnly = message.read_only;
     message.events.forEach((each) => texts.add(each));
-    message.orders.forEach((each) => note(each, false));
+    message.orders.forEach((each) => record(each, false));
   }
   draw();
 }
@@ -186,21 +186,21 @@ function closed(reason) {
   page.isOpen = false;
   const banner = byId("banner");
   banner.hidden = false;
-  if (reason !== "unauthorized") show(banner, "No connection to the server: what is shown is old, and gets older.");
+  if (reason !== "unauthorized") show(banner, "No connection to the server: the values shown are old.");
   else if (!banner.querySelector("form")) askToken(banner);
   draw();
 }
 
 function askToken(banner) {
   const input = element("input", { type: "password", required: true, autocomplete: "off" });
-  const form = element("form", { onsubmit: (event) => { event.preventDefault(); useToken(input.value); show(banner, "trying …"); } },
-    hasToken() ? "The token is wrong (a new one is made at each start): " : "This server wants its token: ", input, " ", element("button", { type: "submit" }, "Use"));
+  const form = element("form", { onsubmit: (event) => { event.preventDefault(); useToken(input.value); show(banner, "connecting …"); } },
+    hasToken() ? "The token is invalid (the server may create a new one at each start): " : "This server needs its token: ", input, " ", element("button", { type: "submit" }, "Use"));
   banner.replaceChildren(form);
 }
 
 function showServer() {
   const isFresh = page.isOpen && performance.now() - page.receivedAt < 3000;
-  const text = !page.isOpen ? "no connection" : !isFresh ? "no news" : page.isReadOnly ? "reading only" : "live";
+  const text = !page.isOpen ? "no connection" : !isFresh ? "no data" : page.isReadOnly ? "read-only" : "live";
   show(byId("server"), text, `pill ${isFresh ? "good" : "bad"}`);
 }
 
@@ -210,6 +210,6 @@ ask("GET", "api").then((about) => {
   byId("server").title = `aerokit ${about.aerokit}`;
 }).catch(() => {});
 open(table);
-openStream({ message: heard, opened, closed });
+openStream({ message: onMessage, opened, closed });
 setInterval(() => { showServer(); draw(); }, 500);
 window.addEventListener("resize", draw);

@@ -1,10 +1,10 @@
-// The map: a plane of metres around the first place that was heard, drawn on a canvas; tiles only if a server is named.
+// The map: a plane in metres around the first known position, drawn on a canvas; tiles only if a server is configured.
 
 export const COLOURS = ["#4cc2ff", "#ffb84d", "#8ee07f", "#ff7eb6", "#c79bff", "#ffe066", "#5ee6d0", "#ff9e80"];
 export const colourOf = (id) => COLOURS[(id - 1) % COLOURS.length];
 const METRES_PER_DEGREE = 111195;
-const MOST_POINTS = 5000;
-const OLD_S = 3;
+const MAX_POINTS = 5000;
+const MAX_AGE_S = 3;
 
 export class MapView {
   constructor(canvas, picked) {
@@ -50,13 +50,13 @@ export class MapView {
 
   place(position) { return this.toScreen(this.toPlane(position.latitude_deg, position.longitude_deg)); }
 
-  note(id, position) {
+  addPoint(id, position) {
     const track = this.tracks.get(id) || [];
     this.tracks.set(id, track);
     const point = this.toPlane(position.latitude_deg, position.longitude_deg);
     const last = track[track.length - 1];
     if (!last || Math.hypot(point.x - last.x, point.y - last.y) > 0.3) track.push(point);
-    if (track.length > MOST_POINTS) track.splice(0, MOST_POINTS / 5);
+    if (track.length > MAX_POINTS) track.splice(0, MAX_POINTS / 5);
   }
 
   zoom(factor, x = this.width / 2, y = this.height / 2) {
@@ -157,7 +157,7 @@ export class MapView {
     this.context.fillStyle = "#8fa0b5";
     this.context.font = "14px system-ui, sans-serif";
     this.context.textAlign = "center";
-    this.context.fillText("no position known yet", this.width / 2, this.height / 2);
+    this.context.fillText("no position known", this.width / 2, this.height / 2);
   }
 
   step() {
@@ -245,7 +245,7 @@ export class MapView {
   }
 
   drawVehicle(vehicle, isSelected) {
-    const pen = this.context, at = this.place(vehicle.position), isOld = !(vehicle.age <= OLD_S);
+    const pen = this.context, at = this.place(vehicle.position), isOld = !(vehicle.age <= MAX_AGE_S);
     pen.save();
     pen.translate(at.x, at.y);
     pen.globalAlpha = isOld ? 0.45 : 1;

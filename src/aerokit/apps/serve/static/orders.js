@@ -1,25 +1,25 @@
-// Orders: buttons, and the dialog that names vehicle and order. Nothing is sent without it, and nothing twice.
+// Orders: buttons, and the confirmation dialog that names vehicle and order. Every order needs it, and is sent once.
 
 import { byId, element } from "./dom.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 
-// name, text of the button, what the dialog says, fields [name, label, value, step], kind of button
+// name, text of the button, text of the dialog, fields [name, label, value, step], class of the button
 export const BUTTONS = [
   ["arm", "Arm", "arm the motors: propellers may start to turn", [], "main"],
   ["take_off", "Take off", "take off and climb", [["altitude_m", "Metres above home", 10, "any"]], "main"],
   ["pick", "Go to …", "", [], "main"],
-  ["hold", "Hold", "stop, and stay where it is", [], "rest"],
-  ["land", "Land", "land where it is now", [], "rest"],
-  ["return_to_launch", "Return", "return to the launch place", [], "rest"],
+  ["hold", "Hold", "stop and hold its position", [], "rest"],
+  ["land", "Land", "land at its current position", [], "rest"],
+  ["return_to_launch", "Return", "return to the launch position", [], "rest"],
   ["disarm", "Disarm", "stop the motors", [], ""],
   null,
-  ["mission/start", "Start mission", "fly its mission from an item on: it takes off if the mission says so", [["item", "From item", 0, "1"]], ""],
-  ["mission/pause", "Pause", "pause its mission, and hold", [], ""],
-  ["mission/resume", "Resume", "go on with its mission", [], ""],
+  ["mission/start", "Start mission", "fly its mission from an item; it takes off if the mission has a takeoff item", [["item", "From item", 0, "1"]], ""],
+  ["mission/pause", "Pause", "pause its mission and hold", [], ""],
+  ["mission/resume", "Resume", "resume its mission", [], ""],
 ];
 
 export class Orders {
-  // page: {vehicle(), seenAt(), pick(), toast(text, kind), given(record)}
+  // page: {vehicle(), seenAt(), pick(), toast(text, kind), record(order)}
   constructor(box, page) {
     this.page = page;
     this.buttons = [];
@@ -63,7 +63,7 @@ export class Orders {
 
   setParameter(id, parameter) {
     this.confirm({
-      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, which is ${parameter.value} now`,
+      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value}`,
       fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
     });
   }
@@ -71,7 +71,7 @@ export class Orders {
   confirm(wanted) {
     const vehicle = this.page.vehicle();
     if (!vehicle) return;
-    const id = wanted.vehicle ?? vehicle.system_id; // what the dialog names is what is ordered, whatever is selected later
+    const id = wanted.vehicle ?? vehicle.system_id; // fixed now, because the selection can change while the dialog is open
     const dialog = byId("dialog"), key = newKey();
     const inputs = wanted.fields.map(([name, label, value, step]) => {
       const input = element("input", { type: "number", step, name, required: value !== "" });
@@ -90,7 +90,7 @@ export class Orders {
     const cancel = element("button", { type: "button", onclick: () => dialog.close() }, "Cancel");
     dialog.replaceChildren(element("form", { onsubmit: give },
       element("h2", {}, `${wanted.title}?`),
-      element("p", {}, element("span", { class: "whom" }, `Vehicle ${id}`), ` (${vehicle.firmware}) is ordered to ${wanted.text}.`),
+      element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will ${wanted.text}.`),
       ...inputs.map(([, , label]) => label),
       token ? element("label", {}, "Token", token) : null,
       element("div", { class: "buttons" }, cancel, element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.toLowerCase()} · vehicle ${id}`))));
@@ -107,13 +107,13 @@ export class Orders {
     const what = `Vehicle ${id}: ${wanted.title}`;
     try {
       const record = await ask(isParameter ? "PUT" : "POST", `api/vehicles/${id}/${path}?wait=false`, body, headers);
-      this.page.given(record);
+      this.page.record(record);
     } catch (error) {
       if (error instanceof Refusal) {
         if (error.problem.status === 401) useToken("");
-        if (error.problem.order) this.page.given(error.problem.order);
+        if (error.problem.order) this.page.record(error.problem.order);
         else this.page.toast(`${what}: ${error.message}`, "failed");
-      } else this.page.toast(`${what}: the server did not answer. It is not known whether the order was given: look at the orders.`, "failed");
+      } else this.page.toast(`${what}: the server did not answer, so it is unknown whether the order was sent. Check the tab Orders.`, "failed");
     }
   }
 }

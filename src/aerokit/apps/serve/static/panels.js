@@ -1,4 +1,4 @@
-// The panels beside the map: mission, parameters, texts and events, orders.
+// The panels: mission, parameters, texts and events, orders.
 
 import { clock, element, number, show, UNKNOWN, unitOf } from "./dom.js";
 import { ask } from "./server.js";
@@ -21,17 +21,17 @@ export class MissionPanel {
     this.missions.set(id, { items: [], note: "reading …" });
     try {
       const found = await ask("GET", `api/vehicles/${id}/mission${refresh ? "?refresh=true" : ""}`);
-      const what = found.items.length ? `${found.items.length} items` : "the vehicle holds no mission";
-      this.missions.set(id, { items: found.items, note: `${what}, as read at ${clock(Date.now() / 1000 - found.age_s)}`, isRead: true });
+      const what = found.items.length ? `${found.items.length} items` : "the vehicle has no mission";
+      this.missions.set(id, { items: found.items, note: `${what}, read at ${clock(Date.now() / 1000 - found.age_s)}`, isRead: true });
     } catch (error) {
-      this.missions.set(id, { items: [], note: `not read: ${error.message}` });
+      this.missions.set(id, { items: [], note: `reading failed: ${error.message}` });
     }
     this.drawn = undefined;
     this.changed();
   }
 
-  // Once, when the vehicle counts other items than were read: the server reads it again, too.
-  readAnother(vehicle, mission) {
+  // Reads the mission again, once, when the vehicle reports another number of items.
+  reloadIfChanged(vehicle, mission) {
     const id = vehicle.system_id, count = vehicle.mission_items ?? null;
     if (!mission.isRead || count === null || count === mission.items.length || this.counts.get(id) === count) return;
     this.counts.set(id, count);
@@ -43,7 +43,7 @@ export class MissionPanel {
     if (!vehicle) return;
     this.vehicle = vehicle.system_id;
     const current = currentItem(vehicle), mission = this.missions.get(this.vehicle) || { items: [], note: "not read yet" };
-    this.readAnother(vehicle, mission);
+    this.reloadIfChanged(vehicle, mission);
     show(this.note, mission.note);
     const drawn = [this.vehicle, current, mission.note].join("|");
     if (this.drawn === drawn) return;
@@ -59,10 +59,10 @@ export class MissionPanel {
   }
 }
 
-// as the mission counts; the state mission_current counts home, too, where the autopilot does
+// Numbered like the mission. The state mission_current counts home too, if the autopilot does.
 export const currentItem = (vehicle) => vehicle.mission_item ?? null;
 
-const MOST_SHOWN = 400;
+const MAX_SHOWN = 400;
 
 export class ParameterPanel {
   constructor(setParameter) {
@@ -84,7 +84,7 @@ export class ParameterPanel {
       const found = await ask("GET", `api/vehicles/${id}/parameters${refresh ? "?refresh=true" : ""}`);
       this.tables.set(id, { rows: found.parameters });
     } catch (error) {
-      this.tables.set(id, { rows: [], note: `not read: ${error.message}` });
+      this.tables.set(id, { rows: [], note: `reading failed: ${error.message}` });
     }
     this.draw();
   }
@@ -106,8 +106,8 @@ export class ParameterPanel {
     const table = this.tables.get(this.vehicle) || { rows: [], note: "" };
     const wanted = this.search.value.trim().toUpperCase();
     const found = table.rows.filter((each) => each.name.toUpperCase().includes(wanted));
-    show(this.note, table.note ?? `${found.length} of ${table.rows.length}${found.length > MOST_SHOWN ? `, the first ${MOST_SHOWN} are shown` : ""}`);
-    this.body.replaceChildren(...found.slice(0, MOST_SHOWN).map((each) => {
+    show(this.note, table.note ?? `${found.length} of ${table.rows.length}${found.length > MAX_SHOWN ? `, showing the first ${MAX_SHOWN}` : ""}`);
+    this.body.replaceChildren(...found.slice(0, MAX_SHOWN).map((each) => {
       const differs = each.default !== null && each.default !== each.value;
       return element("tr", { class: "clickable", title: "set …", onclick: () => this.setParameter(this.vehicle, each) },
         element("td", {}, each.name),
@@ -117,7 +117,7 @@ export class ParameterPanel {
   }
 }
 
-const MOST_TEXTS = 300;
+const MAX_TEXTS = 300;
 const SEVERITIES = ["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"];
 
 export class TextPanel {
@@ -131,7 +131,7 @@ export class TextPanel {
     if (this.numbers.has(event.number)) return;
     this.numbers.add(event.number);
     this.entries.push(event);
-    if (this.entries.length > MOST_TEXTS) this.numbers.delete(this.entries.shift().number);
+    if (this.entries.length > MAX_TEXTS) this.numbers.delete(this.entries.shift().number);
     this.drawn = undefined;
   }
 
@@ -146,15 +146,26 @@ export class TextPanel {
       const title = SEVERITIES[severity] || "event";
       return element("div", { class: "text", title }, element("time", {}, clock(each.time_unix_s)), element("span", { class: kind }, describe(each)));
     }));
-    if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "nothing was said yet"));
+    if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no messages yet"));
   }
 }
 
 function describe(event) {
   if (event.event === "StatusTextReceived") return event.text;
-  const left = new Set(["type", "event", "number", "at", "system_id", "time_unix_s", "missed"]);
-  const fields = Object.entries(event).filter(([name]) => !left.has(name)).map(([name, value]) => `${name.replaceAll("_", " ")} ${typeof value === "object" ? JSON.stringify(value) : value}`);
+  const hidden = new Set(["type", "event", "number", "at", "system_id", "time_unix_s", "missed"]);
+  if ("after" in event) hidden.add("before");
+  const fields = Object.entries(event).filter(([name]) => !hidden.has(name)).map(([name, value]) => eventField(event, name, value));
   return [event.event.replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`), fields.join(", ")].filter(Boolean).join(": ");
+}
+
+// The same text as event_details in event_text.py.
+function eventField(event, name, value) {
+  const text = value === null ? "unknown" : typeof value === "object" ? JSON.stringify(value) : String(value);
+  if (name === "after") return (event.before ?? null) === null ? text : `${event.before} → ${text}`;
+  if (typeof value === "boolean") return `${value ? "" : "not "}${name.replace(/^is_/, "").replaceAll("_", " ")}`;
+  if (["name", "message", "link", "peer", "text", "error"].includes(name)) return text;
+  const { label, unit } = unitOf(name);
+  return `${label.replace(/ id$/, "")} ${text}${unit ? ` ${unit}` : ""}`;
 }
 
 export class OrderPanel {
@@ -163,8 +174,8 @@ export class OrderPanel {
     this.records = new Map();
   }
 
-  note(record) {
-    this.records.set(record.key, record);
+  record(order) {
+    this.records.set(order.key, order);
     if (this.records.size > 100) this.records.delete(this.records.keys().next().value);
     this.drawn = undefined;
   }
@@ -181,20 +192,20 @@ export class OrderPanel {
       element("time", {}, clock(each.given_unix_s)),
       element("span", {}, `vehicle ${each.system_id}: ${orderText(each)}: `, element("b", { class: each.state }, each.state),
         each.problem ? element("div", { class: "detail" }, each.problem.detail) : null))));
-    if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders were given yet"));
+    if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
 }
 
-// what an order says beside its name; those that are not here list their arguments
-const SAID = {
+// Text after the name of an order; other orders list their arguments.
+const ORDER_TEXTS = {
   take_off: ({ altitude_m }) => ` to ${+altitude_m.toFixed(2)} m`,
   mode: ({ mode }) => ` ${mode}`,
   set_parameter: ({ name, value }) => ` ${name} to ${+value.toPrecision(7)}`,
 };
 
 export function orderText(record) {
-  const name = record.order.replace(/[_/]/g, " ").replace("set parameter", "set"), said = SAID[record.order];
-  if (said) return name + said(record.arguments);
+  const name = record.order.replace(/[_/]/g, " ").replace("set parameter", "set"), text = ORDER_TEXTS[record.order];
+  if (text) return name + text(record.arguments);
   const given = Object.entries(record.arguments).map(([each, value]) => {
     const { label, unit } = unitOf(each);
     return `${label} ${typeof value === "number" ? +value.toFixed(6) : value}${unit ? ` ${unit}` : ""}`;

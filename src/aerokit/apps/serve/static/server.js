@@ -1,15 +1,15 @@
-// The server: requests with the token, and the stream, which is opened again when it ends.
+// The server: requests with the token, and the stream, which is reopened when it ends.
 
 const PROTOCOL = "aerokit.v1";
-const KEPT = "aerokit token";
+const STORAGE_KEY = "aerokit token";
 
 function takeToken() {
   const found = /(?:^#|&)token=([A-Za-z0-9._~-]+)/.exec(location.hash);
   if (found) {
-    sessionStorage.setItem(KEPT, found[1]);
-    history.replaceState(null, "", location.pathname); // not to be seen over a shoulder, or copied with the address
+    sessionStorage.setItem(STORAGE_KEY, found[1]);
+    history.replaceState(null, "", location.pathname); // hide the token from onlookers, and from copies of the address
   }
-  return sessionStorage.getItem(KEPT) || "";
+  return sessionStorage.getItem(STORAGE_KEY) || "";
 }
 
 let token = takeToken();
@@ -18,7 +18,7 @@ window.addEventListener("hashchange", () => { token = takeToken(); });
 export const hasToken = () => token !== "";
 export function useToken(text) {
   token = text.trim();
-  sessionStorage.setItem(KEPT, token);
+  sessionStorage.setItem(STORAGE_KEY, token);
 }
 
 export class Refusal extends Error {
@@ -44,21 +44,21 @@ export async function ask(method, path, body, headers = {}) {
 export const newKey = () =>
   Array.from(crypto.getRandomValues(new Uint8Array(16)), (each) => each.toString(16).padStart(2, "0")).join("");
 
-// told: {message(m), opened(), closed(reason)}
-export function openStream(told) {
+// handlers: {message(m), opened(), closed(reason)}
+export function openStream(handlers) {
   let wait = 500;
   function open() {
     const url = new URL("api/stream?rate_hz=5", location.href);
     url.protocol = url.protocol.replace("http", "ws");
     url.hash = "";
     const socket = new WebSocket(url, token ? [PROTOCOL, `bearer.${token}`] : [PROTOCOL]);
-    let heardAt = performance.now();
-    const watchdog = setInterval(() => { if (performance.now() - heardAt > 6000) socket.close(); }, 1000);
-    socket.onopen = () => { wait = 500; told.opened(); };
-    socket.onmessage = (event) => { heardAt = performance.now(); told.message(JSON.parse(event.data)); };
+    let receivedAt = performance.now();
+    const watchdog = setInterval(() => { if (performance.now() - receivedAt > 6000) socket.close(); }, 1000);
+    socket.onopen = () => { wait = 500; handlers.opened(); };
+    socket.onmessage = (event) => { receivedAt = performance.now(); handlers.message(JSON.parse(event.data)); };
     socket.onclose = async () => {
       clearInterval(watchdog);
-      told.closed(await whyClosed());
+      handlers.closed(await whyClosed());
       setTimeout(open, wait);
       wait = Math.min(wait * 1.7, 5000);
     };

@@ -1,10 +1,10 @@
-// What a vehicle has told, with ages: the few big values, and the table of all of it.
+// State of a vehicle, with ages: the main values, and a table of all states.
 
 import { age, element, number, show, staleness, UNKNOWN, unitOf } from "./dom.js";
 
-const TOLD_ONCE = new Set(["home", "origin", "version", "capabilities", "status_text", "mission_reached", "mission_current"]);
+const UNREPEATABLE_COMMANDS = new Set(["home", "origin", "version", "capabilities", "status_text", "mission_reached", "mission_current"]);
 
-// seconds since it was told, by now: it goes on while nothing comes
+// Current age of a value in seconds; it increases while nothing is received.
 export const ageOf = (entry, receivedAt) =>
   entry && typeof entry.age_s === "number" ? entry.age_s + (performance.now() - receivedAt) / 1000 : undefined;
 
@@ -50,7 +50,7 @@ export class BigValues {
       const old = ageOf(entry, receivedAt);
       const kind = shown === UNKNOWN ? "unknown" : staleness(old) || (shown === "ARMED" ? "armed" : "");
       show(this.cells[index], kind.includes("old") ? `${shown} (${age(old)})` : shown, kind);
-      this.cells[index].title = known ? `told ${age(old)} ago` : "not told";
+      this.cells[index].title = known ? `received ${age(old)} ago` : "unknown";
     });
   }
 }
@@ -85,13 +85,13 @@ export class StateTable {
       this.rows.set(name, cells);
       this.body.append(element("tr", {}, ...cells));
     }
-    const old = ageOf(entry, receivedAt), kind = TOLD_ONCE.has(name) ? "" : staleness(old);
+    const old = ageOf(entry, receivedAt), kind = UNREPEATABLE_COMMANDS.has(name) ? "" : staleness(old);
     show(cells[1], plain(entry.value, unitOf(name)), `value ${kind}`);
     show(cells[2], age(old), `age ${kind === "very-old" ? "old" : kind}`);
   }
 }
 
-const RAW = new Set(["custom_mode", "base_mode"]); // numbers that the name beside them tells
+const RAW = new Set(["custom_mode", "base_mode"]); // redundant: the mode name is shown
 
 function plain(value, { unit, digits } = { unit: "" }) {
   if (value === null || value === undefined) return UNKNOWN;

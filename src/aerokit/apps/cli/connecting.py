@@ -1,0 +1,314 @@
+"""Options and connections shared by commands that use a vehicle or a whole link."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import sys
+from argparse import ArgumentTypeError
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit.apps.cli.arguments import add_baud, address, number, system_id
+from aerokit.apps.cli.completion import addresses, offer
+from aerokit.apps.cli.output import DONE, add_json, emit_done
+from aerokit.apps.cli.terminal import on_interrupt, waiting
+from aerokit.connection.opening import OBSERVER_SYSTEM_ID
+from aerokit.errors import ConnectFailed, InvalidArgument
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.signing import Signing, SigningKey
+    from aerokit.transport.link import Link
+    from aerokit.vehicle.vehicle import Vehicle
+
+# HEARTBEAT is sent once a second.
+_OTHER_VEHICLES_TIMEOUT_S = 1.5
+SIGNING_KEY_VARIABLE = "AEROKIT_SIGNING_KEY"
+"""Environment variable with the signing key: a passphrase, or 64 hexadecimal digits."""
+ADDRESS_VARIABLE = "AEROKIT_ADDRESS"
+"""Environment variable with the default address."""
+_DEFAULT_ADDRESS = "udpin:0.0.0.0:14550"
+_CONNECT_TIMEOUT_S = 30.0
+
+
+async def _check_only_vehicle(vehicle: Vehicle, options: argparse.Namespace) -> None:
+    """Unless ``--system-id`` is given, check that no other vehicle is on the link.
+
+    Raises:
+        InvalidArgument: there are several vehicles.
+    """
+    if options.system_id is not None:
+        return
+    system_ids = {vehicle.system_id}
+    with anyio.move_on_after(_OTHER_VEHICLES_TIMEOUT_S):
+        async for found in vehicle.connection.vehicles():
+            system_ids.add(found.system_id)
+            if len(system_ids) > 1:
+                numbers = ", ".join(map(str, sorted(system_ids)))
+                raise InvalidArgument(
+                    f"several vehicles are on the link (system ids {numbers}): choose one with --system-id;"
+                    " nothing was sent"
+                )
+
+
+def add_signing_key(command: argparse._ActionsContainer, text: str) -> None:
+    command.add_argument(
+        "--signing-key",
+        type=key_file,
+        metavar="FILE",
+        help=f"{text}: file with a passphrase, or with the key as 64 hexadecimal digits",
+    )
+
+
+def key_file(path: str) -> SigningKey:
+    """Parse the path of a signing key, and read it."""
+    from aerokit.mavlink.signing import SigningKey
+
+    try:
+        with open(path, encoding="utf-8-sig") as file:
+            return SigningKey.from_text(file.read())
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not a text file"
+        raise ArgumentTypeError(f"cannot read a signing key from {path!r}: {why}") from None
+    except InvalidArgument as error:
+        raise ArgumentTypeError(f"{path!r} has no signing key: {error}") from None
+
+
+def signing_of(options: argparse.Namespace) -> Signing | None:
+    """Return the signing for a connection, from ``--signing-key`` or the environment; None without a key."""
+    key, text = options.signing_key, os.environ.get(SIGNING_KEY_VARIABLE, "")
+    if key is None and not text.strip():
+        return None
+    from aerokit.mavlink.signing import Signing, SigningKey
+
+    return Signing(SigningKey.from_text(text) if key is None else key)
+
+
+def default_address() -> str:
+    """Return the address in the environment, else the port on which ground stations listen."""
+    return os.environ.get(ADDRESS_VARIABLE, "").strip() or _DEFAULT_ADDRESS
+
+
+def add_address(
+    command: argparse._ActionsContainer, name: str = "address", *, what: str = "", default: str | None = None
+) -> None:
+    """Add the address, as an argument or an option, and ``--baud``.
+
+    Args:
+        command: the parser or group.
+        name: of the argument; with leading dashes, an option.
+        what: text before the examples in the help.
+        default: describes what happens without an address; None: the default address is used.
+    """
+    options: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
+    usual = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
+    place = command.add_argument(
+        name,
+        type=address,
+        default=default_address() if default is None else None,
+        metavar="ADDRESS",
+        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … ({default or usual})",
+        **options,
+    )
+    offer(place, addresses)
+    add_baud(command)
+
+
+def _vehicle_parser() -> argparse.ArgumentParser:
+    parent = argparse.ArgumentParser(add_help=False)
+    add_vehicle(parent)
+    parent.add_argument(
+        "--source-system",
+        type=system_id,
+        default=OBSERVER_SYSTEM_ID,
+        metavar="ID",
+        help=f"system id of this program ({OBSERVER_SYSTEM_ID}; with 255, a flying vehicle starts its GCS failsafe"
+        " when the command ends, but vehicles that accept commands from one ground station only may require it)",
+    )
+    return parent
+
+
+def add_vehicle(command: argparse.ArgumentParser) -> None:
+    """Add the options that select a vehicle and its connection."""
+    group = command.add_argument_group("vehicle")
+    add_address(group, "--connect")
+    group.add_argument("--system-id", type=system_id, metavar="ID", help="system id of the vehicle (the only one)")
+    group.add_argument(
+        "--patience",
+        type=number(0.1, 3600),
+        default=10.0,
+        metavar="S",
+        help="time out after S seconds without progress (10)",
+    )
+    add_signing_key(group, f"signing key of the vehicle (${SIGNING_KEY_VARIABLE})")
+
+
+def add_action(
+    actions: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: Callable[[argparse.Namespace], Awaitable[int]],
+    text: str,
+    *,
+    connects: bool = True,
+) -> argparse.ArgumentParser:
+    """Add ``aerokit COMMAND name``. ``connects``: the action connects to a vehicle."""
+    parents = [_vehicle_parser()] if connects else []
+    summary = text[0].lower() + text[1:].partition(". ")[0].rstrip(".")
+    action = actions.add_parser(name, help=summary, description=text, parents=parents)
+    action.set_defaults(run=run)
+    add_json(action)
+    return action
+
+
+def confirm_blocking(question: str) -> bool:
+    """Ask a yes/no question before connecting; no on stdin that is not a terminal."""
+    return sys.stdin.isatty() and input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+def command_action(
+    name: str,
+    action: Callable[[Any, argparse.Namespace], Awaitable[object]],
+    target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
+) -> Callable[[argparse.Namespace], Awaitable[int]]:
+    """Return a ``run`` function that performs one action, and prints the ``done`` record.
+
+    Args:
+        name: the name of the action in the record; may contain names of options in braces.
+        action: called with the target and the options.
+        target: opens the target, by default the vehicle.
+    """
+
+    async def run(options: argparse.Namespace) -> int:
+        async with target(options) if target else connected(options, changes=True) as opened_target:
+            await action(opened_target, options)
+        emit_done(options, name.format(**vars(options)))
+        return DONE
+
+    return run
+
+
+@asynccontextmanager
+async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
+    """Connect to the vehicle that the options name, without requesting message rates.
+
+    ``changes``: the action changes something, so the vehicle must be the only one or chosen by ``--system-id``.
+    """
+    async with connect_to(
+        options,
+        options.connect,
+        changes=changes,
+        source_system=options.source_system,
+        rates={},
+        signing=signing_of(options),
+    ) as vehicle:
+        yield vehicle
+
+
+@asynccontextmanager
+async def connect_to(
+    options: argparse.Namespace, link: str | Link, *, changes: bool, **connecting: Any
+) -> AsyncIterator[Vehicle]:
+    """Connect to the vehicle on a link, with a countdown. ``connecting`` is passed to :func:`aerokit.connect`.
+
+    ``changes``: see :func:`connected`.
+    """
+    from aerokit.vehicle.connect import connect
+
+    address = link if isinstance(link, str) else link.address
+    async with AsyncExitStack() as stack:
+        async with waiting(options, address, _CONNECT_TIMEOUT_S):
+            vehicle = await stack.enter_async_context(
+                connect(
+                    link,
+                    system_id=options.system_id,
+                    timeout=_CONNECT_TIMEOUT_S,
+                    baud=options.baud,
+                    **connecting,
+                )
+            )
+        if changes:
+            await _check_only_vehicle(vehicle, options)
+        yield vehicle
+
+
+def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
+    """Add the address with ``--baud``, ``--signing-key`` and ``--json``; ``default`` as in :func:`add_address`."""
+    add_address(command, default=default)
+    add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
+    add_json(command)
+
+
+def add_seconds(command: argparse.ArgumentParser, text: str, default: float | None = None) -> None:
+    command.add_argument("--seconds", type=number(0.1, 1e6), default=default, metavar="S", help=text)
+
+
+@asynccontextmanager
+async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> AsyncIterator[Connection]:
+    """Open a connection to the address. Only heartbeats are sent.
+
+    ``reconnect``: reopen a lost link, if the address is a string.
+    """
+    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
+
+    place: str | Link = options.address
+    async with open_connection(
+        place,
+        baud=options.baud,
+        signing=signing_of(options),
+        source_system=OBSERVER_SYSTEM_ID,
+        reconnect=reconnect and isinstance(place, str),
+    ) as connection:
+        yield connection
+
+
+async def await_vehicle(connection: Connection, options: argparse.Namespace, patience_s: float) -> None:
+    """Wait for the first heartbeat of an autopilot.
+
+    Raises:
+        ConnectFailed: no heartbeat arrived; the message says what was received instead.
+        ConnectionClosed, LinkLost: the connection ended.
+    """
+    from aerokit.connection.opening import explain_no_vehicle
+
+    async with AsyncExitStack() as stack:
+        await stack.enter_async_context(waiting(options, connection.link.address, patience_s))
+        with anyio.move_on_after(patience_s):
+            async for _ in connection.vehicles():
+                return
+    raise ConnectFailed(
+        f"no autopilot heartbeat on {connection.link.address} within {patience_s:g} s:"
+        f" {explain_no_vehicle(connection, None)}"
+    )
+
+
+async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:
+    """Wait for Ctrl-C or for ``seconds``. Return True after Ctrl-C.
+
+    Raises the error that ended the connection. ``work``: a background task whose end also ends the wait.
+    """
+    ended = asyncio.Event()
+    interrupted = False
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+        ended.set()
+
+    detach = connection.on_end(lambda _: ended.set())
+    if work is not None:
+        work.add_done_callback(lambda _: ended.set())
+    try:
+        with on_interrupt(interrupt), anyio.move_on_after(seconds):
+            await ended.wait()
+    finally:
+        detach()
+    if not interrupted:
+        connection.raise_if_ended()
+    return interrupted

@@ -1,0 +1,251 @@
+"""``aerokit camera`` and ``aerokit gimbal``: cameras and gimbals on board."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import asynccontextmanager, suppress
+from typing import TYPE_CHECKING
+from urllib.parse import unquote
+
+import anyio
+
+from aerokit.apps.cli.arguments import directory, integer, number
+from aerokit.apps.cli.connecting import add_action, command_action, confirm_blocking, connected
+from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
+from aerokit.errors import AerokitError
+from aerokit.position import Position
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from aerokit.vehicle.camera.cameras import Camera
+    from aerokit.vehicle.camera.capture import Capture
+    from aerokit.vehicle.gimbal.device import GimbalInformation
+    from aerokit.vehicle.gimbal.gimbal import Gimbal
+
+_MAX_PICTURES = 32_767
+_MAX_FILE_NAME = 200
+_ATTITUDE_TIMEOUT_S = 2.0
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
+    info = add_action(actions, "info", _info, "Show model, firmware, capabilities and storage.")
+    photo = add_action(actions, "photo", _photo, "Take pictures, and show where each was taken.")
+    photo.add_argument(
+        "--count",
+        type=integer(1, _MAX_PICTURES, "a number of pictures"),
+        default=1,
+        metavar="N",
+        help="number of pictures (1)",
+    )
+    photo.add_argument(
+        "--interval", type=number(0.1, 3600), default=2.0, metavar="S", help="seconds between pictures (2)"
+    )
+    photo.add_argument("--to", type=directory, metavar="DIRECTORY", help="download the pictures to this directory")
+    record = command_action("camera video {what}", _record_video, _camera)
+    video = add_action(actions, "video", record, "Start or stop video recording.")
+    video.add_argument("what", choices=("start", "stop"), help="start or stop")
+    set_mode = command_action("camera mode", lambda camera, o: camera.set_mode(o.mode), _camera)
+    mode = add_action(actions, "mode", set_mode, "Change the camera's mode.")
+    mode.add_argument("mode", choices=("photo", "video", "survey"), help="camera mode")
+    zoom_to = command_action("camera zoom", lambda camera, o: camera.zoom_to(o.percent), _camera)
+    zoom = add_action(actions, "zoom", zoom_to, "Zoom.")
+    zoom.add_argument("percent", type=number(0, 100), metavar="PERCENT", help="of the zoom range, 0 to 100")
+    streams = add_action(actions, "streams", _streams, "List the video streams with their addresses.")
+    erase = add_action(actions, "format", _format, "Format the storage. All pictures are deleted.")
+    erase.add_argument("--yes", action="store_true", help="do not ask")
+    for action in (info, photo, video, mode, zoom, streams, erase):
+        action.add_argument(
+            "--camera",
+            type=int,
+            metavar="ID",
+            help="component id, or 1 to 6 for one attached to the autopilot (the first)",
+        )
+
+
+@asynccontextmanager
+async def _camera(options: argparse.Namespace, *, changes: bool = True) -> AsyncIterator[Camera]:
+    async with connected(options, changes=changes) as vehicle:
+        camera = vehicle.camera if options.camera is None else vehicle.camera_at(options.camera)
+        await camera.wait_found(timeout=options.patience)
+        yield camera
+
+
+async def _info(options: argparse.Namespace) -> int:
+    async with _camera(options, changes=False) as camera:
+        about = camera.information.value
+        name = _plain(f"{about.vendor} {about.model}")
+        capabilities = ", ".join(sorted(about.capabilities)) or "none reported"
+        text = f"{camera.number}  {name}, firmware {about.firmware or 'unknown'}\ncapabilities: {capabilities}"
+        record = {**about.to_dict(), "capabilities": sorted(about.capabilities)}
+        emit(options, "camera", record, text)
+        for card in await camera.load_storage():
+            free = "" if card.available_mib is None else f", {card.available_mib:.0f} MiB free"
+            emit(options, "card", card.to_dict(), f"card {card.number}: {card.status}{free}")
+    return DONE
+
+
+async def _photo(options: argparse.Namespace) -> int:
+    is_complete = True
+    async with _camera(options) as camera:
+        if options.count == 1:
+            is_complete = await _show(options, camera, await camera.take_photo())
+        else:
+            async with camera.photo_interval(options.interval, options.count) as captures:
+                async for capture in captures:
+                    is_complete = await _show(options, camera, capture) and is_complete
+    return DONE if is_complete else FAILED
+
+
+async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
+    """Print a picture, and download it with ``--to``. Return False if it was not taken or not downloaded."""
+    place, to = capture.place, options.to
+    where = "position unknown" if place is None else f"{place.latitude_deg:.7f} {place.longitude_deg:.7f}"
+    text = f"{capture.index:>5}  {where}  {_plain(capture.file_url)}".rstrip()
+    record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
+    emit(options, "picture", record, text)
+    if to is None or not capture.success:
+        return capture.success is not False
+    name = _file_name(capture)
+    if name is None:
+        not_fetched = {"index": capture.index, "file": None, "bytes": None}
+        emit(options, "fetched_picture", not_fetched, "       not downloaded: unsafe file name in its address")
+        return False
+    content = await camera.read_picture(capture)
+    target = _write_new(to, name, content)
+    fetched = {"index": capture.index, "file": target, "bytes": len(content)}
+    emit(options, "fetched_picture", fetched, f"       {target}")
+    return True
+
+
+def _plain(text: str) -> str:
+    """Replace control characters, which a terminal would execute."""
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
+
+
+def _file_name(capture: Capture) -> str | None:
+    """Return ``INDEX-NAME``, from the last part of the address; None if that is a path, or not a portable file
+    name.
+    """
+    base = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
+    is_name = base.isprintable() and not set(base) & set('/\\:*?"<>|') and base.strip(" .") == base
+    return f"{capture.index:05}-{base}" if is_name and len(base) <= _MAX_FILE_NAME else None
+
+
+def _write_new(to: Path, name: str, content: bytes) -> Path:
+    """Write to a new file; append a number to the name if it exists."""
+    stem, dot, ending = name.rpartition(".")
+    at, target = 1, to / name
+    while True:
+        with suppress(FileExistsError), target.open("xb") as file:
+            file.write(content)
+            return target
+        at += 1
+        target = to / (f"{stem}-{at}.{ending}" if dot else f"{name}-{at}")
+
+
+async def _record_video(camera: Camera, options: argparse.Namespace) -> None:
+    await (camera.start_video() if options.what == "start" else camera.stop_video())
+
+
+async def _streams(options: argparse.Namespace) -> int:
+    async with _camera(options) as camera:
+        for stream in await camera.load_streams():
+            size = f"{stream.width_px}x{stream.height_px}"
+            name = _plain(stream.name)
+            text = f"{stream.number:>3}  {_plain(stream.uri)}  {size}  {stream.encoding}  {name}".rstrip()
+            emit(options, "stream", stream.to_dict(), text)
+    return DONE
+
+
+async def _format(options: argparse.Namespace) -> int:
+    if not options.yes and not confirm_blocking("format the camera's storage?"):
+        emit(options, "declined", {"action": "camera format"}, "not confirmed; nothing was formatted")
+        return FAILED
+    async with _camera(options) as camera:
+        await camera.format_storage()
+    emit_done(options, "camera format", "formatted")
+    return DONE
+
+
+def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
+    actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
+    info = add_action(actions, "info", _gimbal_info, "Show model, limits and attitude.")
+    run = command_action("gimbal point", _point, _gimbal)
+    point = add_action(actions, "point", run, "Point the gimbal, and hold the direction.")
+    point.add_argument(
+        "pitch",
+        type=number(-360, 360),
+        metavar="PITCH",
+        help="degrees from the horizon: -90 is straight down",
+    )
+    point.add_argument(
+        "yaw", type=number(-360, 360), nargs="?", default=0.0, metavar="YAW", help="degrees to the right (0)"
+    )
+    point.add_argument(
+        "--frame",
+        choices=("earth", "vehicle"),
+        default="vehicle",
+        help="yaw from north, or from the nose (vehicle)",
+    )
+    run = command_action("gimbal look", _look_at, _gimbal)
+    look = add_action(actions, "look", run, "Keep the gimbal pointed at a position.")
+    look.add_argument("latitude", type=number(-90, 90), metavar="LATITUDE", help="degrees")
+    look.add_argument("longitude", type=number(-180, 180), metavar="LONGITUDE", help="degrees")
+    look.add_argument("altitude", type=number(-500, 10_000), metavar="ALTITUDE", help="metres above home")
+    run = command_action("gimbal neutral", lambda gimbal, o: gimbal.neutral(timeout=o.patience), _gimbal)
+    neutral = add_action(actions, "neutral", run, "Turn the gimbal to its neutral position.")
+    run = command_action("gimbal release", lambda gimbal, o: gimbal.release(), _gimbal)
+    release = add_action(actions, "release", run, "Return control of the gimbal to the pilot.")
+    for action in (info, point, look, neutral, release):
+        action.add_argument(
+            "--gimbal",
+            type=int,
+            metavar="ID",
+            help="component id, or 1 to 6 for one attached to the autopilot (the first)",
+        )
+
+
+@asynccontextmanager
+async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> AsyncIterator[Gimbal]:
+    async with connected(options, changes=changes) as vehicle:
+        await vehicle.gimbals.discover()  # until then, commands go to the autopilot
+        yield vehicle.gimbal if options.gimbal is None else vehicle.gimbals.get(options.gimbal)
+
+
+async def _gimbal_info(options: argparse.Namespace) -> int:
+    async with _gimbal(options, changes=False) as gimbal:
+        try:
+            about = await gimbal.information()
+        except AerokitError as error:
+            emit(options, "gimbal_silent", {"reason": str(error)}, f"gimbal information unavailable: {error}")
+        else:
+            emit(options, "gimbal", about.to_dict(), "\n".join(_lines(about)))
+        with anyio.move_on_after(_ATTITUDE_TIMEOUT_S):
+            attitude = await gimbal.attitude.wait_until(lambda _: True)
+            angles = {"pitch": attitude.pitch_deg, "roll": attitude.roll_deg, "yaw": attitude.yaw_deg}
+            shown = ", ".join(f"{name} {angle:.0f}" for name, angle in angles.items() if angle is not None)
+            record = {f"{name}_deg": angle for name, angle in angles.items()}
+            emit(options, "gimbal_attitude", record, f"attitude: {shown}")
+    return DONE
+
+
+async def _point(gimbal: Gimbal, options: argparse.Namespace) -> None:
+    await gimbal.point(options.pitch, options.yaw, frame=options.frame, timeout=options.patience)
+
+
+async def _look_at(gimbal: Gimbal, options: argparse.Namespace) -> None:
+    position = Position(options.latitude, options.longitude, altitude_relative_m=options.altitude)
+    await gimbal.look_at(position, timeout=options.patience)
+
+
+def _lines(about: GimbalInformation) -> list[str]:
+    name = f"{about.vendor} {about.model}".strip() or "unnamed gimbal"
+    lines = [f"{about.gimbal_device_id}  {name}, managed by component {about.manager_component_id}"]
+    for axis in ("roll", "pitch", "yaw"):
+        limits = getattr(about, f"{axis}_deg")
+        if limits is not None:
+            lines.append(f"{axis:>6}  {limits[0]:.0f} to {limits[1]:.0f} degrees")
+    return lines

@@ -1,0 +1,130 @@
+"""``aerokit convert`` and ``aerokit report``: flight logs in other formats, and as an HTML report."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aerokit._internal.formatting import printable
+from aerokit.apps.cli.output import DONE, add_json, emit, import_extra
+from aerokit.apps.cli.terminal import progress_bar
+from aerokit.logs.report.statistics import clock
+
+if TYPE_CHECKING:
+    import argparse
+
+    from aerokit.logs.report import Report
+
+# The noun for `Conversion.written`; an .mcap also gets a message for each state that an entry changes.
+_WRITTEN = {".mcap": "message", ".gpx": "point", ".kml": "point"}
+_NEEDS = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    command.set_defaults(run=_convert)
+    command.add_argument("log", type=Path, metavar="LOG", help=".tlog, .bin (ArduPilot) or .ulg (PX4)")
+    command.add_argument(
+        "out",
+        type=Path,
+        metavar="OUT",
+        help=".mcap (Foxglove), .csv or .parquet (one table of the flight), .gpx, .kml;"
+        " without a suffix: a folder with one table for each message type",
+    )
+    command.add_argument(
+        "--tables", choices=("csv", "parquet"), default="csv", help="format of the tables in a folder (csv)"
+    )
+    command.add_argument("--force", action="store_true", help="replace existing files")
+    add_json(command)
+
+
+async def _convert(options: argparse.Namespace) -> int:
+    needed = _NEEDS.get(options.out.suffix.lower() or f".{options.tables}")
+    if needed is not None:
+        import_extra(needed, "convert")
+    if options.log.suffix.lower() == ".ulg":
+        import_extra("pyulog", "convert")
+    from aerokit.logs.convert import convert
+
+    with progress_bar(options.log.name, "B") as on_progress:
+        done = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
+    for note in done.notes:
+        print(printable(f"aerokit: {options.log}: {note}"), file=sys.stderr)
+    emit(
+        options,
+        "conversion",
+        {**done.to_dict(), "log": options.log},
+        f"{done.target}: {_number(done.written, _WRITTEN.get(done.target.suffix.lower(), 'row'))}"
+        f" from {_number(done.entries, 'entry')}, {_size(done.bytes)},"
+        f" {_shown(done.begins_at)} to {_shown(done.ends_at)} UTC",
+    )
+    return DONE
+
+
+def _number(count: int, what: str) -> str:
+    many = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
+    return f"{count:,} {what if count == 1 else many}"
+
+
+def _size(number: int) -> str:
+    return f"{number / 1e6:.1f} MB" if number >= 1e6 else f"{number / 1e3:.1f} kB"
+
+
+def _shown(unix_s: float) -> str:
+    return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M:%S}"
+
+
+def add_report_arguments(command: argparse.ArgumentParser) -> None:
+    command.set_defaults(run=_report)
+    command.add_argument("log", type=Path, metavar="LOG", help=".tlog, .bin (ArduPilot) or .ulg (PX4)")
+    command.add_argument("other", type=Path, nargs="?", metavar="LOG2", help="a second log to compare with")
+    command.add_argument(
+        "-o", "--output", type=Path, metavar="OUT.html", help="output file (the name of the log, with .html)"
+    )
+    command.add_argument(
+        "--system",
+        type=int,
+        metavar="ID",
+        help="system id of the vehicle, if a .tlog has several (the first)",
+    )
+    command.add_argument("--force", action="store_true", help="replace an existing file")
+    command.add_argument("--open", action="store_true", help="open the report in the browser")
+    add_json(command)
+
+
+async def _report(options: argparse.Namespace) -> int:
+    import_extra("plotly", "report")
+    logs = [options.log] if options.other is None else [options.log, options.other]
+    if any(log.suffix.lower() == ".ulg" for log in logs):
+        import_extra("pyulog", "report")
+    from aerokit.logs.report import write_report
+
+    target = options.output or options.log.with_suffix(".html")
+    with progress_bar(options.log.name, "B") as on_progress:
+        report = write_report(
+            options.log,
+            target,
+            compare_with=options.other,
+            system_id=options.system,
+            force=options.force,
+            on_progress=on_progress,
+        )
+    emit(options, "report", {**report.to_dict(), "logs": logs}, _report_text(report))
+    if options.open:
+        import webbrowser
+
+        webbrowser.open(report.target.resolve().as_uri())
+    return DONE
+
+
+def _report_text(report: Report) -> str:
+    lines = []
+    for number, (sentences, failsafes) in enumerate(zip(report.summaries, report.failsafes, strict=True)):
+        if len(report.summaries) > 1:
+            lines.append(f"{'AB'[number]}:")
+        lines += sentences
+        for failsafe in failsafes:
+            lines.append(f"{clock(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")
+            lines += [f"  {fact}" for fact in failsafe.context]
+    return "\n".join([*lines, f"{report.target}: {report.bytes / 1e6:.1f} MB"])

@@ -1,0 +1,242 @@
+"""Commands that listen to a link: ``aerokit record``, ``events`` and ``monitor``."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+import threading
+from collections import Counter
+from contextlib import AsyncExitStack, ExitStack, suppress
+from datetime import datetime, timezone
+from typing import TYPE_CHECKING
+
+from aerokit.apps.cli.arguments import log_file
+from aerokit.apps.cli.connecting import (
+    SIGNING_KEY_VARIABLE,
+    add_address,
+    add_link,
+    add_seconds,
+    add_signing_key,
+    await_end,
+    opened,
+    signing_of,
+)
+from aerokit.apps.cli.output import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    create_recording,
+    emit,
+    import_extra,
+    remove_if_empty,
+)
+from aerokit.apps.cli.terminal import on_interrupt, waiting
+from aerokit.apps.event_text import event_details
+from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.events import Event, LinkReport, StatusTextReceived
+
+if TYPE_CHECKING:
+    import argparse
+
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.frame import Frame
+    from aerokit.transport.link import Peer
+
+# When the terminal is too slow, the oldest events are dropped and counted.
+_MAX_WAITING_EVENTS = 1000
+_SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
+# After this time the command continues to wait, without a countdown.
+_COUNTDOWN_S = 30.0
+EXIT_TIMEOUT_S = 3.0
+"""Seconds from a signal to the end of the process, in case Textual does not exit and keeps the port open."""
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    command.set_defaults(run=run_record)
+    add_link(command)
+    command.add_argument("file", type=log_file, metavar="FILE", help="new file, flight.tlog; directly after ADDRESS")
+    add_seconds(command, "stop after S seconds (at Ctrl-C)")
+    command.add_argument(
+        "--ask",
+        action="store_true",
+        help="request aerokit's default message rates; without it, nothing is requested",
+    )
+
+
+async def run_record(options: argparse.Namespace) -> int:
+    """Record until Ctrl-C or for ``--seconds``; a lost link is reopened."""
+    counts: Counter[tuple[int, int]] = Counter()
+
+    def count(frame: Frame, peer: Peer) -> None:
+        counts[frame.system_id, frame.message_id] += 1
+
+    create_recording(options.file)
+    error: AerokitError | None = None
+    try:
+        async with opened(options, reconnect=True) as connection:
+            started = connection.now()
+            connection.record(options.file)
+            connection.observe_frames(count)
+            text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
+            emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
+            try:
+                is_interrupted = await _record(connection, options)
+            except AerokitError as ended:  # report the counts before the error
+                error, is_interrupted = ended, False
+            seconds = connection.now() - started
+    except BaseException:
+        remove_if_empty(options.file)
+        raise
+    _emit_counts(options, counts, seconds)
+    if error is not None:
+        raise error
+    if not counts:
+        return FAILED
+    return INTERRUPTED if is_interrupted and options.seconds is not None else DONE
+
+
+async def _record(connection: Connection, options: argparse.Namespace) -> bool:
+    if not options.ask:
+        return await await_end(connection, options.seconds)
+    from aerokit.vehicle.connect import vehicles_on
+
+    async with vehicles_on(connection):
+        return await await_end(connection, options.seconds)
+
+
+def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], seconds: float) -> None:
+    from aerokit.mavlink.dialect import STANDARD
+
+    messages: Counter[str] = Counter()
+    for (_, message_id), number in counts.items():
+        known = STANDARD.get(message_id)
+        messages[str(message_id) if known is None else known.NAME] += number
+    systems = sorted({system_id for system_id, _ in counts})
+    size = os.path.getsize(options.file)
+    record = {
+        "file": options.file,
+        "seconds": seconds,
+        "frames": sum(counts.values()),
+        "bytes": size,
+        "systems": systems,
+        "messages": dict(messages.most_common()),
+    }
+    sources = f" from system{'s' if len(systems) > 1 else ''} {', '.join(map(str, systems))}" if systems else ""
+    details = ", ".join(f"{name} {number}" for name, number in messages.most_common(5))
+    text = f"{options.file}: {sum(counts.values())} frames received{sources} in {seconds:.1f} s, {size} bytes"
+    if set(messages) == {"HEARTBEAT"} and not options.ask:
+        details += "; no other messages: --ask requests position, attitude and other messages"
+    emit(options, "recorded", record, f"{text}\n  {details}" if details else f"{text}: nothing was received")
+
+
+def add_events_arguments(command: argparse.ArgumentParser) -> None:
+    command.set_defaults(run=run_events)
+    add_link(command)
+    add_seconds(command, "stop after S seconds (at Ctrl-C)")
+    command.add_argument("--all", action="store_true", help="include the link quality of each vehicle, once a second")
+
+
+async def run_events(options: argparse.Namespace) -> int:
+    """Print events until Ctrl-C or for ``--seconds``; a lost link is reopened."""
+    from aerokit.vehicle.connect import vehicles_on
+
+    async with AsyncExitStack() as stack:
+        connection = await stack.enter_async_context(opened(options, reconnect=True))
+        # Subscribed before the vehicles connect, so that their first events are printed too.
+        printing = asyncio.create_task(_print_all(connection, options))
+        stack.push_async_callback(_cancel, printing)
+        await stack.enter_async_context(vehicles_on(connection, rates={}))
+        is_interrupted = await await_end(connection, options.seconds, printing)
+    return INTERRUPTED if is_interrupted and options.seconds is not None else DONE
+
+
+async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
+    wall_at_0 = connection.unix_time() - connection.now()
+    async with AsyncExitStack() as stack:
+        events = stack.enter_context(connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS))
+        missed = 0
+        async with waiting(options, connection.link.address, _COUNTDOWN_S):
+            event = await events.get()
+        with suppress(AerokitError):  # the end of the connection; await_end raises it
+            while True:
+                if options.all or not isinstance(event, LinkReport):
+                    _emit_event(event, wall_at_0 + event.at, options)
+                if events.missed > missed:
+                    emit(options, "missed", {"events": events.missed - missed}, None)
+                    missed = events.missed
+                event = await events.get()
+
+
+async def _cancel(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    with suppress(asyncio.CancelledError, AerokitError):
+        await task
+
+
+def _emit_event(event: Event, unix_s: float, options: argparse.Namespace) -> None:
+    details = {name: value for name, value in event.to_dict().items() if name not in ("at", "system_id")}
+    record = {
+        "time_unix_s": unix_s,
+        "system_id": event.system_id,
+        "event": type(event).__name__,
+        "details": details,
+    }
+    time = datetime.fromtimestamp(unix_s, timezone.utc).astimezone()
+    system = "  -" if event.system_id == 0 else f"{event.system_id:>3}"
+    emit(
+        options,
+        "event",
+        record,
+        f"{time:%H:%M:%S}.{time.microsecond // 1000:03}  {system}  {_event_text(event)}",
+    )
+
+
+def _event_text(event: Event) -> str:
+    if isinstance(event, StatusTextReceived):
+        severity = _SEVERITIES[event.severity] if 0 <= event.severity < len(_SEVERITIES) else event.severity
+        return f"{severity}: {event.text}"
+    return f"{type(event).__name__}  {event_details(event)}".rstrip()
+
+
+def add_monitor_arguments(command: argparse.ArgumentParser) -> None:
+    command.set_defaults(run=run_monitor)
+    add_address(command)
+    add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
+
+
+async def run_monitor(options: argparse.Namespace) -> int:
+    """Show the vehicles until the user quits."""
+    import_extra("textual", "monitor")
+    from aerokit.apps.monitor.app import run_monitor as run
+
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise InvalidArgument("aerokit monitor needs a terminal: stdin or stdout is redirected")
+    with ExitStack() as stack:
+
+        def end_soon(number: int) -> None:
+            if number == getattr(signal, "SIGHUP", None):
+                _detach_terminal()
+            end = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))
+            end.daemon = True
+            end.start()
+            stack.callback(end.cancel)
+
+        return await run(
+            options.address,
+            baud=options.baud,
+            signing=signing_of(options),
+            on_start=lambda app: stack.enter_context(on_interrupt(app.exit, end_soon)),
+        )
+
+
+def _detach_terminal() -> None:
+    """Redirect the output to the null device.
+
+    Textual's output thread ends at a write to a terminal that is gone; after that, its writes block the event
+    loop.
+    """
+    with open(os.devnull, "w") as nothing:
+        for stream in (1, 2):
+            os.dup2(nothing.fileno(), stream)

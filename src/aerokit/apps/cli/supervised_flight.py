@@ -1,0 +1,310 @@
+"""Base class of commands that arm and fly a vehicle, with the handling of failures and Ctrl-C."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import sys
+from abc import ABC, abstractmethod
+from contextlib import asynccontextmanager, suppress
+from functools import partial
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit import events
+from aerokit.apps.cli.output import DONE, INTERRUPTED, emit
+from aerokit.errors import (
+    AerokitError,
+    CommandRejected,
+    HeartbeatTimeout,
+    OperationRejected,
+    OperationTimeout,
+)
+from aerokit.events import SILENT_AFTER_S
+from aerokit.mavlink.enums import MavLandedState
+from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+    from typing import Literal
+
+    from aerokit.apps.cli.terminal import InterruptStack
+    from aerokit.position import Position
+    from aerokit.vehicle.vehicle import Vehicle
+
+    Purpose = Literal["mission", "hold", "land", "return", "take_off", "setpoint"]
+
+INTERRUPT_ACTIONS: dict[str, str] = {
+    "return": "returning to launch",
+    "land": "landing here",
+    "hold": "holding here",
+    "nothing": "no command is sent",
+}
+"""Choices of ``--on-interrupt``, and the text that is printed."""
+_AUTO_DISARM_TIMEOUT_S = 30.0
+_WARNING = 4
+# After this time without output, print a status line.
+_STATUS_INTERVAL_S = 5.0
+
+
+class SupervisedFlight(ABC):
+    """Arms and flies a vehicle, and brings it to a safe state after a failure or Ctrl-C.
+
+    Never commands a vehicle that was armed before, or whose mode another party has changed.
+    """
+
+    def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
+        self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
+        self._on_interrupt = on_interrupt
+        self.armed_by_us: bool = False
+        """True once this program has sent an arm command."""
+        self._may_arm_late = False  # an arm command was sent, and its result is unknown
+        self._modes_armed_in: set[str] = set()
+        self._has_started = False  # our command has changed the mode in which it was armed
+
+    async def fly(self) -> int:
+        """Fly to the end, and return the exit code. On failure, make the vehicle safe and re-raise the error."""
+        try:
+            code = await self._interrupts.run(self._fly)
+        except Exception as error:
+            # Any error: a vehicle that this program has armed must not stay armed on the ground.
+            self._print(f"failed: {error}")
+            if self.armed_by_us:
+                await self._make_safe(partial(self._after_failure, error))
+            raise
+        if code is None:
+            self._print(f"interrupted, {self._vehicle.describe_now()}")
+            if self.armed_by_us:
+                await self._make_safe(self._after_interrupt)
+            return INTERRUPTED
+        return code
+
+    @abstractmethod
+    async def _fly(self) -> int:
+        """Perform the flight, and return the exit code."""
+
+    @abstractmethod
+    def _our_purposes(self) -> tuple[Purpose, ...]:
+        """Return the purposes of the modes in which only this program controls the vehicle."""
+
+    def _check_disarmed(self) -> None:
+        now = self._vehicle.describe_now()
+        if self._vehicle.heartbeat_age > SILENT_AFTER_S:
+            raise HeartbeatTimeout(f"cannot check whether the vehicle is armed ({now}); nothing was started")
+        if not self._vehicle.is_confirmed_disarmed:
+            raise OperationRejected(f"the vehicle was armed by another party ({now}); nothing was started")
+
+    async def _arm(self) -> None:
+        self._check_disarmed()
+        self.armed_by_us = self._may_arm_late = True
+        self._modes_armed_in.add(self._vehicle.mode_name)
+        try:
+            await self._vehicle.arm()
+        except CommandRejected:
+            self._may_arm_late = False
+            raise
+        self._may_arm_late = False
+        self._modes_armed_in.add(self._vehicle.mode_name)
+
+    async def _wait_disarmed_on_ground(self) -> None:
+        if self._vehicle.landed_state.latest == MavLandedState.ON_GROUND:
+            with suppress(OperationTimeout):
+                await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
+
+    async def _make_safe(self, action: Callable[[], Awaitable[int]]) -> None:
+        """Run the action. A second Ctrl-C or an error ends it, without further commands."""
+        try:
+            if await self._interrupts.run(action) is None:
+                self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
+        except AerokitError as error:
+            self._print(f"failed again: {error}")
+            self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
+
+    async def _after_failure(self, error: Exception) -> int:
+        """Disarm on the ground if this program armed it. In the air, leave control to mission, pilot or failsafe."""
+        vehicle = self._vehicle
+        if vehicle.is_confirmed_disarmed:
+            await self._watch_late_arming()
+        elif self._is_armed_on_ground and self._is_in_our_mode:
+            await self._disarm()
+        else:
+            self._print(f"no command is sent: vehicle {vehicle.describe_now()}")
+        return DONE
+
+    async def _after_interrupt(self) -> int:
+        """Disarm on the ground. In the air, perform ``--on-interrupt`` if this program has control."""
+        vehicle, wanted = self._vehicle, self._on_interrupt
+        if vehicle.is_confirmed_disarmed:
+            await self._watch_late_arming()
+            return DONE
+        if not self._check_control():
+            return DONE
+        if self._is_armed_on_ground and wanted != "nothing":
+            try:
+                await self._disarm()
+            except CommandRejected as error:  # it has taken off since its last landed state
+                self._print(f"disarming failed: {error}")
+            if vehicle.is_confirmed_disarmed or not self._check_control():
+                return DONE
+        self._print(INTERRUPT_ACTIONS[wanted] + ("" if wanted == "nothing" else "; press Ctrl-C again to exit at once"))
+        if wanted == "return":
+            await vehicle.return_to_launch(timeout=None)
+        elif wanted == "land":
+            await vehicle.land(timeout=None)
+        elif wanted == "hold":
+            await vehicle.hold()
+        if wanted in ("return", "land"):
+            await self._wait_disarmed_on_ground()
+        self._print(vehicle.describe_now())
+        return DONE
+
+    async def _watch_late_arming(self) -> None:
+        """Wait for an arm command that may still arrive; the library then disarms the vehicle while connected."""
+        if not self._may_arm_late:
+            return
+        self._print(
+            f"the arm command may still take effect: waiting {ARM_WATCH_S:g} s to disarm the vehicle if it arms;"
+            " press Ctrl-C again to exit now"
+        )
+        armed = self._vehicle.armed
+        with suppress(OperationTimeout):
+            await armed.wait_until(bool, timeout=ARM_WATCH_S)
+            await armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
+        self._print(self._vehicle.describe_now())
+
+    async def _disarm(self) -> None:
+        self._print("on the ground and armed; disarming")
+        await self._vehicle.disarm()
+        self._print("disarmed")
+
+    def _check_control(self) -> bool:
+        if not self._is_in_our_mode:
+            mode, now = self._vehicle.mode_name, self._vehicle.describe_now()
+            self._print(f"no command is sent, because another party changed the mode to {mode}: {now}")
+        return self._is_in_our_mode
+
+    @property
+    def _is_armed_on_ground(self) -> bool:
+        return self._vehicle.is_armed and self._vehicle.landed_state.latest == MavLandedState.ON_GROUND
+
+    @property
+    def _is_in_our_mode(self) -> bool:
+        vehicle = self._vehicle
+        if not self._has_started and vehicle.mode_name in self._modes_armed_in:
+            return True
+        mode_for, is_vtol = vehicle.autopilot.mode_for, vehicle.is_vtol
+        modes = [mode_for(purpose, is_vtol=is_vtol) for purpose in self._our_purposes()]
+        return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
+
+
+class FlightReport:
+    """Prints the progress of a flight and the vehicle's texts, and measures the track."""
+
+    def __init__(self, vehicle: Vehicle, options: argparse.Namespace) -> None:
+        self._vehicle, self._options = vehicle, options
+        self._started = self._last_line = vehicle.connection.now()
+        self._highest_m = self._fastest_m_s = self._flown_m = 0.0
+        self._before: Position | None = None
+        self.prints_status: bool = True
+        """Print status lines while nothing else is printed; set to False while a question is open."""
+
+    def print_line(self, text: str) -> None:
+        """Print a line with time and altitude. A closed pipe or a full disk does not end the flight."""
+        here = self._vehicle.position.latest
+        altitude = None if here is None else here.altitude_relative_m
+        height = "     -" if altitude is None else f"{round(altitude, 1) + 0.0:6.1f}"
+        self._last_line = self._vehicle.connection.now()
+        seconds = self._last_line - self._started
+        record = {"seconds": seconds, "altitude_relative_m": altitude, "text": text.strip()}
+        self._emit("flight", record, f"{seconds:6.1f} s {height} m  {text}")
+
+    @asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Within the block, print the vehicle's texts, mode changes and status lines."""
+        detach = self._vehicle.position.observe(self._on_position)
+        tasks = [asyncio.create_task(coroutine) for coroutine in (self._print_events(), self._print_status())]
+        try:
+            yield
+        finally:
+            detach()
+            for task in tasks:
+                task.cancel()
+            with anyio.CancelScope(shield=True):
+                await asyncio.gather(*tasks, return_exceptions=True)
+
+    def print_summary(self, recorded_in: str | None = None) -> None:
+        """Print the statistics of the flight, the link and the batteries."""
+        vehicle = self._vehicle
+        received, lost = vehicle.connection.counts(vehicle.system_id)
+        seconds = vehicle.connection.now() - self._started
+        version = vehicle.version.latest
+        batteries = vehicle.batteries.latest or ()
+        record = {
+            "system_id": vehicle.system_id,
+            "firmware": vehicle.autopilot.firmware,
+            "version": None if version is None else str(version),
+            "seconds": seconds,
+            "flown_m": self._flown_m,
+            "highest_m": self._highest_m,
+            "fastest_m_s": self._fastest_m_s,
+            "batteries": batteries,
+            "frames_received": received,
+            "frames_lost": lost,
+            "armed": vehicle.is_armed,
+            "mode": vehicle.mode_name,
+            "recorded_in": recorded_in,
+        }
+        lines = [
+            f"\n{vehicle.autopilot.firmware} {version or '(unknown version)'}, {seconds:.0f} s:"
+            f" flown {self._flown_m:.0f} m, max height {self._highest_m:.1f} m, max speed {self._fastest_m_s:.1f} m/s",
+            *(
+                f"battery {battery.id}: {_number(battery.voltage_v, 'V')},"
+                f" {_number(battery.remaining_percent, '%')} left"
+                for battery in batteries
+            ),
+            f"{received} frames received, {lost} lost" + (f"; recorded in {recorded_in}" if recorded_in else ""),
+        ]
+        self._emit("flight_summary", record, "\n".join(lines))
+
+    async def _print_events(self) -> None:
+        with (
+            self._vehicle.subscribe(events.StatusTextReceived, events.ModeChanged, capacity=100) as messages,
+            contextlib.suppress(AerokitError),
+        ):
+            async for event in messages:
+                if isinstance(event, events.ModeChanged):
+                    self.print_line(f"  mode {event.after}")
+                elif isinstance(event, events.StatusTextReceived):
+                    self.print_line(f"  {'! ' if event.severity <= _WARNING else ''}{event.text}")
+
+    async def _print_status(self) -> None:
+        vehicle = self._vehicle
+        while vehicle.connection.is_open:
+            await anyio.sleep(_STATUS_INTERVAL_S / 5)
+            if not self.prints_status or vehicle.connection.now() - self._last_line < _STATUS_INTERVAL_S:
+                continue
+            missing = [] if vehicle.is_armed else vehicle.missing_for_flight()
+            if missing:
+                self.print_line(f"  still missing: {'; '.join(missing)}")
+            else:
+                self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
+
+    def _on_position(self, before: Position | None, position: Position) -> None:
+        if self._before is not None:
+            self._flown_m += position.distance_to(self._before)
+        self._before = position
+        self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
+        self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
+
+    def _emit(self, kind: str, record: Mapping[str, object], text: str) -> None:
+        try:
+            emit(self._options, kind, record, text)
+        except OSError:
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "unknown" if value is None else f"{value:.4g} {unit}"

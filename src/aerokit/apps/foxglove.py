@@ -1,0 +1,272 @@
+"""Vehicles live in Foxglove: ``async with foxglove_bridge(connection): ...``.
+
+Needs foxglove-sdk (``pip install 'aerokit-mavlink[foxglove]'``); see docs/convert.md. ``aerokit convert``
+writes the same topics to an ``.mcap`` file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from fnmatch import fnmatchcase
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit._internal.arguments import checked
+from aerokit._internal.async_block import async_block
+from aerokit.connection.tasks import BackgroundTasks
+from aerokit.errors import InvalidArgument, LinkOpenError
+from aerokit.logs.convert import topics
+from aerokit.logs.convert.topics import Topic
+from aerokit.transport.sockets import is_port_free
+from aerokit.vehicle.connect import vehicles_on
+from aerokit.vehicle.vehicle import overview
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = ["FoxgloveBridge", "foxglove_bridge"]
+
+MAX_RATE_HZ = 100.0
+# For each viewer. The SDK drops the oldest messages, so a slow viewer gets the newest and delays nothing.
+_MAX_BACKLOG = 512
+# Wait for the SDK to close the port.
+_PORT_CLOSE_TIMEOUT_S = 2.0
+_LINK_INTERVAL_S = 1.0
+
+
+class FoxgloveBridge:
+    """A running server for viewers, from :func:`foxglove_bridge`."""
+
+    def __init__(self, server: Any, vehicles: Mapping[int, Vehicle], host: str) -> None:
+        self._server = server
+        self.vehicles = vehicles
+        """System id → vehicle, of all vehicles that are shown."""
+        self.port: int = server.port
+        """TCP port on which it listens."""
+        self.url: str = f"ws://{f'[{host}]' if ':' in host else host}:{self.port}"
+        """URL to enter in Foxglove, under "Open connection"."""
+
+
+@checked
+@async_block
+async def foxglove_bridge(
+    connection: Connection,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    rate_hz: float = 10.0,
+    messages: Iterable[str] = (),
+    rates: Mapping[type[Message], float] | None = None,
+    on_found: Callable[[Vehicle], object] | None = None,
+) -> AsyncIterator[FoxgloveBridge]:
+    """Serve the vehicles of a connection to Foxglove, while the block lasts.
+
+    Viewers cannot send anything to a vehicle. Each topic sends its newest value, at most ``rate_hz`` times a
+    second, and only while a viewer subscribes to it; docs/convert.md lists the topics. There is no password:
+    every client that can reach the port can see everything.
+
+    The server is foxglove-sdk's. It runs on two threads of its own, which start with the first bridge of a
+    process. The server and its sockets end with the block; the idle threads end with the process.
+
+    Args:
+        connection: a connection from :func:`aerokit.open_connection`.
+        host: address to listen on; ``"0.0.0.0"`` for all interfaces.
+        port: TCP port, 0 to 65535; 0 for any free port.
+        rate_hz: maximum rate of each topic, above 0, at most 100.
+        messages: names of MAVLink messages to show unconverted; ``*`` and ``?`` are wildcards: ``["GPS_*"]``.
+        rates: message class → Hz, requested from each vehicle, as in :func:`aerokit.connect`; ``{}`` requests
+            nothing.
+        on_found: called with each new vehicle, in the event loop.
+
+    Raises:
+        InvalidArgument: an argument is invalid, or no message has such a name.
+        LinkOpenError: cannot listen on the port.
+        ConnectionClosed, LinkLost: the connection has ended.
+        ModuleNotFoundError: foxglove-sdk is not installed.
+    """
+    if not 0 < rate_hz <= MAX_RATE_HZ:
+        raise InvalidArgument(f"rate_hz = {rate_hz} is not allowed: above 0, at most {MAX_RATE_HZ:g}")
+    if not 0 <= port <= 65535:
+        raise InvalidArgument(f"port = {port} is not allowed: 0 to 65535")
+    kinds = _message_types(connection, messages)
+    channels = _TopicChannels(connection)
+    server = _serve(channels, host, port)
+    tasks, detachers = BackgroundTasks(connection.fail), connection.attach(kinds, channels.on_message)
+    try:
+        async with vehicles_on(connection, rates=rates, on_found=on_found) as vehicles:
+            tasks.start(lambda: _repeat(lambda: channels.publish(vehicles), 1 / rate_hz))
+            try:
+                yield FoxgloveBridge(server, vehicles, host)
+            finally:
+                await tasks.aclose()
+    finally:
+        for detach in detachers:
+            detach()
+        channels.close()
+        await _stop(server, host)
+
+
+def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
+    found: dict[int, type[Message]] = {}
+    for pattern in patterns:
+        matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]
+        if not matching:
+            raise InvalidArgument(f"messages: no message of the connection's dialect matches {pattern!r}")
+        found.update({message.ID: message for message in matching})
+    return list(found.values())
+
+
+def _serve(channels: _TopicChannels, host: str, port: int) -> Any:
+    try:
+        return import_module("foxglove").start_server(
+            name="aerokit",
+            host=host,
+            port=port,
+            context=channels.context,
+            server_listener=_Listener(asyncio.get_running_loop(), channels),
+            message_backlog_size=_MAX_BACKLOG,
+        )
+    except RuntimeError as error:
+        raise LinkOpenError(f"cannot serve Foxglove on {host} port {port}: {error}") from None
+
+
+async def _stop(server: Any, host: str) -> None:
+    """Stop the server, and wait until its thread has closed the socket, which happens after ``stop`` returns."""
+    port = server.port
+    server.stop()
+    with anyio.move_on_after(_PORT_CLOSE_TIMEOUT_S, shield=True):
+        while not await is_port_free(host, port):  # noqa: ASYNC110 - the SDK has no notification
+            await anyio.sleep(0.005)
+
+
+async def _repeat(action: Callable[[], None], every_s: float) -> None:
+    while True:
+        action()
+        await asyncio.sleep(every_s)
+
+
+class _Listener:
+    """Receives subscriptions of viewers, on threads of the SDK."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, channels: _TopicChannels) -> None:
+        self._loop, self._channels = loop, channels
+
+    def on_subscribe(self, client: Any, channel: Any) -> None:
+        # A new viewer needs the current value.
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._channels.send_again, channel.topic)
+
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:
+        pass  # publish() skips topics without viewers
+
+
+class _TopicChannels:
+    """The channels of all topics, and the time of the value that each has sent."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._sdk = import_module("foxglove")
+        self.context = self._sdk.Context()
+        self._connection = connection
+        self._wall_at_0 = connection.unix_time() - connection.now()
+        self._channels: dict[str, Any] = {}
+        self._sent_at: dict[str, float] = {}
+        self._map = topics.MapFrame()
+        self._messages: dict[tuple[int, int, int], Message] = {}
+
+    def send_again(self, topic: str) -> None:
+        """Send the current value of a topic again, for a new viewer. Texts are always read from the buffer."""
+        if not topic.endswith("/log"):
+            self._sent_at.pop(topic, None)
+
+    def on_message(self, message: Message) -> None:
+        frame = message.received_frame
+        if frame is not None:
+            self._messages[frame.system_id, frame.component_id, message.ID] = message
+
+    def publish(self, vehicles: Mapping[int, Vehicle]) -> None:
+        """Send all values that are newer than those already sent."""
+        for system_id, vehicle in vehicles.items():
+            self._publish_states(system_id, vehicle)
+            self._publish_place(system_id, vehicle)
+            self._publish_texts(system_id, vehicle)
+        for (system_id, component_id, _), message in self._messages.items():
+            assert message.received_frame is not None
+            at, kind = message.received_frame.received_at, type(message)
+            name = topics.raw_topic_name(system_id, component_id, kind)
+            if self._needs_sending(name, at, lambda: topics.raw_topic(system_id, component_id, kind)):  # noqa: B023
+                self._send(name, at, topics.raw_fields(message))
+
+    def close(self) -> None:
+        """Remove all topics."""
+        for channel in self._channels.values():
+            channel.close()
+        self._channels.clear()
+
+    def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
+        for state, cell in vehicle.telemetry.cells.items():
+            at, value, name = cell.updated_at, cell.latest, topics.vehicle_topic(system_id, state)
+            if value is None:
+                continue
+            if self._needs_sending(name, at, lambda: topics.state_topic(system_id, state, value)):  # noqa: B023
+                self._send(name, at, topics.state_fields(value))
+        name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
+        if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
+            link = overview(vehicle)["link"]
+            if self._needs_sending(name, now, lambda: topics.state_topic(system_id, "link", link)):
+                self._send(name, now, link)
+
+    def _publish_place(self, system_id: int, vehicle: Vehicle) -> None:
+        place, attitude = vehicle.position.latest, vehicle.attitude.latest
+        if place is None:
+            return
+        at = vehicle.position.updated_at
+        moved_at = max(at, vehicle.attitude.updated_at)
+        location, transform, pose = (
+            topics.vehicle_topic(system_id, what) for what in ("location", "transform", "pose")
+        )
+        if self._needs_sending(location, at, lambda: Topic(location, topics.LOCATION_FIX)):
+            heading, velocity = vehicle.heading_deg.latest, vehicle.velocity.latest
+            self._send(location, at, topics.location_fix(self._unix(at), system_id, place, heading, velocity))
+        metres = self._map.east_north_up_m(place)
+        if self._needs_sending(transform, moved_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
+            fields = topics.frame_transform(self._unix(moved_at), system_id, metres, attitude)
+            self._send(transform, moved_at, fields)
+        if self._needs_sending(pose, moved_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
+            self._send(pose, moved_at, topics.pose_in_frame(self._unix(moved_at), metres, attitude))
+
+    def _publish_texts(self, system_id: int, vehicle: Vehicle) -> None:
+        name = topics.vehicle_topic(system_id, "log")
+        sent_at = self._sent_at.get(name, -math.inf)
+        for text in vehicle.telemetry.texts_since(sent_at):
+            if text.at > sent_at and self._needs_sending(name, text.at, lambda: Topic(name, topics.LOG)):
+                self._send(name, text.at, topics.log_entry(self._unix(text.at), system_id, text))
+
+    def _needs_sending(self, name: str, at: float, topic: Callable[[], Topic]) -> bool:
+        """Return True if a viewer subscribes to the topic, and the value is newer than the last one sent.
+
+        Creates the channel of the topic with its first value.
+        """
+        channel = self._channels.get(name)
+        if channel is None:
+            channel = self._channels[name] = self._sdk.Channel(
+                name, schema=dict(topic().schema), message_encoding="json", context=self.context
+            )
+        if not channel.has_sinks():
+            self._sent_at.pop(name, None)
+            return False
+        return at > self._sent_at.get(name, -math.inf)
+
+    def _send(self, name: str, at: float, fields: Mapping[str, Any]) -> None:
+        self._sent_at[name] = at
+        self._channels[name].log(topics.encoded(fields), log_time=topics.nanoseconds(self._unix(at)))
+
+    def _unix(self, at: float) -> float:
+        """Convert the loop's time to UTC, in seconds since 1970."""
+        return self._wall_at_0 + at

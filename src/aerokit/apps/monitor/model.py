@@ -1,0 +1,117 @@
+"""``MonitorModel``: data of the terminal monitor: texts and events, message rates, tracks."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections import Counter, defaultdict, deque
+from typing import TYPE_CHECKING
+
+from rich.text import Text
+
+from aerokit._internal import geo
+from aerokit._internal.formatting import printable
+from aerokit.apps.event_text import event_details
+from aerokit.events import Event, LinkReport, LoopBlocked, StatusTextReceived
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from aerokit.connection.bus import Detach
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.frame import Frame
+    from aerokit.vehicle.vehicle import Vehicle
+
+MAX_LINES = 500
+MAX_TRACK_POINTS = 3000
+MIN_POINT_DISTANCE_M = 0.5
+MAX_MESSAGE_TYPES = 2000
+"""Limits memory, because senders can make up any number of ids."""
+RATE_WINDOW_S = 5.0
+SEVERITY_STYLES = ("bold white on red", "bold red", "bold red", "red", "yellow", "cyan", "", "dim")
+"""Styles by MAV_SEVERITY, emergency first."""
+
+
+class MonitorModel:
+    """Collects data from a connection. Call ``update()`` a few times a second."""
+
+    def __init__(self, connection: Connection, vehicles: Mapping[int, Vehicle]) -> None:
+        self.connection: Connection = connection
+        self.vehicles: Mapping[int, Vehicle] = vehicles
+        self.lines: deque[Text] = deque(maxlen=MAX_LINES)
+        """Texts and events that are not displayed yet, the oldest first."""
+        self.tracks: dict[int, deque[tuple[float, float]]] = defaultdict(lambda: deque(maxlen=MAX_TRACK_POINTS))
+        """System id → metres north and east of ``reference``."""
+        self.reference: tuple[float, float] | None = None
+        """The first known position, latitude and longitude in degrees."""
+        self._counts: Counter[tuple[int, int]] = Counter()
+        self._counted: deque[tuple[float, Counter[tuple[int, int]]]] = deque([(connection.now(), Counter())])
+        self._detach: list[Detach] = [
+            connection.observe_frames(self._count),
+            *connection.attach([Event], self._on_event),
+        ]
+
+    def close(self) -> None:
+        for detach in self._detach:
+            detach()
+
+    def update(self) -> None:
+        """Sample the positions and the message counts."""
+        now = self.connection.now()
+        if now - self._counted[-1][0] >= 1.0:
+            self._counted.append((now, self._counts.copy()))
+            while now - self._counted[1][0] >= RATE_WINDOW_S:
+                self._counted.popleft()
+        for system_id, vehicle in self.vehicles.items():
+            place = vehicle.position.latest
+            if place is not None:
+                point, track = self.metres(place.latitude_deg, place.longitude_deg), self.tracks[system_id]
+                if not track or math.dist(track[-1], point) >= MIN_POINT_DISTANCE_M:
+                    track.append(point)
+
+    def rates(self, system_id: int) -> list[tuple[str, float]]:
+        """Return message names of a system, and their rates in Hz over the last five seconds, the highest first."""
+        (since, before), (until, after) = self._counted[0], self._counted[-1]
+        if until <= since:
+            return []
+        dialect = self.connection.bus.dialect
+        rates = []
+        for (system, number), count in after.items():
+            if system == system_id:
+                known = dialect.get(number)
+                name = f"message {number}" if known is None else known.NAME
+                rates.append((name, (count - before[system, number]) / (until - since)))
+        return sorted(rates, key=lambda each: (-each[1], each[0]))
+
+    def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """Convert to metres north and east of ``reference``; the first position becomes the reference."""
+        if self.reference is None:
+            self.reference = latitude_deg, longitude_deg
+        return geo.north_east_m(*self.reference, latitude_deg, longitude_deg)
+
+    def add_line(self, system_id: int, text: str, style: str = "") -> None:
+        """Add a line with the current time."""
+        line = Text(time.strftime("%H:%M:%S ", time.localtime(self.connection.unix_time())), "dim")
+        line.append(f"{system_id} " if system_id else "link ", "bold")
+        line.append(printable(text).replace("\n", " "), style)
+        self.lines.append(line)
+
+    def _count(self, frame: Frame, _peer: object) -> None:
+        kind = frame.system_id, frame.message_id
+        if kind in self._counts or len(self._counts) < MAX_MESSAGE_TYPES:
+            self._counts[kind] += 1
+
+    def _on_event(self, event: Event) -> None:
+        if isinstance(event, StatusTextReceived):
+            style = SEVERITY_STYLES[event.severity] if 0 <= event.severity < 8 else ""
+            self.add_line(event.system_id, event.text, style)
+        elif not isinstance(event, (LinkReport, LoopBlocked)):
+            self.add_line(event.system_id, _event_line(event), "italic")
+
+
+def _event_line(event: Event) -> str:
+    """Return ``ModeChanged(before='A', after='B')`` as "mode changed: A → B"."""
+    name = re.sub(r"(?<!^)(?=[A-Z])", " ", type(event).__name__).lower()
+    details = event_details(event)
+    return f"{name}: {details}" if details else name

@@ -1,0 +1,144 @@
+"""``ServedVehicles``: the vehicles that are served, with their recent events and texts."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.serve.requests import HttpProblem
+from aerokit.connection.connection import Connection
+from aerokit.connection.tasks import BackgroundTasks
+from aerokit.errors import InvalidArgument
+from aerokit.events import Event, LinkReport, StatusTextReceived
+from aerokit.vehicle.connect import vehicles_on
+from aerokit.vehicle.vehicle import Vehicle, overview
+
+if TYPE_CHECKING:
+    from aerokit.connection.bus import Detach
+
+Listener = Callable[[dict[str, Any]], object]
+
+MAX_EVENTS = 500
+MAX_TEXTS = 200
+"""For each vehicle."""
+SNAPSHOT_MAX_AGE_S = 0.05
+"""Requests within this time share one snapshot."""
+
+
+class ServedVehicles:
+    """Follows the vehicles of a source, and keeps their recent events and texts. Requests nothing from a vehicle.
+
+    ``source``: a connection, whose vehicles are added as they appear; one vehicle; or a mapping from system id
+    to vehicle, which may grow.
+    """
+
+    def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
+        self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
+        self._texts: dict[int, deque[dict[str, Any]]] = {}
+        self._listeners: list[Listener] = []
+        self._attached: dict[Connection, list[Detach]] = {}
+        self._count = 0
+        self._snapshot: tuple[float, str] | None = None
+        # The end of a connection is no error here: the states of its vehicles show it.
+        self._background = BackgroundTasks(lambda error: None)
+        self._vehicles: Mapping[int, Vehicle] = {}
+        if isinstance(source, Connection):
+            self._attach(source)
+            self._attached[source].append(source.on_end(lambda _: self._background.cancel()))
+            self._background.start(lambda: self._follow(source), "aerokit serve")
+        elif isinstance(source, Vehicle):
+            self._vehicles = {source.system_id: source}
+        elif isinstance(source, Mapping):
+            self._vehicles = source
+        else:
+            raise InvalidArgument(f"source = {source!r} is not a connection, a vehicle or a mapping of vehicles")
+        self._attach_new()
+
+    @property
+    def vehicles(self) -> Mapping[int, Vehicle]:
+        self._attach_new()
+        return self._vehicles
+
+    def vehicle(self, system_id: int) -> Vehicle:
+        """Return the vehicle with this system id; raise HttpProblem 404 if there is none."""
+        found = self.vehicles.get(system_id)
+        if found is None:
+            known = ", ".join(map(str, self.vehicles)) or "none"
+            raise HttpProblem(
+                404, "NotHeard", f"no vehicle has system id {system_id} (vehicles: {known}); nothing was sent"
+            )
+        return found
+
+    def texts(self, system_id: int) -> list[dict[str, Any]]:
+        return list(self._texts.get(system_id, ()))
+
+    def snapshot(self) -> str:
+        """Return the current state of all vehicles, as a JSON ``state`` message of the stream."""
+        now = asyncio.get_running_loop().time()
+        if self._snapshot is None or now - self._snapshot[0] > SNAPSHOT_MAX_AGE_S:
+            vehicles = [_state_of(vehicle) for vehicle in self.vehicles.values()]
+            message = {"type": "state", "at_s": now, "vehicles": vehicles}
+            self._snapshot = now, json.dumps(message, ensure_ascii=False, allow_nan=False)
+        return self._snapshot[1]
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Call ``listener`` with each published message, until the returned function is called."""
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
+
+    def publish(self, message: dict[str, Any]) -> None:
+        """Number a message, and pass it to all listeners."""
+        self._count += 1
+        numbered = {**message, "number": self._count}
+        if message["type"] == "event":
+            self.events.append(numbered)
+        for listener in tuple(self._listeners):
+            listener(numbered)
+
+    async def aclose(self) -> None:
+        for detaches in self._attached.values():
+            for detach in detaches:
+                detach()
+        self._attached.clear()
+        await self._background.aclose()
+
+    async def _follow(self, connection: Connection) -> None:
+        async with vehicles_on(connection) as vehicles:
+            self._vehicles = vehicles
+            await asyncio.Event().wait()
+
+    def _attach_new(self) -> None:
+        for vehicle in self._vehicles.values():
+            if vehicle.connection not in self._attached:
+                self._attach(vehicle.connection)
+
+    def _attach(self, connection: Connection) -> None:
+        def on_event(event: Event) -> None:
+            if isinstance(event, LinkReport) or not (event.system_id == 0 or event.system_id in self._vehicles):
+                return
+            self._record(event, connection.unix_time() - (connection.now() - event.at))
+
+        self._attached[connection] = connection.attach([Event], on_event)
+
+    def _record(self, event: Event, unix_s: float) -> None:
+        if isinstance(event, StatusTextReceived):
+            texts = self._texts.setdefault(event.system_id, deque(maxlen=MAX_TEXTS))
+            texts.append({"time_unix_s": unix_s, "severity": event.severity, "text": event.text})
+        self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
+
+
+def _state_of(vehicle: Vehicle) -> dict[str, Any]:
+    """Return the overview of a vehicle, with mission items numbered like the mission.
+
+    The state ``mission_current`` is numbered as on the wire, where ArduPilot counts home as item 0.
+    """
+    mission = vehicle.mission
+    return {
+        **overview(vehicle),
+        "mission_item": mission.current.latest,
+        "mission_items": mission.count.latest,
+    }

@@ -1,0 +1,141 @@
+"""``LinkProbes``: TIMESYNC requests over each link to each vehicle, and requests for its hardware id over new links.
+
+https://mavlink.io/en/services/timesync.html, https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING
+
+from aerokit.connection.multilink.vehicle_clock import HardwareId
+from aerokit.events import DuplicateSender
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavComponent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from aerokit.connection.bus import Bus
+    from aerokit.connection.multilink.link_choice import Candidate, LinkChoice
+    from aerokit.mavlink.frame import Frame
+    from aerokit.mavlink.message import Message
+    from aerokit.transport.link import Peer
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+PROBE_INTERVAL_S = 0.5
+IDLE_COSTLY_PROBE_INTERVAL_S = 5.0
+TIMER_TOLERANCE_S = 0.05  # probe() is called ten times a second
+MAX_PENDING = 256
+
+# Probes per second to all systems without a vehicle object: forged system ids must not saturate a slow radio.
+UNATTACHED_RATE_HZ = 40.0
+
+_AUTOPILOT = int(MavComponent.AUTOPILOT1)
+
+
+class LinkProbes:
+    """Probes each link to a system twice a second, an idle costly link every five seconds.
+
+    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once until it stops.
+    ``send(message, peer)`` sends a probe.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        choices: Mapping[int, LinkChoice],
+        bus: Bus,
+        send: Callable[[Message, Peer], object],
+    ) -> None:
+        self._names, self._choices, self._bus, self._send = names, choices, bus, send
+        self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 → system, link, sent at
+        self._probed_at: dict[tuple[int, int], float] = {}
+        self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
+        self._reported: set[tuple[int, int]] = set()
+        bus.require_frames(m.Timesync, m.AutopilotVersion)
+
+    def probe(
+        self,
+        system_id: int,
+        choice: LinkChoice,
+        candidate: Candidate,
+        peer: Peer,
+        now: float,
+        *,
+        is_attached: bool,
+    ) -> None:
+        """Send a probe if one is due. ``is_attached``: the system has a vehicle object."""
+        is_idle = candidate.is_costly and candidate is not choice.used
+        is_new = not candidate.is_proven and not candidate.is_doubted
+        interval_s = IDLE_COSTLY_PROBE_INTERVAL_S if is_idle and not is_new else PROBE_INTERVAL_S
+        key = system_id, candidate.link
+        if now - self._probed_at.get(key, -math.inf) < interval_s - TIMER_TOLERANCE_S:
+            return
+        if not is_attached and not self._take_budget(now):
+            return
+        self._probed_at[key] = now
+        # Our time in nanoseconds; the last digits make it unique per system and link.
+        number = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
+        if number <= 0 or number in self._pending:
+            return
+        if len(self._pending) >= MAX_PENDING:
+            del self._pending[next(iter(self._pending))]
+        self._pending[number] = system_id, candidate.link, now
+        self._send(m.Timesync(0, number, target_system=system_id, target_component=_AUTOPILOT), peer)
+        if choice.should_request_hardware(candidate, is_attached=is_attached):
+            message_id = float(m.AutopilotVersion.ID)
+            request = m.CommandLong(system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, 0, message_id, 0, 0, 0, 0, 0, 0)
+            self._send(request, peer)
+
+    def is_answer(self, frame: Frame, link: int) -> bool:
+        """Return True if this TIMESYNC answers one of our probes, over any link, and record it."""
+        message = self._bus.dialect.decode(frame)
+        if not isinstance(message, m.Timesync) or not message.tc1 or message.ts1 not in self._pending:
+            return False
+        now = frame.received_at
+        round_trip_s = self._round_trip_of(message, frame.system_id, link, now)
+        choice = self._choices.get(frame.system_id)
+        if round_trip_s is not None and choice is not None and link in choice.candidates:
+            choice.record_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
+            self._report_doubt(frame, choice.candidates[link])
+        return True
+
+    def record_hardware(self, frame: Frame, link: int) -> None:
+        if frame.message_id != m.AutopilotVersion.ID or frame.component_id != _AUTOPILOT:
+            return
+        choice, message = self._choices.get(frame.system_id), self._bus.dialect.decode(frame)
+        if isinstance(message, m.AutopilotVersion) and choice is not None and link in choice.candidates:
+            choice.record_hardware(link, HardwareId.from_message(message))
+            for candidate in choice.candidates.values():
+                self._report_doubt(frame, candidate)
+
+    def _take_budget(self, now: float) -> bool:
+        self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
+        self._budget_at = now
+        if self._budget < 1:
+            return False
+        self._budget -= 1
+        return True
+
+    def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
+        """Return the seconds since the probe; None if it went to another system or over another link."""
+        if self._pending.get(answer.ts1, (0, 0, 0.0))[:2] != (system_id, link):
+            return None
+        return max(0.0, now - self._pending.pop(answer.ts1)[2])
+
+    def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
+        key = frame.system_id, candidate.link
+        if not candidate.is_doubted:
+            self._reported.discard(key)
+        elif key not in self._reported:
+            self._reported.add(key)
+            logger.warning(
+                "another vehicle with system id %d was received over %s (its %s differs): its frames are refused",
+                frame.system_id,
+                self._names[candidate.link],
+                "hardware id in AUTOPILOT_VERSION" if candidate.is_other_hardware else "clock",
+            )
+            self._bus.publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))

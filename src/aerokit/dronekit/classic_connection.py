@@ -1,0 +1,311 @@
+"""``ClassicConnection``: an open connection with the threads of the classic API, and its background calls."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import concurrent.futures
+import contextlib
+import functools
+import logging
+import threading
+import weakref
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from aerokit.connection.heartbeats import is_autopilot
+from aerokit.dronekit.exceptions import classic_errors
+from aerokit.dronekit.listener_thread import ListenerThread
+from aerokit.errors import AerokitError, CommandRejected, ConnectionClosed
+from aerokit.mavlink.messages import RcChannelsOverride
+
+if TYPE_CHECKING:
+    from aerokit.connection.connection import Connection
+    from aerokit.mavlink.message import Message
+    from aerokit.sync.loop_thread import LoopThread, OpenContext
+
+logger: logging.Logger = logging.getLogger("dronekit.mavlink")
+
+vehicle_logger: logging.Logger = logging.getLogger("dronekit")
+
+ORDERS_TIMEOUT_S = 2.0  # close() waits for the answers to recent orders
+
+SAME_KIND = {"disarm": "arm"}  # a newer order of either kind replaces the older one
+
+Work = Callable[..., Awaitable[object]]
+
+
+class ClassicConnection:
+    """An open connection, its event loop on a thread, and the thread of the program's callbacks."""
+
+    def __init__(
+        self,
+        address: str,
+        loop: LoopThread,
+        held: OpenContext[Connection],
+        target_system: int,
+        overrides: OverrideRelease,
+    ) -> None:
+        self.target_system = target_system
+        """System id of the vehicle, 0 until it is found."""
+        self.listener_thread: ListenerThread = ListenerThread()
+        self.listener_thread.on_called = loop.activity.feed
+        self.loop = loop
+        self._held = held
+        self.connection: Connection = held.value
+        """The asynchronous connection, for code that runs on its loop."""
+        self.calls: BackgroundCalls = BackgroundCalls(loop)
+        self.overrides = overrides
+        self.supports_mavlink_2 = False
+        """True once the vehicle has reported that it supports MAVLink 2, even if it still sends version 1."""
+        self.note_sent: Callable[[Message], None] = lambda message: None
+        """Called on the loop with each sent message, because it may be an order that overrules earlier ones."""
+        self.vehicle: Any = None
+        self._is_closed = threading.Event()
+        self._closing = threading.Lock()
+        self._at_close: list[Callable[[], object]] = []
+        self._at_exit = weak_callback(self.close)
+        atexit.register(self._at_exit)
+        loop.when_dropped(functools.partial(_on_dropped, address, self._at_exit, self.listener_thread, self._at_close))
+
+    def send(self, message: Message, *, to: int | None = None) -> None:
+        """Send a message, in the order of the calls, from any thread, without blocking.
+
+        InvalidArgument: a field is out of range; APIException: the connection is closed.
+        """
+        message.encode()  # raises here, in the caller, rather than on the loop
+        with classic_errors():
+            self.connection.raise_if_ended()
+            self.calls.post(self._send, message, to)
+
+    def _send(self, message: Message, to: int | None) -> None:
+        try:
+            self.connection.send(message, to=to)
+            self.overrides.note_sent(message)
+            self.note_sent(message)
+        except AerokitError as error:
+            logger.warning("%s was not sent: %s", message.NAME, error)
+
+    def close(self) -> None:
+        """Wait up to two seconds for answers to recent orders, then close the link and end the threads.
+
+        Idempotent. Can be called from any thread and callback, at interpreter exit, and after the link was lost.
+        """
+        with self._closing:
+            if self._is_closed.is_set():
+                return
+            self._is_closed.set()
+        atexit.unregister(self._at_exit)
+        try:
+            self.calls.wait(ORDERS_TIMEOUT_S)
+        finally:
+            self.listener_thread.stop()
+            try:
+                self._held.close()
+            finally:
+                self.loop.close()
+            self.listener_thread.join()
+            for function in self._at_close:
+                function()
+
+    def on_close(self, function: Callable[[], object]) -> None:
+        self._at_close.append(function)
+
+    def wait_closed(self, timeout: float) -> bool:
+        """Wait at most ``timeout`` seconds until :meth:`close` is called; return True if it was."""
+        return self._is_closed.wait(timeout)
+
+    @property
+    def is_closed(self) -> bool:
+        return self._is_closed.is_set()
+
+    def is_of_another_vehicle(self, system_id: int) -> bool:
+        """Return True if this system has an autopilot and is not the connected vehicle."""
+        heard = self.connection.heartbeats
+        return system_id != self.target_system and any(
+            source[0] == system_id and is_autopilot(heartbeat) for source, heartbeat in heard.items()
+        )
+
+    def match_mavlink_version(self, heartbeat: Message) -> None:
+        """Send the MAVLink version that the vehicle uses, because old firmware does not understand version 2."""
+        frame = heartbeat.received_frame
+        if frame is not None:
+            version = 2 if self.supports_mavlink_2 else frame.version
+            if version != self.connection.mavlink_version:
+                self.connection.mavlink_version = version
+
+
+def _on_dropped(
+    address: str,
+    at_exit: Callable[[], None],
+    listener_thread: ListenerThread,
+    at_close: list[Callable[[], object]],
+) -> None:
+    """Runs on the loop, which ends afterwards, when the connection was garbage collected."""
+    vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
+    atexit.unregister(at_exit)
+    listener_thread.stop()
+    for function in at_close:
+        function()
+
+
+class BackgroundCall(concurrent.futures.Future[None]):
+    """A call that runs on the loop in the background; a Future without a result."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self.kind = kind
+        self.task: asyncio.Task[None] | None = None
+
+
+class BackgroundCalls:
+    """Runs coroutine functions on the loop in the background, and logs each failure as a warning.
+
+    A newer call of a kind cancels the previous one. This class does not decide which commands may still be sent; the
+    vehicle's :class:`aerokit.vehicle.commanding.arbiter.CommandArbiter` does.
+    """
+
+    def __init__(self, loop: LoopThread) -> None:
+        self._loop = loop
+        self._newest: dict[str, BackgroundCall] = {}
+        self._pending: set[BackgroundCall] = set()
+        self.describe: Callable[[], str] | None = None
+        """Describes the vehicle's state in the warning about a rejected command."""
+
+    def start(self, kind: str, function: Work, *args: Any, **kwargs: Any) -> BackgroundCall:
+        """Start a call, from any thread, without blocking. First messages are sent in the order of these calls.
+
+        Raises ConnectionClosed if the connection was closed.
+        """
+        order = BackgroundCall(kind)
+        self._pending.add(order)
+        order.add_done_callback(self._pending.discard)
+        try:
+            self._loop.call_soon(self._begin, order, functools.partial(function, *args, **kwargs))
+        except ConnectionClosed:
+            order.cancel()
+            raise
+        return order
+
+    def cancel(self, order: BackgroundCall) -> None:
+        """Cancel a call, so that it sends nothing more. From any thread, without blocking."""
+        with contextlib.suppress(ConnectionClosed):
+            self._loop.call_soon(self._cancel, order)
+
+    def post(self, function: Callable[..., object], *args: Any) -> None:
+        """Call a function on the loop that neither blocks nor raises, in order with other calls."""
+        if self._loop.is_current:
+            function(*args)
+        else:
+            self._loop.call_soon(_call_after_tasks, function, *args)
+
+    def wait(self, timeout: float) -> None:
+        """Wait at most ``timeout`` seconds until all calls have ended."""
+        pending = self._pending.copy()
+        if pending and not self._loop.is_current:
+            concurrent.futures.wait(pending, timeout)
+
+    def _begin(self, order: BackgroundCall, work: Work) -> None:
+        kind = SAME_KIND.get(order.kind, order.kind)
+        if kind in self._newest:
+            self._cancel(self._newest[kind])
+        if order.set_running_or_notify_cancel():
+            name = f"dronekit {order.kind}"
+            order.task = asyncio.get_running_loop().create_task(self._run(order, work), name=name)
+            order.task.add_done_callback(lambda _: self._end(kind, order))
+            self._newest[kind] = order
+
+    def _cancel(self, order: BackgroundCall) -> None:
+        if order.task is not None and order in self._newest.values():
+            order.task.cancel()
+
+    def _end(self, kind: str, order: BackgroundCall) -> None:
+        if self._newest.get(kind) is order:
+            del self._newest[kind]
+        if not order.done():  # its task was cancelled
+            reason = "a newer order replaced it, it was cancelled, or the connection was closed"
+            order.set_exception(ConnectionClosed(f"{order.kind}: {reason}"))
+
+    async def _run(self, order: BackgroundCall, work: Work) -> None:
+        try:
+            await work()
+        except Exception as error:
+            if not isinstance(error, ConnectionClosed):
+                text = str(error)  # the exception itself would keep frames, and so the vehicle, alive
+                if isinstance(error, CommandRejected) and self.describe is not None:
+                    text += f" ({self.describe()})"  # a rejection rarely names its cause
+                vehicle_logger.warning("%s: %s", order.kind, text)
+            order.set_exception(error)
+        else:
+            order.set_result(None)
+
+
+def _call_after_tasks(function: Callable[..., object], *args: Any) -> None:
+    # In the next turn of the loop, so that calls started before have sent their first messages.
+    asyncio.get_running_loop().call_soon(function, *args)
+
+
+def weak_callback(method: Callable[..., object]) -> Callable[..., None]:
+    """Return a function that calls a bound method without keeping its object alive."""
+    bound: Any = method
+    owner, function = weakref.ref(bound.__self__), bound.__func__
+
+    def call(*args: object) -> None:
+        present = owner()
+        if present is not None:
+            function(present, *args)
+
+    return call
+
+
+IGNORE = 0xFFFF
+RELEASE = 0
+RELEASE_UPPER = 0xFFFE  # releases a channel above 8, for which 0 means "ignore"
+
+CHANNELS_OF_MAVLINK_1 = 8
+CHANNELS = 18
+
+RELEASE_COPIES = 3  # not acknowledged, and frames get lost
+
+
+class OverrideRelease:
+    """The channels that this connection overrides, by target; releases them when it ends.
+
+    https://mavlink.io/en/messages/common.html#RC_CHANNELS_OVERRIDE
+    """
+
+    is_enabled: bool
+
+    def __init__(self) -> None:
+        self.is_enabled = True
+        self._overridden: dict[tuple[int, int], set[int]] = {}
+
+    def note_sent(self, message: Message) -> None:
+        """Record the channels of a sent RC_CHANNELS_OVERRIDE; ignores other messages."""
+        if not isinstance(message, RcChannelsOverride):
+            return
+        target = message.target_system, message.target_component
+        overridden = self._overridden.setdefault(target, set())
+        for channel in range(1, CHANNELS + 1):
+            value = getattr(message, f"chan{channel}_raw")
+            is_upper = channel > CHANNELS_OF_MAVLINK_1
+            if value == (RELEASE_UPPER if is_upper else RELEASE):
+                overridden.discard(channel)
+            elif value not in (IGNORE, RELEASE):
+                overridden.add(channel)
+
+    def send(self, connection: Connection) -> None:
+        """Release overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
+        for (system, component), channels in self._overridden.items():
+            if self.is_enabled and channels:
+                values = [_released(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
+                message = RcChannelsOverride(system, component, *values)
+                with contextlib.suppress(AerokitError):  # the link may be closed
+                    for _ in range(RELEASE_COPIES):
+                        connection.send(message)
+
+
+def _released(channel: int, is_overridden: bool) -> int:
+    if channel > CHANNELS_OF_MAVLINK_1:
+        return RELEASE_UPPER if is_overridden else 0
+    return RELEASE if is_overridden else IGNORE

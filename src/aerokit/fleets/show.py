@@ -1,0 +1,190 @@
+"""``Show``: timed trajectories of several vehicles, and their files. Without IO to vehicles.
+
+Two file formats, both with seconds, and metres north, east and up of the show's origin:
+
+- CSV: the header ``name,t_s,north_m,east_m,up_m``, then one line for each point; names may be in any order;
+- JSON: ``{"format": "aerokit show", "version": 1, "tracks": {"name": [[t_s, north_m, east_m, up_m], …], …}}``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.files import read_bounded, write_atomically
+from aerokit._internal.values import Snapshot
+from aerokit.errors import FileFormatError, InvalidArgument
+from aerokit.fleets.paths import LocalPoint, Path, PathPoint
+from aerokit.fleets.separation import Conflict, find_conflicts
+
+if TYPE_CHECKING:
+    import os
+
+    from typing_extensions import Self
+
+__all__ = ["Show", "state_at"]
+
+COLUMNS = ["name", "t_s", "north_m", "east_m", "up_m"]
+
+FORMAT, VERSION = "aerokit show", 1
+
+
+class Show(Snapshot):
+    """Trajectories by name. All times are seconds since the common start."""
+
+    tracks: Mapping[str, Path]
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds until the last trajectory ends."""
+        return max(each.ends_at_s for each in self.tracks.values())
+
+    def top_speed_m_s(self, name: str) -> float:
+        """Return the speed of the fastest leg of one track, in m/s."""
+        legs = pairwise(self.tracks[name].points)
+        return max((_speed(one, other) for one, other in legs), default=0.0)
+
+    def conflicts(self, min_distance_m: float, *, slack_s: float = 0.5) -> tuple[Conflict, ...]:
+        """Return all pairs of tracks that come closer than ``min_distance_m``.
+
+        Args:
+            min_distance_m: metres.
+            slack_s: how early or late one vehicle may be relative to another, in seconds.
+        """
+        return find_conflicts(list(self.tracks.values()), min_distance_m, slack_s=slack_s)
+
+    def renamed(self, names: Mapping[str, str]) -> Self:
+        """Return the show with other names: name in the show → name of the fleet member.
+
+        Raises:
+            InvalidArgument: a name is missing, or two tracks get the same name.
+        """
+        missing = [name for name in self.tracks if name not in names]
+        if missing or len(set(names.values())) < len(self.tracks):
+            raise InvalidArgument(f"names: {missing or 'one member for two tracks'}: each track needs its own member")
+        return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
+
+    @classmethod
+    def from_points(cls, tracks: Mapping[str, Any]) -> Self:
+        """Make a show from points ``(t_s, north_m, east_m, up_m)`` for each name.
+
+        Raises:
+            InvalidArgument: a point is not four numbers, or times decrease.
+        """
+        parsed: dict[str, Path] = {}
+        for name, points in tracks.items():
+            try:
+                parsed[name] = Path(name, [PathPoint(*map(float, each)) for each in points])
+            except (TypeError, ValueError) as error:
+                raise InvalidArgument(f"track {name!r}: {error}") from None
+        return cls(parsed)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a CSV or JSON file; the content decides which.
+
+        Raises:
+            FileFormatError: the file is neither, or damaged; the text names the line or the track.
+            OSError: the file cannot be read.
+        """
+        text = read_bounded(path).decode("utf-8-sig", errors="replace")
+        try:
+            return cls.from_json(text) if text.lstrip().startswith("{") else cls.from_csv(text)
+        except InvalidArgument as error:
+            raise FileFormatError(f"{path}: {error}") from None
+
+    @classmethod
+    def from_csv(cls, text: str) -> Self:
+        """Parse CSV text in the format above.
+
+        Raises:
+            InvalidArgument: the text is not in this format; the error names the line.
+        """
+        rows = csv.reader(io.StringIO(text))
+        if [each.strip() for each in next(rows, [])] != COLUMNS:
+            raise InvalidArgument(f"line 1 is not {','.join(COLUMNS)}")
+        points: dict[str, list[PathPoint]] = {}
+        for row in rows:
+            if not row:
+                continue
+            try:
+                name, *numbers = row
+                t_s, north_m, east_m, up_m = map(float, numbers)
+                points.setdefault(name, []).append(PathPoint(t_s, north_m, east_m, up_m))
+            except ValueError as error:
+                raise InvalidArgument(f"line {rows.line_num}: {error}") from None
+        return cls({name: Path(name, each) for name, each in points.items()})
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Parse JSON text in the format above.
+
+        Raises:
+            InvalidArgument: the text is not in this format; the error names the track.
+        """
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InvalidArgument(f"not JSON: {error}") from None
+        tracks = data.get("tracks") if isinstance(data, dict) else None
+        if not isinstance(tracks, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
+            raise InvalidArgument(f"not {FORMAT!r} of version {VERSION}")
+        return cls.from_points(tracks)
+
+    def to_csv(self) -> str:
+        """Return the show as CSV text."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for name, track in self.tracks.items():
+            writer.writerows([name, each.t_s, *each.place] for each in track.points)
+        return out.getvalue()
+
+    def to_json(self) -> str:
+        """Return the show as JSON text."""
+        tracks = {name: [[each.t_s, *each.place] for each in track.points] for name, track in self.tracks.items()}
+        return json.dumps({"format": FORMAT, "version": VERSION, "tracks": tracks})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a file: JSON if its name ends in ``.json``, otherwise CSV. Raises OSError."""
+        write_atomically(path, self.to_json() if str(path).lower().endswith(".json") else self.to_csv())
+
+    def _check(self) -> None:
+        object.__setattr__(self, "tracks", dict(self.tracks))
+        if not self.tracks:
+            raise InvalidArgument("tracks: a show needs at least one")
+        for name, track in self.tracks.items():
+            if not isinstance(track, Path) or track.begins_at_s < 0:
+                raise InvalidArgument(f"tracks: {name!r} needs a Path that begins at 0 s or later")
+            for one, other in pairwise(track.points):
+                if not _speed(one, other) < math.inf:
+                    raise InvalidArgument(f"tracks: {name!r} has two positions at {other.t_s:g} s")
+
+
+def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
+    """Return position and velocity on a path at a time, as metres and m/s north, east and up."""
+    points = path.points
+    after = bisect_right(points, at_s, key=_time_of)
+    if after == 0 or after == len(points):
+        return points[min(after, len(points) - 1)].place, (0.0, 0.0, 0.0)
+    one, other = points[after - 1], points[after]
+    lasts = other.t_s - one.t_s
+    share = (at_s - one.t_s) / lasts
+    way = [b - a for a, b in zip(one.place, other.place, strict=True)]
+    place = tuple(a + share * d for a, d in zip(one.place, way, strict=True))
+    return place, (way[0] / lasts, way[1] / lasts, way[2] / lasts)  # type: ignore[return-value]
+
+
+def _time_of(point: PathPoint) -> float:
+    return point.t_s
+
+
+def _speed(one: PathPoint, other: PathPoint) -> float:
+    way, lasts = math.dist(one.place, other.place), other.t_s - one.t_s
+    return way / lasts if lasts > 0 else (math.inf if way > 0 else 0.0)

@@ -1,0 +1,419 @@
+"""``Shows``: flies the trajectories of a show on a common clock, and reports the deviations.
+
+The clocks of the vehicles are measured with TIMESYNC (https://mavlink.io/en/services/timesync.html).
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from itertools import combinations, pairwise
+from typing import TYPE_CHECKING
+
+import anyio
+
+from aerokit._internal.arguments import check_range, checks_arguments
+from aerokit._internal.formatting import short_repr
+from aerokit._internal.values import Snapshot
+from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout, StaleValueError
+from aerokit.fleets.distances import LocalOrigin, altitude_amsl
+from aerokit.fleets.formation import follow_velocity
+from aerokit.fleets.members import Member
+from aerokit.fleets.policy import FleetResult
+from aerokit.fleets.separation import METRES_PER_DEGREE
+from aerokit.fleets.show import Show, state_at
+from aerokit.fleets.travel import Travel
+from aerokit.mavlink.messages import GlobalPositionInt, Timesync
+from aerokit.position import Position
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from typing_extensions import Self
+
+    from aerokit.connection.bus import Detach
+    from aerokit.fleets.paths import LocalPoint, Path
+    from aerokit.vehicle.vehicle import Vehicle
+
+__all__ = [
+    "ClockOffset",
+    "ShowReport",
+    "TrackDeviation",
+    "max_relative_error",
+    "measure_clock",
+    "track_deviation",
+]
+
+# Correction speed per metre of deviation from the track, in 1/s.
+TRACK_GAIN = 0.8
+
+# Speed limit while catching up: this factor of the track's speed, plus this many m/s.
+CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
+
+CONFLICT_SLACK_S = 0.5
+
+POSITION_MAX_AGE_S = 2.0
+
+
+# ------------------------------------------------------------------------------------------ clocks
+
+TIMESYNC_INTERVAL_S = 0.1
+TIMESYNC_TIMEOUT_S = 2.0
+
+# If `time_boot_ms` differs more than this from the arrival, it does not use the clock that TIMESYNC measured.
+MAX_CLOCK_ERROR_S = 1.0
+
+
+class ClockOffset(Snapshot):
+    """A vehicle's clock minus the event loop's clock.
+
+    Accurate to half of ``round_trip_s``, the shortest of ``answers`` round trips.
+    """
+
+    offset_s: float
+    round_trip_s: float
+    answers: int
+
+    def to_local_time(self, vehicle_time_s: float) -> float:
+        """Convert a time on the vehicle's clock to the event loop's clock."""
+        return vehicle_time_s - self.offset_s
+
+
+async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
+    """Measure a vehicle's clock with several TIMESYNC requests; the answer with the shortest round trip counts.
+
+    Raises:
+        OperationTimeout: no request was answered.
+        ConnectionClosed, LinkLost: the connection ended.
+    """
+    connection = vehicle.connection
+    sent: dict[int, float] = {}
+    found: list[tuple[float, float]] = []
+
+    def on_timesync(message: Timesync) -> None:
+        frame = message.received_frame
+        sent_at = sent.pop(message.ts1, None)
+        if frame is None or sent_at is None or message.tc1 == 0 or frame.component_id != vehicle.component_id:
+            return
+        round_trip_s = frame.received_at - sent_at
+        found.append((round_trip_s, message.tc1 / 1e9 - (sent_at + round_trip_s / 2)))
+
+    detach = connection.bus.attach(Timesync, on_timesync, system_id=vehicle.system_id)
+    try:
+        for _ in range(requests):
+            now = connection.now()
+            timestamp = int(now * 1e9) | 1  # odd, unlike the timestamps of the link's own requests
+            sent[timestamp] = now
+            connection.send(Timesync(0, timestamp), to=vehicle.system_id)
+            await anyio.sleep(TIMESYNC_INTERVAL_S)
+        deadline = connection.now() + TIMESYNC_TIMEOUT_S
+        while sent and not found and connection.now() < deadline:
+            connection.raise_if_ended()
+            await anyio.sleep(TIMESYNC_INTERVAL_S)
+    finally:
+        detach()
+    if not found:
+        raise OperationTimeout(f"TIMESYNC was not answered; {vehicle.describe_link()}")
+    round_trip_s, offset_s = min(found)
+    return ClockOffset(offset_s, round_trip_s, len(found))
+
+
+# ------------------------------------------------------------------------------------------ report
+
+# On slower legs a lag cannot be distinguished from a position error.
+MIN_LAG_SPEED_M_S = 0.3
+
+RELATIVE_ERROR_SAMPLES = 60
+
+
+class TrackDeviation(Snapshot):
+    """Deviation of one member from its track: maximum and root mean square in metres, and lag in seconds.
+
+    ``lag_s`` is the delay that explains most of the deviation (negative: early); None if the member hardly moved.
+    """
+
+    max_m: float
+    rms_m: float
+    lag_s: float | None
+    samples: int
+
+
+class ShowReport(Snapshot):
+    """Result of a show. Times are of the vehicles' own clocks, converted with ``clocks``.
+
+    ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
+    error of the vector between any two members. Both are None if unknown.
+    """
+
+    result: FleetResult
+    tracks: Mapping[str, TrackDeviation]
+    clocks: Mapping[str, ClockOffset]
+    lag_spread_s: float | None
+    max_relative_error_m: float | None
+
+
+def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
+    """Compare positions, given with seconds of the show, with a path.
+
+    The lag is the time shift of the path that fits the samples best (least squares along the track).
+    """
+    errors: list[float] = []
+    along = moved = 0.0
+    for at_s, point in samples:
+        planned, velocity = state_at(path, at_s)
+        error = [p - q for p, q in zip(planned, point, strict=True)]
+        errors.append(math.hypot(*error))
+        if math.hypot(*velocity) >= MIN_LAG_SPEED_M_S:
+            along += sum(e * v for e, v in zip(error, velocity, strict=True))
+            moved += sum(v * v for v in velocity)
+    if not errors:
+        return TrackDeviation(math.nan, math.nan, None, 0)
+    rms = math.sqrt(sum(each * each for each in errors) / len(errors))
+    return TrackDeviation(max(errors), rms, along / moved if moved else None, len(errors))
+
+
+def max_relative_error(
+    paths: Mapping[str, Path], samples: Mapping[str, Sequence[tuple[float, LocalPoint]]], duration_s: float
+) -> float | None:
+    """Return the largest error of the vector between two vehicles, in metres; None for fewer than two vehicles.
+
+    Evaluated at 60 times of the show, with positions interpolated between samples.
+    """
+    worst: float | None = None
+    for number in range(RELATIVE_ERROR_SAMPLES + 1):
+        at_s = duration_s * number / RELATIVE_ERROR_SAMPLES
+        errors: list[LocalPoint] = []
+        for name, path in paths.items():
+            here = _interpolate(samples.get(name, ()), at_s)
+            if here is not None:
+                planned = state_at(path, at_s)[0]
+                errors.append((planned[0] - here[0], planned[1] - here[1], planned[2] - here[2]))
+        if len(errors) > 1:
+            worst = max(worst or 0.0, max(math.dist(one, other) for one, other in combinations(errors, 2)))
+    return worst
+
+
+def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
+    for (before, one), (after, other) in pairwise(samples):
+        if before <= at_s <= after:
+            share = 0.0 if after == before else (at_s - before) / (after - before)
+            return (
+                one[0] + share * (other[0] - one[0]),
+                one[1] + share * (other[1] - one[1]),
+                one[2] + share * (other[2] - one[2]),
+            )
+    return None
+
+
+# ------------------------------------------------------------------------------------------ flight
+
+
+class TrackRecorder:
+    """Records each GLOBAL_POSITION_INT in its block as seconds of the show and metres from its origin.
+
+    Uses the vehicle's own time (``time_boot_ms``) with its measured clock, or the time of arrival if that is
+    implausible.
+    """
+
+    def __init__(self, vehicle: Vehicle, clock: ClockOffset, origin: LocalOrigin, begin: float, base_m: float) -> None:
+        self._vehicle, self._clock, self._begin, self._base_m = vehicle, clock, begin, base_m
+        position = origin.to_position((0.0, 0.0, base_m))
+        self._latitude, self._longitude = position.latitude_deg, position.longitude_deg
+        self._north_m, self._east_m = _metres_per_degree(origin, self._latitude, self._longitude)
+        self.samples: list[tuple[float, LocalPoint]] = []  # from the start of the show
+        self._latest: tuple[float, LocalPoint, LocalPoint] | None = None
+        self._detach: Detach | None = None
+
+    def __enter__(self) -> Self:
+        bus = self._vehicle.connection.bus
+        self._detach = bus.attach(GlobalPositionInt, self._on_message, system_id=self._vehicle.system_id)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._detach is not None:
+            self._detach()
+
+    @property
+    def has_position(self) -> bool:
+        return self._latest is not None
+
+    def extrapolated_position(self) -> LocalPoint:
+        """Return the latest position, extrapolated to now by its velocity.
+
+        Raises:
+            StaleValueError: it is older than two seconds.
+        """
+        now = self._vehicle.connection.now()
+        if self._latest is None or now - self._latest[0] > POSITION_MAX_AGE_S:
+            raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
+        at, place, velocity = self._latest
+        age = now - at
+        return place[0] + age * velocity[0], place[1] + age * velocity[1], place[2] + age * velocity[2]
+
+    def _on_message(self, message: GlobalPositionInt) -> None:
+        frame = message.received_frame
+        if frame is None or frame.component_id != self._vehicle.component_id:
+            return
+        at = self._clock.to_local_time(message.time_boot_ms / 1000)
+        if abs(at - frame.received_at) > MAX_CLOCK_ERROR_S:
+            at = frame.received_at
+        place = (
+            (message.lat / 1e7 - self._latitude) * self._north_m,
+            math.remainder(message.lon / 1e7 - self._longitude, 360.0) * self._east_m,
+            message.alt / 1000 - self._base_m,
+        )
+        self._latest = at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
+        if at >= self._begin:
+            self.samples.append((at - self._begin, place))
+
+
+def _metres_per_degree(origin: LocalOrigin, latitude: float, longitude: float) -> tuple[float, float]:
+    """Return metres per degree of latitude and of longitude. Accurate within some hundred metres."""
+    step = 1e-3
+    north = origin.to_local(Position(min(latitude + step, 90.0), longitude), 0.0)[0] / step
+    east = origin.to_local(Position(latitude, longitude + step), 0.0)[1] / step
+    return north or METRES_PER_DEGREE, east
+
+
+@checks_arguments
+class Shows(Travel):
+    """Trajectories on a common clock."""
+
+    def show_start_positions(self, show: Show, origin: Position) -> dict[str, Position]:
+        """Return the position of each member at the start of a show.
+
+        Args:
+            show: the trajectories.
+            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
+                member's home.
+
+        Raises:
+            InvalidArgument: a track has no member.
+            ValueUnknownError: the position of the first member is unknown.
+        """
+        return self._start_positions(show, *self._local_origin(show, origin))
+
+    async def fly_show(
+        self,
+        show: Show,
+        origin: Position,
+        *,
+        rate_hz: float = 5.0,
+        start_in_s: float = 5.0,
+        lead_s: float | None = 0.3,
+        speed_m_s: float | None = None,
+    ) -> ShowReport:
+        """Fly a show: all members fly to their first points, start at the same instant, and hold at the end.
+
+        The members have to be in the air. Their clocks are measured with TIMESYNC, so that delayed telemetry does not
+        count as deviation. If a member fails, the fleet's policy decides about the others, as in any action.
+
+        Args:
+            show: tracks by member's name; :meth:`Show.renamed` assigns tracks to members.
+            origin: origin of the show's metres; without an altitude above sea level it is at the altitude of the first
+                member's home.
+            rate_hz: set-points per second for each member, 2 to 50.
+            start_in_s: seconds from the arrival of the last member at its first point to the start.
+            lead_s: seconds by which velocities are sent ahead of the track, to compensate for the vehicles' reaction
+                time (``lag_s`` in the report); None: 0.
+            speed_m_s: ground speed to the first points; None: unchanged.
+
+        Raises:
+            InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
+            OperationRejected: tracks come too close, or a member is unavailable. Nothing was sent.
+            FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
+            ValueUnknownError: the position of a member is unknown.
+        """
+        check_range("rate_hz", rate_hz, 2, 50)
+        local_origin, base_m = self._local_origin(show, origin)
+        self._check_show(show)
+        names = tuple(show.tracks)
+        clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
+        clocks.raise_for_errors()
+        arrived = await self.go_to(self._start_positions(show, local_origin, base_m), speed_m_s=speed_m_s)
+        arrived.raise_for_errors()
+        begin = self._context.now() + start_in_s
+        with ExitStack() as stack:
+            recorders = {
+                name: stack.enter_context(
+                    TrackRecorder(self.members[name].vehicle, clocks[name], local_origin, begin, base_m)
+                )
+                for name in names
+            }
+
+            async def fly(member: Member) -> None:
+                track, recorder = show.tracks[member.name], recorders[member.name]
+                await _fly_track(member, track, recorder, begin, rate_hz, lead_s or 0.0)
+
+            result = await self._run("show", fly, names=names)
+        samples = {name: recorder.samples for name, recorder in recorders.items()}
+        tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
+        lags = [each.lag_s for each in tracks.values() if each.lag_s is not None]
+        offsets = {name: each for name, each in clocks.items() if isinstance(each, ClockOffset)}
+        spread_s = max(lags) - min(lags) if lags else None
+        relative_m = max_relative_error(show.tracks, samples, show.duration_s)
+        return ShowReport(result, tracks, offsets, spread_s, relative_m)
+
+    # --------------------------------------------------------------------------------------- private
+
+    def _local_origin(self, show: Show, origin: Position) -> tuple[LocalOrigin, float]:
+        """Return the origin and its altitude above sea level."""
+        for name in show.tracks:
+            if name not in self.members:
+                raise InvalidArgument(f"show: {short_repr(name)} is not one of {', '.join(self.members)}")
+        first = self.members[next(iter(show.tracks))]
+        if origin.altitude_amsl_m is not None:
+            return LocalOrigin(origin), origin.altitude_amsl_m
+        home = origin.replace(altitude_relative_m=origin.altitude_relative_m or 0.0)
+        return LocalOrigin(origin), altitude_amsl(first, home)
+
+    @staticmethod
+    def _start_positions(show: Show, origin: LocalOrigin, base_m: float) -> dict[str, Position]:
+        starts = {name: track.points[0] for name, track in show.tracks.items()}
+        return {
+            name: origin.to_position((start.north_m, start.east_m, start.up_m + base_m))
+            for name, start in starts.items()
+        }
+
+    def _check_show(self, show: Show) -> None:
+        for name in show.tracks:
+            member = self.members[name]
+            member.refresh()
+            if not member.is_available:
+                raise OperationRejected(f"fly_show: {name} is {member.status}; nothing was sent")
+        min_m = self._context.min_distance_m
+        conflicts = () if min_m is None else show.conflicts(min_m, slack_s=CONFLICT_SLACK_S)
+        if conflicts:
+            first = conflicts[0]
+            more = f" (and {len(conflicts) - 1} more pairs)" if len(conflicts) > 1 else ""
+            raise OperationRejected(
+                f"fly_show: {first.name} and {first.other} come within {first.distance_m:.1f} m of each other{more},"
+                f" closer than the minimum of {min_m:g} m; nothing was sent"
+            )
+
+
+async def _fly_track(
+    member: Member, path: Path, recorder: TrackRecorder, begin: float, rate_hz: float, lead_s: float
+) -> None:
+    vehicle, period_s = member.vehicle, 1 / rate_hz
+    with vehicle._session.streaming("position"):
+        async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
+            while (at_s := vehicle.connection.now() - begin) < path.ends_at_s:
+                if at_s >= 0 or recorder.has_position:
+                    stream.set(_setpoint(path, at_s, lead_s, recorder.extrapolated_position()))
+                else:
+                    stream.set(VelocitySetpoint())
+                await anyio.sleep(period_s)
+
+
+def _setpoint(path: Path, at_s: float, lead_s: float, here: LocalPoint) -> VelocitySetpoint:
+    planned, velocity = state_at(path, at_s)[0], state_at(path, at_s + lead_s)[1]
+    speed = math.hypot(*velocity)
+    north, east, up = follow_velocity(
+        (planned[0] - here[0], planned[1] - here[1], planned[2] - here[2]),
+        velocity,
+        gain=TRACK_GAIN,
+        max_speed_m_s=max(CATCH_UP_FACTOR * speed, CATCH_UP_M_S) + CATCH_UP_M_S,
+    )
+    return VelocitySetpoint(north, east, -up)

@@ -1,0 +1,159 @@
+"""Log records in sequence, each with the vehicle states that it changes; input of converters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from aerokit._internal.values import Snapshot
+from aerokit.connection.heartbeats import is_autopilot
+from aerokit.errors import FileFormatError
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import Heartbeat
+from aerokit.mavlink.tlog import read_tlog
+from aerokit.vehicle.state.states import SOURCES
+from aerokit.vehicle.state.telemetry import Telemetry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+
+    from aerokit.mavlink.message import Message
+
+
+_KINDS = {"float": "float", "double": "float", "uint64_t": "uint"}
+_UNITS = {"%": "percent", "c%": "centipercent", "d%": "decipercent", "m/s/s": "m_s2", "m/s^2": "m_s2"}
+
+
+class TableColumn(Snapshot):
+    """A column of a table: its name with the unit, the field, and ``kind``: float, int, uint, str, bool or time."""
+
+    name: str
+    field: str
+    kind: str
+
+
+class LogRecord(Snapshot):
+    """One record of a log: a MAVLink message, or a row of a flight controller's own log."""
+
+    unix_s: float
+    """UTC, in seconds since 1970."""
+    system_id: int
+    component_id: int
+    table: str
+    """``GPS_RAW_INT`` in a ``.tlog``, ``GPS`` in a ``.bin``, ``vehicle_gps_position`` in a ``.ulg``."""
+    fields: Mapping[str, Any]
+    states: tuple[tuple[str, Any], ...]
+    """Names and values of the states that it changes, as in docs/states.md."""
+    message: Message | None = None
+
+
+class LogReader:
+    """Reads a log once. ``notes`` lists problems found so far."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: list[str] = []
+
+    def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
+        """Yield all records in order; ``on_bytes(read)`` is called from time to time."""
+        raise NotImplementedError
+
+    def columns(self, entry: LogRecord) -> list[TableColumn]:
+        """Return the columns of the table of a record."""
+        raise NotImplementedError
+
+
+def unit_suffix(name: str, unit: str) -> str:
+    """Append the unit to a name that does not have it: ``alt`` in mm becomes ``alt_mm``."""
+    suffix = _UNITS.get(unit, unit).replace("/", "_").replace("*", "").replace("^", "")
+    suffix = "".join(character for character in suffix if character.isalnum() or character == "_")
+    return name if not suffix or name.lower().endswith(f"_{suffix.lower()}") else f"{name}_{suffix}"
+
+
+class TlogReader(LogReader):
+    """Reads a ``.tlog`` of a ground station."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._vehicles: dict[int, _VehicleStates] = {}
+        self._framer = Framer()
+
+    def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
+        """Yield all messages of the standard with valid checksums."""
+        framer, decode, count = self._framer, STANDARD.decode, 0
+        with self.path.open("rb") as file:
+            for unix_s, raw in read_tlog(file):
+                count += 1
+                if not count & 0xFFF:
+                    on_bytes(file.tell())
+                for frame in framer.receive(raw, unix_s):
+                    message = decode(frame)
+                    states = self._states(frame.system_id, frame.component_id, unix_s, message)
+                    yield LogRecord(unix_s, frame.system_id, frame.component_id, message.NAME, {}, states, message)
+            on_bytes(file.tell())
+        self._note(count)
+
+    def columns(self, entry: LogRecord) -> list[TableColumn]:
+        """Return the fields in the standard's order and units; an array has one column for each element."""
+        assert entry.message is not None
+        found = []
+        for field in entry.message.FIELDS:
+            name = unit_suffix(field.name, field.units)
+            kind = _KINDS.get(field.type, "int")
+            if field.is_text or (field.array_length and field.type in ("uint8_t", "char")):
+                found.append(TableColumn(name, field.name, "str"))
+            elif field.array_length:
+                indices = range(field.array_length)
+                found += [TableColumn(f"{name}_{i}", f"{field.name}.{i}", kind) for i in indices]
+            else:
+                found.append(TableColumn(name, field.name, kind))
+        return found
+
+    def _states(
+        self, system_id: int, component_id: int, unix_s: float, message: Message
+    ) -> tuple[tuple[str, Any], ...]:
+        vehicle = self._vehicles.get(system_id)
+        if vehicle is None:
+            if not isinstance(message, Heartbeat) or not is_autopilot(message):
+                return ()
+            vehicle = self._vehicles[system_id] = _VehicleStates(system_id, component_id)
+        return vehicle.update(unix_s, message) if vehicle.component_id == component_id else ()
+
+    def _note(self, records: int) -> None:
+        if not records:
+            raise FileFormatError(f"{self.path} contains no MAVLink messages: it is not a .tlog, or it is empty")
+        counted = self._framer.statistics
+        if not counted.frames:
+            raise FileFormatError(f"{self.path} contains no MAVLink message with a valid checksum")
+        if counted.bad_crcs:
+            self.notes.append(f"{counted.bad_crcs} of {records} messages are damaged and were skipped")
+        if counted.unknown_ids:
+            self.notes.append(f"{counted.unknown_ids} messages of an unknown dialect were skipped")
+
+
+class _VehicleStates:
+    """Decodes the states of one vehicle with the decoders of live vehicles."""
+
+    def __init__(self, system_id: int, component_id: int) -> None:
+        self.component_id = component_id
+        self._now = 0.0
+        self._telemetry = Telemetry(lambda: self._now, system_id=system_id, component_id=component_id)
+        self._names: dict[str, tuple[str, ...]] = {
+            name: tuple(field.name for field, _ in rows) for name, rows in SOURCES.items()
+        }
+        self._expired_at = 0.0
+
+    def update(self, unix_s: float, message: Message) -> tuple[tuple[str, Any], ...]:
+        self._now = now = max(unix_s, self._now + 1e-6)  # the clock may have been set back
+        telemetry = self._telemetry
+        names = self._names.get(type(message).__name__, ())
+        if names:
+            if message.received_frame is not None:
+                message.received_frame.received_at = now
+            telemetry.receive(message)
+        if now - self._expired_at > 1.0:
+            telemetry.expire(now)
+            self._expired_at, names = now, (*names, "status_text")
+        cells = telemetry.cells
+        return tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)

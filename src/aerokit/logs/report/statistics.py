@@ -1,0 +1,277 @@
+"""Statistics of a flight, for its summary and for comparisons."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from datetime import datetime, timezone
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from aerokit._internal.values import Snapshot
+from aerokit.logs.flights.failsafes import failsafes
+from aerokit.logs.flights.flight import TangentPlane
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from aerokit.logs.flights.flight import FlightLog, TimeSeries
+
+# Shorter steps are noise of a stationary vehicle.
+_STEP_M = 1.0
+_A_YEAR_S = 365 * 86_400.0
+
+
+class FlightStatistics(Snapshot):
+    """Statistics of the time while the vehicle was armed, or of the whole log if it never was; None is unknown."""
+
+    armed_s: float | None
+    distance_m: float | None
+    """Length of the track over ground."""
+    max_height_m: float | None
+    """Above home."""
+    max_distance_m: float | None
+    """Horizontal distance from home."""
+    max_speed_m_s: float | None
+    """Over ground."""
+    max_climb_m_s: float | None
+    max_descent_m_s: float | None
+    max_tilt_deg: float | None
+    """Maximum of roll and pitch."""
+    end_distance_m: float | None
+    """Distance from home at the end."""
+    start_voltage_v: float | None
+    """Of the first battery, like the following."""
+    end_voltage_v: float | None
+    min_voltage_v: float | None
+    start_remaining_percent: float | None
+    end_remaining_percent: float | None
+    max_current_a: float | None
+    min_satellites: float | None
+    max_hdop: float | None
+    max_vibration_m_s2: float | None
+    clips: float | None
+    """Count of accelerometer clipping."""
+    max_estimator_ratio: float | None
+    """Above 1, the estimator rejects a measurement."""
+    lost_percent: float | None
+    """Percentage of lost messages."""
+
+
+def statistics_of(flight: FlightLog) -> FlightStatistics:
+    spans = _ArmedSpans(flight)
+    north_east = metres_from_home(flight)
+    rows = list(spans.rows(flight.track))
+    away = [math.hypot(*north_east[row]) for row in rows] if north_east else []
+    speeds = [
+        math.hypot(flight.velocity["north_m_s"][row], flight.velocity["east_m_s"][row])
+        for row in spans.rows(flight.velocity)
+    ]
+    downs = spans.known(flight.velocity, "down_m_s")
+    tilts = [abs(x) for name in ("roll_deg", "pitch_deg") for x in spans.known(flight.attitude, name)]
+    volts, left, amps = (_battery(flight, spans, name) for name in ("voltage_v", "remaining_percent", "current_a"))
+    first_gps = next((flight.gps[number] for number in sorted(flight.gps)), None)
+    satellites = [] if first_gps is None else spans.known(first_gps, "satellites")
+    hdops = [] if first_gps is None else spans.known(first_gps, "hdop")
+    levels = [x for axis in "xyz" for x in spans.known(flight.vibration, f"{axis}_m_s2")]
+    clips = spans.known(flight.vibration, "clips")
+    ratios = [x for name in flight.estimator for x in spans.known(flight.estimator, name)]
+    lost = spans.known(flight.link, "lost_percent")
+    return FlightStatistics(
+        armed_s=sum(end - begin for begin, end in flight.armed) if flight.armed else None,
+        distance_m=_path_length(north_east, rows) if north_east else None,
+        max_height_m=_max(spans.known(flight.track, "altitude_relative_m")),
+        max_distance_m=_max(away),
+        max_speed_m_s=_max(speeds),
+        max_climb_m_s=_max([-down for down in downs]),
+        max_descent_m_s=_max(downs),
+        max_tilt_deg=_max(tilts),
+        end_distance_m=away[-1] if away and away[-1] == away[-1] else None,
+        start_voltage_v=volts[0] if volts else None,
+        end_voltage_v=volts[-1] if volts else None,
+        min_voltage_v=min(volts, default=None),
+        start_remaining_percent=left[0] if left else None,
+        end_remaining_percent=left[-1] if left else None,
+        max_current_a=_max(amps),
+        min_satellites=min(satellites, default=None),
+        max_hdop=_max(hdops),
+        max_vibration_m_s2=_max(levels),
+        clips=clips[-1] - clips[0] if clips else None,
+        max_estimator_ratio=_max(ratios),
+        lost_percent=sum(lost) / len(lost) if lost else None,
+    )
+
+
+def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
+    """Return metres north and east of home for each row of the track; empty without home or track."""
+    if flight.home is None or not len(flight.track):
+        return []
+    plane = TangentPlane(flight.home.latitude_deg, flight.home.longitude_deg)
+    latitudes, longitudes = flight.track["latitude_deg"], flight.track["longitude_deg"]
+    return [plane.metres(*place) for place in zip(latitudes, longitudes, strict=True)]
+
+
+def time_in_modes(flight: FlightLog) -> dict[str, float]:
+    """Return seconds in each mode while armed, in order of first use."""
+    found: dict[str, float] = {}
+    for change, end in flight.mode_spans():
+        for armed_from, armed_to in flight.armed or [(0.0, flight.duration_s)]:
+            seconds = min(end, armed_to) - max(change.time_s, armed_from)
+            if seconds > 0:
+                found[change.name] = found.get(change.name, 0.0) + seconds
+    return found
+
+
+class _ArmedSpans:
+    def __init__(self, flight: FlightLog) -> None:
+        self._spans = flight.armed or [(-math.inf, math.inf)]
+
+    def rows(self, columns: TimeSeries) -> Iterator[int]:
+        for begin, end in self._spans:
+            yield from range(bisect_left(columns.times, begin), bisect_right(columns.times, end))
+
+    def known(self, columns: TimeSeries, name: str) -> list[float]:
+        values = columns[name]
+        return [values[row] for row in self.rows(columns) if math.isfinite(values[row])]
+
+
+def _battery(flight: FlightLog, spans: _ArmedSpans, name: str) -> list[float]:
+    first = next((flight.batteries[number] for number in sorted(flight.batteries)), None)
+    return [] if first is None else spans.known(first, name)
+
+
+def _max(values: list[float]) -> float | None:
+    return max((value for value in values if math.isfinite(value)), default=None)
+
+
+def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
+    length_m, here = 0.0, (math.nan, math.nan)
+    for before, row in pairwise([-2, *rows]):
+        place = north_east[row]
+        if place[0] != place[0]:
+            continue
+        if here[0] != here[0] or row != before + 1:
+            here = place
+            continue
+        step = math.hypot(place[0] - here[0], place[1] - here[1])
+        if step >= _STEP_M:
+            length_m, here = length_m + step, place
+    return length_m
+
+
+def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
+    """Return sentences, the most important first."""
+    sentences = [
+        _flight_sentence(flight, statistics),
+        _modes_sentence(flight),
+        _battery_sentence(statistics),
+        _failsafes_sentence(flight),
+        _warnings_sentence(statistics),
+    ]
+    return [sentence for sentence in sentences if sentence] + [
+        f"{note[:1].upper()}{note[1:]}." for note in flight.notes
+    ]
+
+
+def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
+    if statistics.armed_s is None:
+        return f"Never armed: {span(flight.duration_s)} on the ground."
+    parts = [f"{span(statistics.armed_s)} armed"]
+    if statistics.distance_m is not None:
+        parts.append(f"{length(statistics.distance_m)} flown")
+    if statistics.max_height_m is not None:
+        parts.append(f"max height {number(statistics.max_height_m)} m above home")
+    if statistics.max_distance_m is not None:
+        parts.append(f"max distance {length(statistics.max_distance_m)} from home")
+    if statistics.max_speed_m_s is not None:
+        parts.append(f"max speed {number(statistics.max_speed_m_s)} m/s")
+    if statistics.end_distance_m is not None:
+        parts.append(f"ended {length(statistics.end_distance_m)} from home")
+    return ", ".join(parts) + "."
+
+
+def _modes_sentence(flight: FlightLog) -> str:
+    modes = time_in_modes(flight)
+    return (
+        ("Flown in " if flight.armed else "In ")
+        + ", ".join(f"{name} ({span(seconds)})" for name, seconds in modes.items())
+        + "."
+        if modes
+        else ""
+    )
+
+
+def _battery_sentence(statistics: FlightStatistics) -> str:
+    if statistics.start_voltage_v is None or statistics.end_voltage_v is None:
+        return ""
+    text = f"Battery {statistics.start_voltage_v:.1f} → {statistics.end_voltage_v:.1f} V"
+    if statistics.start_remaining_percent is not None and statistics.end_remaining_percent is not None:
+        text += f", {statistics.start_remaining_percent:.0f} → {statistics.end_remaining_percent:.0f} %"
+    if statistics.min_voltage_v is not None:
+        text += f", minimum {statistics.min_voltage_v:.1f} V"
+    return text + "."
+
+
+def _failsafes_sentence(flight: FlightLog) -> str:
+    found = failsafes(flight)
+    acted = [failsafe for failsafe in found if failsafe.acted]
+    warnings = [failsafe for failsafe in found if not failsafe.acted]
+    text = f"{len(acted) or 'No'} failsafe{'' if len(acted) == 1 else 's'}"
+    if acted:
+        text += ": " + "; ".join(
+            f"{failsafe.title} at {clock(failsafe.time_s)} ({failsafe.reaction})" for failsafe in acted
+        )
+    if warnings:
+        text += f". {len(warnings)} warning{'' if len(warnings) == 1 else 's'} without a known reaction: "
+        text += "; ".join(f"{failsafe.title} at {clock(failsafe.time_s)}" for failsafe in warnings)
+    return text + "."
+
+
+def _warnings_sentence(statistics: FlightStatistics) -> str:
+    warnings = []
+    if statistics.max_vibration_m_s2 is not None and statistics.max_vibration_m_s2 > 30:
+        warnings.append(f"vibration up to {statistics.max_vibration_m_s2:.0f} m/s² (normal: below 30)")
+    if statistics.clips:
+        warnings.append(f"{statistics.clips:.0f} accelerometer clippings")
+    if statistics.max_estimator_ratio is not None and statistics.max_estimator_ratio > 1:
+        warnings.append(f"the estimator rejected measurements (ratio {statistics.max_estimator_ratio:.2f}, above 1)")
+    if statistics.min_satellites is not None and statistics.min_satellites < 6:
+        warnings.append(f"{statistics.min_satellites:.0f} satellites at minimum")
+    if statistics.lost_percent is not None and statistics.lost_percent > 2:
+        warnings.append(f"{statistics.lost_percent:.0f} % of the messages lost")
+    return "Check: " + "; ".join(warnings) + "." if warnings else ""
+
+
+def clock(seconds: float) -> str:
+    """Format minutes and seconds since the start of the log: ``3:07.5``."""
+    minutes, rest = divmod(round(max(seconds, 0.0), 1), 60)
+    return f"{minutes:.0f}:{rest:04.1f}"
+
+
+def span(seconds: float) -> str:
+    """Format a duration: ``47 s``, ``12 min 5 s``, ``1 h 3 min``."""
+    rounded = round(seconds)
+    if rounded < 60:
+        return f"{rounded} s"
+    if rounded < 3600:
+        return f"{rounded // 60} min {rounded % 60} s" if rounded % 60 else f"{rounded // 60} min"
+    return f"{rounded // 3600} h {rounded % 3600 // 60} min"
+
+
+def length(metres: float) -> str:
+    """Format a distance: ``310 m``, ``3.4 km``."""
+    if metres >= 1000:
+        return f"{metres / 1000:.1f} km"
+    return f"{metres:.0f} m" if metres >= 10 else f"{metres:.1f} m"
+
+
+def number(value: float) -> str:
+    """Format with about three digits."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
+
+
+def date(unix_s: float) -> str:
+    """Format as UTC; "at an unknown time" if no clock was set."""
+    if unix_s < _A_YEAR_S:
+        return "at an unknown time"
+    return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"

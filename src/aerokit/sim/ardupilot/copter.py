@@ -1,0 +1,284 @@
+"""`SimulatedCopter`: an ArduCopter 4.7 quadrotor without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar
+
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavCmd,
+    MavFrame,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    MotorTestThrottleType,
+    SpeedType,
+)
+from aerokit.sim.ardupilot import copter_modes as modes
+from aerokit.sim.ardupilot.commands import common_commands, relative_heading
+from aerokit.sim.ardupilot.copter_auto import CopterAuto
+from aerokit.sim.ardupilot.copter_failsafes import CopterArming, CopterFailsafes, CopterFence
+from aerokit.sim.ardupilot.copter_guided import CopterGuided, CopterSetpoints
+from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase
+from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer, variant
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.motion import Ned
+
+_MAX_S = 600.0
+# Pause between two motors, as a share of the time for each.
+_PAUSE_SHARE = 0.5
+_MIN_PWM, _MAX_PWM = 800, 2200
+
+
+class MotorTest:
+    """Motor test on the ground. HEARTBEAT reports the vehicle as armed meanwhile; it is disarmed afterwards."""
+
+    def __init__(self, copter: SimulatedCopter) -> None:
+        self._copter = copter
+        self.is_running: bool = False
+        self._number = 0
+
+    def command(self, command: ReceivedCommand) -> int:
+        """Start a test, or continue with other motors. A text reports the end."""
+        if not self.is_running:
+            reason = "" if self._copter.is_landed else "vehicle not landed"
+            if not self._copter.is_initialised:
+                reason = "Board initialising"
+            if reason:
+                self._copter.send_text(MavSeverity.CRITICAL, f"Motor Test: {reason}")
+                return MavResult.FAILED
+            self._copter.info("starting motor test")
+        self.is_running = True
+        self._number += 1
+        self._copter.call_later(self._duration_s(command), partial(self._stop, self._number))
+        return MavResult.ACCEPTED
+
+    def _duration_s(self, command: ReceivedCommand) -> float:
+        """Return the duration; 0 for an invalid throttle."""
+        kind, throttle = command.param2, command.param3
+        is_valid = kind == MotorTestThrottleType.THROTTLE_PILOT or (
+            throttle <= 100.0
+            if kind in (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
+            else kind == MotorTestThrottleType.THROTTLE_PWM and _MIN_PWM <= throttle <= _MAX_PWM
+        )
+        time, motors = max(0.0, min(command.param4, _MAX_S)), max(1, whole(command.x))
+        return time * (motors + (motors - 1) * _PAUSE_SHARE) if is_valid else 0.0
+
+    def _stop(self, number: int) -> None:
+        if number == self._number:
+            self.is_running = False
+            self._copter.info("finished motor test")
+            self._copter.motors.set_armed(False, self._copter.now)
+
+
+class CopterHold(CopterModeBase):
+    """Holds its position."""
+
+    def update(self, dt: float) -> None:
+        self.vehicle.hold_position()
+
+
+class CopterThrow(CopterHold):
+    """Reports once after arming that it waits for the throw; in the air it holds its position."""
+
+    _reported_at = -math.inf
+
+    def update(self, dt: float) -> None:
+        if self._reported_at < self.vehicle.motors.armed_at:
+            self._reported_at = self.vehicle.now
+            self.vehicle.info("waiting for throw")
+        super().update(dt)
+
+
+class CopterFollow(CopterHold):
+    """Needs FOLL_ENABLE. It holds its position, as the firmware does without a vehicle to follow."""
+
+    def enter(self, *, force: bool) -> bool:
+        if self.vehicle.parameters["FOLL_ENABLE"]:
+            return True
+        self.vehicle.send_text(MavSeverity.WARNING, "Set FOLL_ENABLE = 1")
+        return False
+
+
+_LAND_DETECTOR_S = 1.0
+_BASE = int(MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED)
+_GUIDED, _ARMED = int(MavModeFlag.GUIDED_ENABLED), int(MavModeFlag.SAFETY_ARMED)
+_GUIDED_MODES = frozenset((
+    "GUIDED", "GUIDED_NOGPS", "LOITER", "POSHOLD", "CIRCLE", "BRAKE", "RTL", "SMARTRTL", "LAND", "AUTO", "FOLLOW",
+    "AVOID_ADSB", "ZIGZAG",
+))  # fmt: skip
+
+_refusing = partial(
+    variant,
+    CopterHold,
+    is_available=False,
+    needs_position=False,
+    can_arm=False,
+    entry_severity=MavSeverity.WARNING,
+)
+
+# In the order of AVAILABLE_MODES. SPORT and AUTOROTATE do not exist, as in the firmware for quadrotors.
+_MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
+    _refusing(
+        CopterMode.AUTO_RTL, "AUTO RTL", entry_texts=("Unable to start landing sequence",),
+        refused_because="No return path or landing sequence found",
+    ),
+    CopterAuto,
+    variant(modes.CopterStabilize, CopterMode.ACRO, "ACRO"),
+    variant(modes.CopterStabilize, CopterMode.STABILIZE, "STABILIZE"),
+    variant(modes.CopterPilotedMode, CopterMode.ALT_HOLD, "ALT_HOLD", needs_position=False),
+    # On the ground CIRCLE pulls towards its circle, so that the land detector never triggers.
+    variant(
+        modes.CopterLoiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False
+    ),
+    variant(modes.CopterLoiter, CopterMode.LOITER, "LOITER"),
+    CopterGuided,
+    variant(modes.CopterLand, CopterMode.LAND, "LAND"),
+    variant(modes.CopterRtl, CopterMode.RTL, "RTL"),
+    variant(modes.CopterPilotedMode, CopterMode.DRIFT, "DRIFT", takes_off=False),
+    _refusing(CopterMode.FLIP, "FLIP"),
+    _refusing(CopterMode.AUTOTUNE, "AUTOTUNE"),
+    variant(modes.CopterLoiter, CopterMode.POSHOLD, "POSHOLD"),
+    variant(CopterHold, CopterMode.BRAKE, "BRAKE", can_arm=False),
+    variant(CopterThrow, CopterMode.THROW, "THROW"),
+    variant(CopterHold, CopterMode.AVOID_ADSB, "AVOID_ADSB", can_arm=False),
+    variant(CopterGuided, CopterMode.GUIDED_NOGPS, "GUIDED_NOGPS", needs_position=False),
+    variant(modes.CopterSmartRtl, CopterMode.SMART_RTL, "SMARTRTL"),
+    _refusing(CopterMode.FLOWHOLD, "FLOWHOLD"),
+    variant(CopterFollow, CopterMode.FOLLOW, "FOLLOW", can_arm=False),
+    variant(modes.CopterLoiter, CopterMode.ZIGZAG, "ZIGZAG"),
+    _refusing(CopterMode.SYSTEMID, "SYSTEMID", entry_texts=("No axis selected, SID_AXIS = 0",)),
+    _refusing(CopterMode.TURTLE, "TURTLE"),
+)  # fmt: skip
+
+
+class SimulatedCopter(CopterHost):
+    """Behaves as ArduCopter does where a client can observe it; flies with `Motion`.
+
+    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters; MNT1_TYPE 1 fits a gimbal with three axes.
+
+    Not simulated: slowing down before a fence, the terrain failsafe.
+    """
+
+    KIND: ClassVar[Kind] = "copter"
+    FIRMWARE: ClassVar[str] = "ArduCopter"
+    FRAME: ClassVar[str | None] = "Frame: QUAD/PLUS"
+    MAV_TYPE: ClassVar[int] = MavType.QUADROTOR
+    CAPABILITIES: ClassVar[int] = 0xFBEF
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["copter"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
+    ARMING: ClassVar[type[CopterArming]] = CopterArming
+    FAILSAFES: ClassVar[type[CopterFailsafes]] = CopterFailsafes
+    FENCE: ClassVar[type[CopterFence]] = CopterFence
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        return {
+            **common_commands(self),
+            MavCmd.NAV_TAKEOFF: self._take_off,
+            MavCmd.NAV_VTOL_TAKEOFF: self._take_off,
+            MavCmd.NAV_LAND: lambda _: self.change_to(CopterMode.LAND),
+            MavCmd.NAV_VTOL_LAND: lambda _: self.change_to(CopterMode.LAND),
+            MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(CopterMode.RTL),
+            MavCmd.NAV_LOITER_UNLIM: lambda _: self.change_to(CopterMode.LOITER),
+            MavCmd.DO_CHANGE_SPEED: self._change_speed,
+            MavCmd.CONDITION_YAW: self._turn,
+            MavCmd.DO_PAUSE_CONTINUE: self._pause_or_continue,
+            MavCmd.DO_MOTOR_TEST: lambda command: self.motor_test.command(command),
+        }
+
+    def listen_for_setpoints(self) -> None:
+        CopterSetpoints(self)
+
+    def reset_controllers(self) -> None:
+        super().reset_controllers()
+        self._still = ConditionTimer()
+        self.motor_test: MotorTest = MotorTest(self)
+
+    @property
+    def guided(self) -> CopterGuided:
+        return self.mode_of(CopterGuided)
+
+    @property
+    def is_armed(self) -> bool:
+        """True while the motors are armed or tested."""
+        return self.motors.is_armed or self.motor_test.is_running
+
+    @property
+    def base_mode(self) -> int:
+        # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
+        base, name = _BASE, self.mode.name
+        if not self.has_left_boot:
+            return base | _GUIDED
+        if name in _GUIDED_MODES and (self.motors.is_armed or name != "RTL"):
+            base |= _GUIDED
+        return base | _ARMED if self.is_armed else base
+
+    def move(self, dt: float) -> None:
+        motion = self.motion
+        was_on_ground = motion.is_on_ground
+        motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
+        is_on_ground = motion.is_on_ground
+        if is_on_ground and not was_on_ground:
+            self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
+        keeps_flying = self.motors.is_armed and (self.mode.is_taking_off or not self.mode.notices_landing)
+        still_for = self._still.seconds(is_on_ground and not keeps_flying, self.now)
+        if still_for >= _LAND_DETECTOR_S or (still_for > 0.0 and not self.motors.is_armed):
+            self.is_landed: bool = True
+            self._still.reset()
+            motion.settle()
+
+    def _take_off(self, command: ReceivedCommand) -> int:
+        if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:
+            return MavResult.DENIED
+        upwards = command.z > self.navigation.altitude_above_home
+        if not (self.motors.is_armed and self.is_landed and upwards):
+            return MavResult.FAILED
+        done = self.mode.take_off(command.z, must_navigate=command.param3 == 0.0)
+        return MavResult.ACCEPTED if done else MavResult.FAILED
+
+    def may_go_to(self, place: Ned) -> bool:
+        if not self.fence.contains(place):
+            return False
+        self.yaw.default()
+        return True
+
+    def _change_speed(self, command: ReceivedCommand) -> int:
+        mode, speed = self.mode, command.param2
+        if not speed > 0:
+            return MavResult.DENIED
+        if not mode.can_change_speed:
+            return MavResult.FAILED
+        if command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
+            mode.speed = speed  # type: ignore[attr-defined]
+            return MavResult.ACCEPTED
+        is_vertical = command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED)
+        if not isinstance(mode, CopterGuided | CopterAuto) or not is_vertical:
+            return MavResult.FAILED
+        if command.param1 == SpeedType.CLIMB_SPEED:
+            mode.climb = speed
+        else:
+            mode.descent = speed
+        return MavResult.ACCEPTED
+
+    def _turn(self, command: ReceivedCommand) -> int:
+        heading = relative_heading(command, self.motion.yaw)
+        if heading is None:
+            return MavResult.FAILED
+        direction = 0 if command.param4 else int(command.param3)
+        self.yaw.fixed(heading, math.radians(command.param2), direction)
+        return MavResult.ACCEPTED
+
+    def _pause_or_continue(self, command: ReceivedCommand) -> int:
+        if command.param1 not in (0.0, 1.0):
+            return MavResult.DENIED
+        pause = command.param1 == 0.0
+        if self.mode.pause() if pause else self.mode.resume():
+            return MavResult.ACCEPTED
+        self.info("Failed to pause" if pause else "Failed to resume")
+        return MavResult.FAILED

@@ -1,1 +1,0 @@
-"""What is ArduCopter's own: its modes, missions, commands, arming, failsafes."""

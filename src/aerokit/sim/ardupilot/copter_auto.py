@@ -1,0 +1,428 @@
+"""AUTO of a simulated ArduCopter.
+
+Simulated: take-off, waypoints (splines as straight lines), loitering, circles, delays, landing, return to launch,
+conditions, speed, home, region of interest, jumps; servo, relay and camera commands. Skipped: payload place, guided by
+script or attitude, guided limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavFrame, MavSeverity, SpeedType
+from aerokit.mavlink.messages import MissionItemReached
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterRtl, CopterTakeOff
+from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
+from aerokit.sim.motion import Ned, wrap_pi
+
+_STOPPED_M = 0.3
+_TO_EDGE_M = 3.0
+_TAKE_OFF_WITHOUT_THROTTLE = 2
+_RAISED_THROTTLE = 1100
+
+
+class _Leg(Protocol):
+    """The present manoeuvre of a mission; `update` sets the motion targets for the next ``dt`` seconds."""
+
+    def update(self, dt: float) -> None: ...
+    @property
+    def is_complete(self) -> bool: ...
+
+
+class _FlyLeg:
+    """Straight to a place. With ``stops`` the place itself must be reached, else WPNAV_RADIUS around it."""
+
+    def __init__(self, auto: CopterAuto, destination: Ned, *, stops: bool) -> None:
+        self._copter, self._auto = auto.vehicle, auto
+        self.destination = destination
+        self._radius = _STOPPED_M if stops else self._copter.parameters["WPNAV_RADIUS"] / 100.0
+        self.is_complete: bool = False
+
+    def update(self, dt: float) -> None:
+        copter, limits, motion = self._copter, self._auto, self._copter.motion
+        copter.motors.wanted = not copter.is_landed
+        if copter.is_landed:
+            return
+        motion.seek_position(*self.destination, speed=limits.speed, climb=limits.climb, descent=limits.descent)
+        self.is_complete = self.is_complete or math.dist(self.destination, motion.place) <= self._radius
+
+
+class _CircleLeg:
+    """Circle that is approached at its edge; a negative radius turns anticlockwise."""
+
+    def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
+        self._copter, self._turns, self._centre = auto.vehicle, turns, centre
+        parameters, motion = self._copter.parameters, self._copter.motion
+        self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0
+        self._rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
+        north, east = motion.north - centre[0], motion.east - centre[1]
+        self._angle = math.atan2(east, north)
+        self._turned = 0.0
+        self._reported = -1
+        self._approach: _FlyLeg | None = None
+        to_edge = abs(math.hypot(north, east) - self._radius)
+        if to_edge > _TO_EDGE_M or abs(motion.down - centre[2]) > _TO_EDGE_M:
+            self._approach = _FlyLeg(auto, self._point(), stops=True)
+
+    @property
+    def is_complete(self) -> bool:
+        return self._approach is None and self._turned / math.tau >= self._turns
+
+    def update(self, dt: float) -> None:
+        if self._approach is not None:
+            self._approach.update(dt)
+            if self._approach.is_complete:
+                self._approach = None
+            return
+        motion = self._copter.motion
+        max_rate = math.sqrt(0.7 * motion.limits.acceleration_m_s2 / max(0.5, self._radius))
+        rate = math.copysign(min(abs(self._rate), max_rate), self._rate)
+        self._report()
+        self._angle += rate * dt
+        self._turned += abs(rate) * dt
+        self._report()
+        point, speed = self._point(), rate * self._radius
+        motion.seek_velocity(
+            point[0] - motion.north - speed * math.sin(self._angle),
+            point[1] - motion.east + speed * math.cos(self._angle),
+            point[2] - motion.down,
+        )
+
+    def _point(self) -> Ned:
+        north = self._centre[0] + self._radius * math.cos(self._angle)
+        return (north, self._centre[1] + self._radius * math.sin(self._angle), self._centre[2])
+
+    def _report(self) -> None:
+        number = int(self._turned / math.tau)
+        if number > self._reported:
+            self._reported = number
+            self._copter.info(f"Mission: starting circle {number + 1}/{int(self._turns)}")
+
+
+class _ClimbLeg:
+    """Take-off. On the ground it waits for MISSION_START, a raised throttle or AUTO_OPTIONS."""
+
+    def __init__(self, auto: CopterAuto, altitude_m: float) -> None:
+        self._copter, self._auto = auto.vehicle, auto
+        self._take_off = CopterTakeOff(auto.vehicle, altitude_m)
+
+    @property
+    def is_complete(self) -> bool:
+        return self._take_off.is_complete
+
+    def update(self, dt: float) -> None:
+        copter, auto = self._copter, self._auto
+        options = int(copter.parameters["AUTO_OPTIONS"])
+        if copter.rc[2] > _RAISED_THROTTLE or options & _TAKE_OFF_WITHOUT_THROTTLE:
+            auto.may_lift_off = True
+        if not copter.is_landed or auto.may_lift_off:
+            self._take_off.update(auto.climb)
+
+
+class _ReturnLeg(CopterRtl):
+    @property
+    def is_complete(self) -> bool:
+        return self.vehicle.is_landed and self.vehicle.motors.is_idle
+
+
+class _DescendLeg:
+    def __init__(self, copter: CopterHost) -> None:
+        self._copter = copter
+
+    @property
+    def is_complete(self) -> bool:
+        return self._copter.is_landed and self._copter.motors.is_idle
+
+    def update(self, dt: float) -> None:
+        self._copter.descend()
+
+
+_C = MavCmd
+_ALLOW_ARMING = 1
+_CONTINUE_AFTER_LAND = 4
+_HEADING_REACHED_RAD = math.radians(2.0)
+_MIN_TAKE_OFF_M = 1.0
+_STOPS_NOT_BEFORE = frozenset(
+    {_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME, _C.NAV_SPLINE_WAYPOINT, _C.NAV_PAYLOAD_PLACE}
+)
+_WAYPOINTS = frozenset({_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT, _C.NAV_LOITER_TIME})
+_TAKE_OFFS = frozenset({_C.NAV_TAKEOFF, _C.NAV_VTOL_TAKEOFF})
+_LANDINGS = frozenset({_C.NAV_LAND, _C.NAV_VTOL_LAND})
+_UNTIL_LEG_ENDS = _TAKE_OFFS | {_C.NAV_LOITER_TURNS, _C.NAV_LOITER_TO_ALT, _C.NAV_RETURN_TO_LAUNCH}
+_WITHOUT_EFFECT = (
+    _C.DO_FENCE_ENABLE, _C.DO_WINCH, _C.DO_RETURN_PATH_START, _C.DO_LAND_START, _C.DO_MOUNT_CONTROL,
+    _C.DO_GUIDED_LIMITS, _C.NAV_GUIDED_ENABLE, _C.CONDITION_DISTANCE,
+)  # fmt: skip
+
+
+class CopterAuto(MissionMode):
+    """Flies the mission. `MissionRun` selects the commands, each navigation command becomes a leg."""
+
+    number: int = CopterMode.AUTO
+    name = "AUTO"
+    arms_with_raised_throttle = True
+    vehicle: CopterHost
+
+    def __init__(self, copter: CopterHost) -> None:
+        super().__init__(copter)
+        self.climb: float = 0.0
+        self.descent: float = 0.0  # Limits in m/s.
+        # None holds the position.
+        self._leg: _Leg | None = None
+        self._last_reached = 0
+        self._reached_at = self._condition_from = self._delay_until = 0.0
+        self._version = -1
+        self._upcoming: tuple[tuple[int, MissionItem], ...] = ()
+        self.handlers: dict[int, Callable[[MissionItem], None]] = {
+            **dict.fromkeys(_TAKE_OFFS, self._take_off),
+            **dict.fromkeys((*_WAYPOINTS, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TO_ALT), self._fly),
+            **dict.fromkeys(_LANDINGS, self._land),
+            _C.NAV_LOITER_TURNS: self._circle,
+            _C.NAV_RETURN_TO_LAUNCH: self._return,
+            _C.NAV_DELAY: self._delay,
+            _C.CONDITION_DELAY: self._wait,
+            _C.CONDITION_YAW: self._turn,
+            _C.DO_CHANGE_SPEED: self._change_speed,
+            _C.DO_SET_HOME: lambda item: set_home_from(copter, item),
+            **dict.fromkeys((_C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE), self._look_at),
+            **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
+        }
+
+    @property
+    def can_arm(self) -> bool:  # type: ignore[override]
+        return bool(int(self.vehicle.parameters["AUTO_OPTIONS"]) & _ALLOW_ARMING)
+
+    @property
+    def is_taking_off(self) -> bool:  # type: ignore[override]
+        return isinstance(self._leg, _ClimbLeg) and not self._leg.is_complete
+
+    @property
+    def is_landing(self) -> bool:  # type: ignore[override]
+        leg = self._leg
+        return isinstance(leg, _DescendLeg) or (isinstance(leg, _ReturnLeg) and leg.is_landing)
+
+    @property
+    def _is_leg_complete(self) -> bool:
+        return self._leg is not None and self._leg.is_complete
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._leg.destination if isinstance(self._leg, _FlyLeg | _ReturnLeg) else None
+
+    def pause(self) -> bool:
+        if not isinstance(self._leg, _FlyLeg) or self._leg.is_complete:
+            return False
+        self.is_paused = True
+        return True
+
+    def resume(self) -> bool:
+        self.is_paused = False
+        return True
+
+    def enter(self, *, force: bool) -> bool:
+        """Start. In the air this needs a mission, on the ground one that begins with a take-off."""
+        copter, run = self.vehicle, self.vehicle.mission
+        if copter.mode is self:
+            return True  # armed in this mode
+        if not run.is_present and not force:
+            return False
+        if copter.is_armed and copter.is_landed and not run.starts_with_take_off():
+            copter.send_text(MavSeverity.CRITICAL, "Auto: Missing Takeoff Cmd")
+            return False
+        self.speed = copter.speed_limit("WPNAV_SPEED")
+        self.climb, self.descent = copter.speed_limit("WPNAV_SPEED_UP"), copter.speed_limit("WPNAV_SPEED_DN")
+        self._leg = None
+        self.may_lift_off = self.is_paused = False
+        self.wait_for_origin()
+        return True
+
+    def mission_started(self) -> None:
+        self._has_changed()
+
+    def update(self, dt: float) -> None:
+        self.start_if_waiting()
+        if not self.is_waiting:
+            if self._has_changed() and isinstance(self._leg, _FlyLeg):
+                self._restart_command()
+            self.vehicle.mission.update()
+        if self.vehicle.mode is not self:
+            return
+        is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)
+        if self._leg is None or is_stopped:
+            self.vehicle.hold_position()
+        else:
+            self._leg.update(dt)
+        if not is_stopped:
+            self.vehicle.yaw.update()
+
+    def _has_changed(self) -> bool:
+        """Return True if an upload changed the next commands while the current one is the same."""
+        run, commands = self.vehicle.mission, self.vehicle.missions.commands
+        had_same_place = bool(self._upcoming) and self._upcoming[0][0] == run.nav_index
+        if commands.version == self._version and had_same_place:
+            return False
+        following = zip(run.navigation_from(max(1, run.nav_index)), range(3), strict=False)
+        upcoming = tuple(found for found, _ in following)
+        changed = upcoming != self._upcoming
+        self._version, self._upcoming = commands.version, upcoming
+        return changed and had_same_place
+
+    def _restart_command(self) -> None:
+        run = self.vehicle.mission
+        if not run.is_running:
+            return
+        done = run.set_current(run.nav_index)
+        text = "restarted command" if done else "but failed to restart command"
+        self.vehicle.send_text(MavSeverity.CRITICAL, f"Auto mission changed{',' if done else ''} {text}")
+
+    def is_complete(self, index: int, item: MissionItem) -> bool:
+        if self.vehicle.mode is not self or not self._is_done(index, item):
+            return False
+        if not self._last_reached:
+            self.vehicle.call_later(0.0, self._report_reached)
+        self._last_reached = index
+        return True
+
+    def _report_reached(self) -> None:
+        # Of several commands that complete at the same time the firmware reports the last.
+        index, self._last_reached = self._last_reached, 0
+        self.vehicle.send(MissionItemReached(index))
+
+    def end_mission(self) -> None:
+        """Hold in the air, or disarm on the ground."""
+        if self.vehicle.is_landed:
+            self.vehicle.arming.disarm()
+        else:
+            self._leg = None
+            self.vehicle.yaw.hold()
+
+    def _is_done(self, index: int, item: MissionItem) -> bool:
+        command, now = item.command, self.vehicle.now
+        if command in _WAYPOINTS:
+            return self._has_stayed(index, item.param1)
+        if command in _UNTIL_LEG_ENDS:
+            return self._is_leg_complete
+        if command in _LANDINGS:
+            return self._has_landed(index)
+        if command in (_C.NAV_LOITER_UNLIM, _C.NAV_GUIDED_ENABLE):
+            return command == _C.NAV_GUIDED_ENABLE and item.param1 == 0
+        if command == _C.NAV_DELAY:
+            return now > self._delay_until
+        if command == _C.CONDITION_DELAY:
+            return now - self._condition_from > max(0.0, item.param1)
+        if command == _C.CONDITION_DISTANCE:
+            return horizontal_distance(self.vehicle, self.destination) < max(0.0, item.param1)
+        if command == _C.CONDITION_YAW:
+            return self.vehicle.yaw.keep_fixed(_HEADING_REACHED_RAD)
+        self.warn_if_unknown(item)
+        return True
+
+    def _has_stayed(self, index: int, seconds: float) -> bool:
+        if not self._is_leg_complete:
+            return False
+        now = self.vehicle.now
+        self._reached_at = self._reached_at or now
+        if math.floor(now - self._reached_at) < seconds:
+            return False
+        self.vehicle.info(f"Reached command #{index}")
+        return True
+
+    def _has_landed(self, index: int) -> bool:
+        """Disarm after landing. The mission continues only if a take-off follows and MIS_OPTIONS allows it."""
+        copter = self.vehicle
+        if isinstance(self._leg, _FlyLeg):
+            if self._leg.is_complete:
+                copter.yaw.hold()
+                self._leg = _DescendLeg(copter)
+            return False
+        if not self._is_leg_complete:
+            return False
+        continues = int(copter.parameters["MIS_OPTIONS"]) & _CONTINUE_AFTER_LAND
+        if continues and copter.mission.is_take_off(index + 1):
+            return True
+        copter.arming.disarm()
+        return False
+
+    def _place(self, item: MissionItem) -> Ned:
+        """Return the place of an item; zeros in it keep the present value."""
+        leg = self._leg
+        here: Ned = self.vehicle.motion.place
+        if isinstance(leg, _FlyLeg) and leg.is_complete:
+            here = leg.destination
+        point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        if point is None:
+            return here
+        north, east = here[:2] if (item.x, item.y) == (0, 0) else point[:2]
+        return (north, east, here[2] if item.z == 0 else point[2])
+
+    def _go(self, place: Ned, *, stops: bool = True) -> None:
+        self._reached_at = 0.0
+        self.is_paused: bool = False
+        if not self.vehicle.yaw.has_region_of_interest:
+            self.vehicle.yaw.default()
+        self._leg = _FlyLeg(self, place, stops=stops)
+
+    def _fly(self, item: MissionItem) -> None:
+        run = self.vehicle.mission
+        stops = item.command not in (_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT) or item.param1 > 0
+        if not stops:
+            following = next(run.navigation_from(run.nav_index + 1), None)
+            stops = following is None or following[1].command not in _STOPS_NOT_BEFORE
+        self._go(self._place(item), stops=stops)
+
+    def _take_off(self, item: MissionItem) -> None:
+        copter, down = self.vehicle, self.vehicle.motion.down
+        point = copter.point(0, 0, item.z, item.frame)
+        lowest = down - (_MIN_TAKE_OFF_M if copter.is_landed else 0.0)
+        copter.yaw.hold()
+        target = min(lowest, down if point is None else point[2])
+        self._leg = _ClimbLeg(self, copter.ground_or_home_down - target)
+
+    def _circle(self, item: MissionItem) -> None:
+        self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
+
+    def _land(self, item: MissionItem) -> None:
+        self.vehicle.yaw.hold()
+        if (item.x, item.y) == (0, 0):
+            self._leg = _DescendLeg(self.vehicle)
+            return
+        north, east, _ = self._place(item)
+        self._go((north, east, self.vehicle.motion.down))
+
+    def _return(self, _: MissionItem) -> None:
+        self._leg = leg = _ReturnLeg(self.vehicle)
+        leg.enter(force=True)
+
+    def _delay(self, item: MissionItem) -> None:
+        # A time of day is not simulated and counts as no delay.
+        seconds = max(0.0, item.param1)
+        self._delay_until = self.vehicle.now + seconds
+        self.vehicle.info(f"Delaying {int(seconds)} sec")
+
+    def _wait(self, _: MissionItem) -> None:
+        self._condition_from = self.vehicle.now
+
+    def _turn(self, item: MissionItem) -> None:
+        heading, direction = math.radians(item.param1), int(item.param3)
+        if item.param4 > 0:
+            heading = self.vehicle.motion.yaw + math.copysign(heading, direction or 1.0)
+            direction = 0
+        self.vehicle.yaw.fixed(wrap_pi(heading), math.radians(item.param2), direction)
+
+    def _change_speed(self, item: MissionItem) -> None:
+        if item.param2 <= 0:
+            return
+        if item.param1 == SpeedType.CLIMB_SPEED:
+            self.climb = item.param2
+        elif item.param1 == SpeedType.DESCENT_SPEED:
+            self.descent = item.param2
+        else:
+            self.speed: float = item.param2
+
+    def _look_at(self, item: MissionItem) -> None:
+        is_none = (item.x, item.y, item.z) == (0, 0, 0)
+        point = None if is_none else self.vehicle.point(int(item.x), int(item.y), item.z, MavFrame.GLOBAL)
+        self.vehicle.yaw.region_of_interest(point)

@@ -1,0 +1,309 @@
+"""ArduCopter's arming checks, failsafes and fence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+from aerokit.mavlink.enums import CopterMode, FenceMitigate, MavSeverity
+from aerokit.sim.ardupilot.copter_modes import CopterHost
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
+from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer
+
+_STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
+
+
+class CopterArming(ArduPilotArming[CopterHost]):
+    """Needs a position only in modes that use it, and a throttle stick that is low or centred."""
+
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
+
+    def ahrs_reasons(self) -> Sequence[str]:
+        return ()  # checked after GPS, in `position_reasons`
+
+    def position_reasons(self) -> Sequence[str]:
+        """Check GPS, the estimator, and what a forced arming requires."""
+        if self.vehicle.mode.needs_position and (reasons := self.gps_reasons()):
+            return reasons
+        return super().ahrs_reasons() or self.mandatory_reasons()
+
+    def own_reasons(self) -> list[str]:
+        failsafes = self.vehicle.failsafes
+        reasons = ["GCS failsafe on"] if failsafes.ground_station else []
+        return [*reasons, "Battery failsafe"] if failsafes.battery_is_low else reasons
+
+    def mandatory_reasons(self) -> list[str]:
+        copter, nav = self.vehicle, self.vehicle.navigation
+        reasons = []
+        if copter.mode.needs_position and not (nav.has_position and not copter.failsafes.estimator):
+            reasons.append("Need Position Estimate")
+        if not copter.mode.has_manual_throttle and not nav.has_altitude:
+            reasons.append("Need Alt Estimate")
+        return reasons
+
+    def armed(self) -> None:
+        self.vehicle.path.reset()
+
+    def final_reasons(self) -> list[str]:
+        mode = self.vehicle.mode
+        if not mode.can_arm:
+            return [f"{mode.name} mode not armable"]
+        high = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
+        if not mode.arms_with_raised_throttle and self.vehicle.rc[2] > high:
+            return ["Throttle too high"]
+        return []
+
+
+_NONE, _LAND, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _TERMINATE, _AUTO, _BRAKE = range(8)
+# FS_THR_ENABLE and FS_GCS_ENABLE → action.
+_LINK_ACTIONS = (_NONE, _RTL, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _LAND, _AUTO, _BRAKE)
+_MODES: dict[int, tuple[int, ...]] = {
+    _LAND: (CopterMode.LAND,),
+    _RTL: (CopterMode.RTL, CopterMode.LAND),
+    _SMART_RTL: (CopterMode.SMART_RTL, CopterMode.RTL, CopterMode.LAND),
+    _SMART_RTL_OR_LAND: (CopterMode.SMART_RTL, CopterMode.LAND),
+    _AUTO: (CopterMode.RTL, CopterMode.LAND),
+    _BRAKE: (CopterMode.BRAKE, CopterMode.LAND),
+}
+# Text when the first mode of an action is refused.
+_FALLBACK_TEXTS = {
+    _SMART_RTL: "SmartRTL Unavailable, Trying RTL Mode",
+    _SMART_RTL_OR_LAND: "SmartRTL Unavailable, Using Land Mode",
+    _BRAKE: "Trying Land Mode",
+}
+# Bits of FS_OPTIONS, which let the flight continue in spite of a failsafe: (modes, bit, text).
+_IF_LANDING = 8
+_RADIO_OPTIONS = (
+    (frozenset({"AUTO"}), 1, "Continuing Auto"),
+    (frozenset({"GUIDED"}), 4, "Continuing Guided Mode"),
+)
+_GCS_OPTIONS = (
+    (frozenset({"AUTO"}), 2, "Continuing Auto Mode"),
+    (frozenset({"STABILIZE", "ALT_HOLD", "LOITER", "POSHOLD"}), 16, "Continuing Pilot Control"),
+)
+_MIN_PULSES_S = 0.2
+_ESTIMATOR_TIMEOUT_S = 1.0
+
+
+class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
+    """Radio, ground station, battery and estimator failsafes, and disarming after DISARM_DELAY.
+
+    Terrain, vibration and dead reckoning are not checked. Action 6 does not search the mission for a landing sequence.
+    """
+
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
+        _TERMINATE, _LAND, _RTL, _SMART_RTL_OR_LAND, _SMART_RTL, _NONE,
+    )  # fmt: skip
+
+    def __init__(self, copter: CopterHost) -> None:
+        super().__init__(copter)
+        self._radio_good_at = math.nan
+        self._position_lost = ConditionTimer()
+        self._had_position = self._acted_on_estimator = False
+        self._idling = ConditionTimer()
+
+    def update(self) -> None:
+        self.battery.update()
+        self._check_ground_station()
+        self._check_estimator()
+        self._check_idling()
+        self._check_radio()
+        self.vehicle.fence.update()
+
+    def _check_radio(self) -> None:
+        """Detect missing pulses for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
+        copter, parameters = self.vehicle, self.vehicle.parameters
+        receives = copter.rc.is_receiving
+        if receives:
+            self.radio_received_at: float = copter.now
+        if not parameters["FS_THR_ENABLE"]:
+            self._set_radio(False)
+            return
+        low = copter.rc[2] < parameters["FS_THR_VALUE"]
+        if receives and not low:
+            if math.isnan(self._radio_good_at):
+                self._radio_good_at = copter.now
+            if copter.now - self._radio_good_at >= _MIN_PULSES_S:
+                self._set_radio(False)
+            return
+        if math.isnan(self.radio_received_at):
+            return
+        silent = copter.now - self.radio_received_at >= parameters["RC_FS_TIMEOUT"]
+        self._radio_good_at = math.nan
+        if (receives and low) or silent:
+            self._set_radio(True)
+
+    def _set_radio(self, lost: bool) -> None:
+        if lost == self.radio:
+            return
+        self.radio = lost
+        if lost:
+            action = self._link_parameter("FS_THR_ENABLE", _LAND)
+            self._execute(self._link_action("Radio", action, _RADIO_OPTIONS))
+        else:
+            self.warn("Radio Failsafe Cleared")
+
+    def _check_ground_station(self) -> None:
+        copter, parameters = self.vehicle, self.vehicle.parameters
+        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
+            return
+        lost = self.ground_station_silence > parameters["FS_GCS_TIMEOUT"]
+        if lost == self.ground_station:
+            return
+        self.ground_station = lost
+        if not lost:
+            self.warn("GCS Failsafe Cleared")
+            return
+        copter.rc.release_overrides()
+        if copter.is_armed:
+            self._execute(self._link_action("GCS", self._link_parameter("FS_GCS_ENABLE", _RTL), _GCS_OPTIONS))
+        else:
+            self.warn("GCS Failsafe")
+
+    def _link_parameter(self, name: str, default: int) -> int:
+        value = int(self.vehicle.parameters[name])
+        return _LINK_ACTIONS[value] if 0 <= value < len(_LINK_ACTIONS) else default
+
+    def _link_action(self, name: str, action: int, options: Sequence[tuple[frozenset[str], int, str]]) -> int:
+        """Report the loss of a link and return the action that follows."""
+        mode = self.vehicle.mode
+        if self._disarms(name):
+            return _NONE
+        if mode.is_landing:
+            if self.battery_is_low and self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND):
+                return self._continue(f"{name} + Battery", "Continuing Landing", _LAND)
+            if self._has_option(_IF_LANDING):
+                return self._continue(name, "Continuing Landing", _LAND)
+        for modes, bit, text in options:
+            if mode.name in modes and self._has_option(bit):
+                return self._continue(name, text)
+        self.warn(f"{name} Failsafe")
+        return action
+
+    def act_on_battery(self, action: int) -> None:
+        """Execute the action. On the ground the vehicle always disarms; a landing may continue."""
+        if self._disarms("Battery"):
+            return
+        if self.vehicle.mode.is_landing and self._has_option(_IF_LANDING) and action != _NONE:
+            action = self._continue("Battery", "Continuing Landing", _LAND)
+        else:
+            self.warn("Battery Failsafe")
+        self._execute(action)
+
+    def _check_estimator(self) -> None:
+        """Detect the loss of a position that was good before. A disarmed vehicle only reports it."""
+        copter = self.vehicle
+        if copter.navigation.has_position:
+            self._had_position = True
+            self._position_lost.reset()
+            if self.estimator and self._acted_on_estimator:
+                self.warn("EKF Failsafe Cleared", MavSeverity.CRITICAL)
+            self.estimator = self._acted_on_estimator = False
+            return
+        may_act = self._had_position and not self.estimator
+        if may_act and self._position_lost.seconds(True, copter.now) >= _ESTIMATOR_TIMEOUT_S:
+            self._lose_estimator()
+
+    def _lose_estimator(self) -> None:
+        copter = self.vehicle
+        self.warn("EKF variance", MavSeverity.CRITICAL)
+        self.estimator: bool = True
+        self._acted_on_estimator = copter.is_armed
+        if not copter.is_armed:
+            return
+        if not copter.mode.needs_position:
+            self.warn("EKF Failsafe", MavSeverity.CRITICAL)
+            return
+        copter.set_mode(CopterMode.LAND)
+        self.warn(f"EKF Failsafe: changed to {copter.mode.name} Mode", MavSeverity.CRITICAL)
+
+    def _check_idling(self) -> None:
+        """Disarm after DISARM_DELAY of idling on the ground."""
+        copter, delay = self.vehicle, self.vehicle.parameters["DISARM_DELAY"]
+        idles = copter.is_armed and copter.is_landed and copter.motors.is_idle
+        if 0 < delay <= self._idling.seconds(idles and delay > 0, copter.now):
+            copter.arming.disarm()
+
+    def _has_option(self, bit: int) -> bool:
+        return bool(int(self.vehicle.parameters["FS_OPTIONS"]) & bit)
+
+    def _continue(self, name: str, text: str, action: int = _NONE) -> int:
+        self.warn(f"{name} Failsafe - {text}")
+        return action
+
+    def _disarms(self, name: str) -> bool:
+        """Disarm on the ground, independent of the action, and return True."""
+        copter = self.vehicle
+        if not copter.is_landed or (copter.mode.needs_mission and not copter.motors.is_idle):
+            return False
+        if name == "Radio":  # the firmware reports the other failsafes after disarming
+            self.warn("Radio Failsafe - Disarming")
+        copter.arming.disarm()
+        if name != "Radio":
+            self.warn(f"{name} Failsafe - Disarming")
+        return True
+
+    def _execute(self, action: int) -> None:
+        if action == _TERMINATE:
+            self.vehicle.arming.disarm()
+        if action == _AUTO:
+            self.warn("Unable to start landing sequence")
+            self.warn("Mode change to AUTO RTL failed: No return path or landing sequence found")
+            self.warn("Trying RTL Mode")
+        for attempt, mode in enumerate(_MODES.get(action, ())):
+            if attempt == 1 and action in _FALLBACK_TEXTS:
+                self.warn(_FALLBACK_TEXTS[action])
+            if self.vehicle.set_mode(mode):
+                return
+
+
+_LAND_BEYOND_M = 100.0
+_FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
+    1: _MODES[_RTL],
+    2: _MODES[_LAND],
+    3: _MODES[_SMART_RTL],
+    4: _MODES[_BRAKE],
+    5: _MODES[_SMART_RTL_OR_LAND],
+}
+
+
+class CopterFence(ArduPilotFence[CopterHost]):
+    """FENCE_ACTION: nothing (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4); LAND if that fails or far outside."""
+
+    PERIOD_S: ClassVar[float] = 0.1
+    CHECKS_DISARMED: ClassVar[bool] = True
+    MITIGATION: ClassVar[int] = FenceMitigate.NONE
+
+    def act(self, new: int) -> None:
+        """Disarm on the ground; execute FENCE_ACTION in the air."""
+        vehicle = self.vehicle
+        action = int(vehicle.parameters["FENCE_ACTION"])
+        if vehicle.is_landed:
+            if action != REPORT_ONLY:
+                vehicle.arming.disarm()
+            return
+        self.report("breached", new)
+        if action == REPORT_ONLY:
+            return
+        modes = _FENCE_ACTIONS.get(action, _FENCE_ACTIONS[1])
+        if self.beyond_m(new) > _LAND_BEYOND_M:
+            modes = (CopterMode.LAND,)
+        self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in modes)
+
+    def cleared(self) -> None:
+        if not self.vehicle.is_landed:
+            self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
+
+    def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
+        if not self.forbids_modes() or not self.vehicle.is_armed or self.vehicle.is_landed:
+            return None
+        return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
+
+    def mode_changed(self) -> None:
+        """Give the pilot ten seconds, unless the fence only reports."""
+        super().mode_changed()
+        if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
+            self.recover_by_hand()

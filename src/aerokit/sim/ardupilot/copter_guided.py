@@ -1,0 +1,270 @@
+"""GUIDED of a simulated ArduCopter: targets and set-points from a companion computer or a ground station."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
+from aerokit.mavlink.enums import CopterMode, MavFrame
+from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
+from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase, CopterTakeOff
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import PositionTarget, Setpoint, is_finite, rotated
+from aerokit.sim.motion import Ned, euler_from_quaternion
+
+_ZERO: Ned = (0.0, 0.0, 0.0)
+
+
+class GuidedSubmode(Enum):
+    """ArduCopter's guided controllers."""
+
+    TAKE_OFF = "take-off"
+    POSITION = "position"
+    POSITION_VELOCITY = "position, velocity and acceleration"
+    VELOCITY = "velocity and acceleration"
+    ACCELERATION = "acceleration"
+    ATTITUDE = "attitude"
+
+
+class CopterGuided(CopterModeBase):
+    """Holds its position at first. A position target stays; other set-points expire after GUID_TIMEOUT seconds.
+
+    A change of the submode resets the speed limits to WPNAV_SPEED and its siblings, as ArduCopter does, so
+    DO_CHANGE_SPEED is valid for the flight to the present kind of target.
+    """
+
+    number: int = CopterMode.GUIDED
+    name = "GUIDED"
+    arms_with_raised_throttle = True
+    can_change_speed = True
+
+    def __init__(self, copter: CopterHost) -> None:
+        super().__init__(copter)
+        self.submode: GuidedSubmode = GuidedSubmode.VELOCITY
+        self.speed: float = 0.0
+        self.climb: float = 0.0
+        self.descent: float = 0.0  # Limits in m/s.
+        self.position: Ned = _ZERO
+        self.velocity: Ned = _ZERO
+        self.acceleration: Ned = _ZERO  # Targets in the world frame: north, east, down.
+        self._attitude = (0.0, 0.0)
+        self._attitude_climb = 0.0
+        self._updated_at = -math.inf
+        self._take_off: CopterTakeOff | None = None
+        self._is_paused = False
+
+    def enter(self, *, force: bool) -> bool:
+        self._start(GuidedSubmode.VELOCITY)
+        self._is_paused = False
+        self.velocity = self.acceleration = _ZERO
+        return True
+
+    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
+        self.submode = GuidedSubmode.TAKE_OFF
+        self._take_off = CopterTakeOff(self.vehicle, altitude_m)
+        self.vehicle.yaw.hold()
+        return True
+
+    def go_to(self, position: Ned) -> None:
+        self._set_targets(GuidedSubmode.POSITION, position=position)
+
+    def _set_targets(
+        self,
+        submode: GuidedSubmode,
+        *,
+        position: Ned | None = None,
+        velocity: Ned | None = None,
+        acceleration: Ned | None = None,
+    ) -> None:
+        """Enter a submode and replace the targets that are given."""
+        if self.submode is not submode:
+            self._start(submode)
+        self.position = self.position if position is None else position
+        self.velocity = self.velocity if velocity is None else velocity
+        self.acceleration = self.acceleration if acceleration is None else acceleration
+        self._updated_at = self.vehicle.now
+
+    def set_target(self, position: Ned | None, velocity: Ned | None, acceleration: Ned | None) -> bool:
+        """Follow a set-point; return False if its combination of vectors is not supported."""
+        if velocity is not None:
+            submode = GuidedSubmode.VELOCITY if position is None else GuidedSubmode.POSITION_VELOCITY
+            acceleration = acceleration or _ZERO
+        elif position is None and acceleration is not None:
+            submode = GuidedSubmode.ACCELERATION
+        elif position is not None and acceleration is None:
+            submode = GuidedSubmode.POSITION
+        else:
+            return False
+        self._set_targets(submode, position=position, velocity=velocity, acceleration=acceleration)
+        return True
+
+    def lean(self, roll: float, pitch: float, climb: float) -> None:
+        """Lean by angles in radians and climb (m/s); a climb on the ground takes off."""
+        self.submode = GuidedSubmode.ATTITUDE
+        self._attitude, self._attitude_climb = (roll, pitch), climb
+        self._updated_at = self.vehicle.now
+
+    def pause(self) -> bool:
+        self._is_paused = True
+        return True
+
+    def resume(self) -> bool:
+        self._is_paused = False
+        return True
+
+    @property
+    def destination(self) -> Ned | None:
+        return self.position if self.submode is GuidedSubmode.POSITION else None
+
+    def _start(self, submode: GuidedSubmode) -> None:
+        copter = self.vehicle
+        self.submode = submode
+        self._take_off, self.is_taking_off = None, False
+        self.speed = copter.speed_limit("WPNAV_SPEED")
+        self.climb, self.descent = copter.speed_limit("WPNAV_SPEED_UP"), copter.speed_limit("WPNAV_SPEED_DN")
+        copter.yaw.default()
+
+    def update(self, dt: float) -> None:
+        """Run the controller of the submode."""
+        copter = self.vehicle
+        self.is_taking_off = False
+        if self._is_paused:
+            copter.hold_position()
+        elif self._take_off is not None and self.submode is GuidedSubmode.TAKE_OFF:
+            self._take_off.update(copter.speed_limit("WPNAV_SPEED_UP"))
+            self.is_taking_off: bool = not self._take_off.is_complete
+            copter.yaw.update()
+        elif self.submode is GuidedSubmode.ATTITUDE:
+            self._run_attitude()
+        elif copter.is_landed:
+            copter.hold_position()  # a target does not take off
+        else:
+            copter.motors.wanted = True
+            self._run_target()
+            copter.yaw.update()
+
+    @property
+    def _is_stale(self) -> bool:
+        return self.vehicle.now - self._updated_at > self.vehicle.parameters["GUID_TIMEOUT"]
+
+    def _run_attitude(self) -> None:
+        copter = self.vehicle
+        (roll, pitch), climb = self._attitude, self._attitude_climb
+        if self._is_stale:
+            roll = pitch = climb = 0.0
+        copter.motors.wanted = not copter.is_landed or climb > 0
+        if copter.is_landed:
+            copter.is_landed = not (climb > 0 and copter.motors.can_lift)
+            return
+        copter.motion.seek_attitude(roll, pitch, -climb)
+
+    def _run_target(self) -> None:
+        motion = self.vehicle.motion
+        if self._is_stale:
+            self.vehicle.yaw.stop_turning()
+            self.velocity = self.acceleration = _ZERO
+        if self.submode is GuidedSubmode.POSITION:
+            motion.seek_position(*self.position, speed=self.speed, climb=self.climb, descent=self.descent)
+        elif self.submode is GuidedSubmode.VELOCITY:
+            self._seek_velocity(*self.velocity)
+        elif self.submode is GuidedSubmode.ACCELERATION:
+            if self._is_stale:
+                motion.seek_velocity(*_ZERO)
+            else:
+                motion.seek_acceleration(*self.acceleration)
+        else:
+            errors = (target - now for target, now in zip(self.position, motion.place, strict=True))
+            north, east, down = (speed + error for speed, error in zip(self.velocity, errors, strict=True))
+            self._seek_velocity(north, east, down)
+
+    def _seek_velocity(self, north: float, east: float, down: float) -> None:
+        size = math.hypot(north, east)
+        if size > self.speed:
+            north, east = north * self.speed / size, east * self.speed / size
+        self.vehicle.motion.seek_velocity(north, east, max(-self.climb, min(self.descent, down)))
+
+
+_BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
+_LOCAL = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED}) | _BODY
+_ALL_RATES = (
+    AttitudeMask.BODY_ROLL_RATE_IGNORE | AttitudeMask.BODY_PITCH_RATE_IGNORE | AttitudeMask.BODY_YAW_RATE_IGNORE
+)
+_MAX_VELOCITY_M_S = 1000.0
+
+
+class CopterSetpoints:
+    """Handlers of the set-point messages. In GUIDED an invalid message stops the vehicle, as in the firmware."""
+
+    def __init__(self, copter: CopterHost) -> None:
+        self._copter = copter
+        copter.on(SetPositionTargetLocalNed, self._on_local)
+        copter.on(SetPositionTargetGlobalInt, self._on_global)
+        copter.on(SetAttitudeTarget, self._on_attitude)
+
+    @property
+    def _guided(self) -> CopterGuided:
+        return self._copter.mode_of(CopterGuided)
+
+    @property
+    def _is_guided(self) -> bool:
+        return self._copter.mode is self._guided
+
+    def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
+        if not self._is_guided:
+            return
+        frame = target.coordinate_frame
+        point = self._copter.local_point(target, _BODY)
+        if frame not in _LOCAL or not self._apply(target, point, rotate=frame in _BODY):
+            self._guided.enter(force=False)
+
+    def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        if not self._is_guided:
+            return
+        point = self._copter.point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
+        is_invalid = point is None and Setpoint.of(target).has_position
+        if is_invalid or not self._apply(target, point or _ZERO, rotate=False):
+            self._guided.enter(force=False)
+
+    def _apply(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
+        setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
+        velocity = setpoint.velocity if setpoint.has_velocity else None
+        acceleration = setpoint.acceleration if setpoint.has_acceleration else None
+        is_sane = all(abs(part) <= _MAX_VELOCITY_M_S for part in velocity or _ZERO)
+        if setpoint.is_force or not is_sane or not is_finite(acceleration, point):
+            return False
+        if rotate:
+            velocity = None if velocity is None else rotated(velocity, motion.yaw)
+            acceleration = None if acceleration is None else rotated(acceleration, motion.yaw)
+        position = point if setpoint.has_position else None
+        if not self._guided.set_target(position, velocity, acceleration):
+            return False
+        if setpoint.yaw is not None:
+            yaw.fixed(setpoint.yaw + (motion.yaw if rotate else 0.0))
+        elif setpoint.yaw_rate is not None:
+            yaw.turn(setpoint.yaw_rate)
+        else:
+            yaw.default()
+        return True
+
+    def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        copter, mask = self._copter, target.type_mask
+        guided = copter.mode
+        if not isinstance(guided, CopterGuided):
+            return
+        rates_ignored = mask & _ALL_RATES
+        size = math.sqrt(sum(part * part for part in target.q))
+        ill = mask & AttitudeMask.THROTTLE_IGNORE or rates_ignored not in (0, _ALL_RATES)
+        if ill or (not mask & AttitudeMask.ATTITUDE_IGNORE and not abs(size - 1.0) < 1e-3):
+            guided.enter(force=False)
+            return
+        roll = pitch = 0.0
+        if not mask & AttitudeMask.ATTITUDE_IGNORE:
+            roll, pitch, yaw = euler_from_quaternion(*target.q)
+            copter.motion.face(yaw)
+        elif not rates_ignored:
+            copter.motion.turn(target.body_yaw_rate)
+        # Thrust is a climb rate, 0.5 holds the altitude. The other meaning (GUID_OPTIONS) is not simulated.
+        share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
+        name = "WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"
+        guided.lean(roll, pitch, share * copter.parameters[name] / 100.0)

@@ -1,0 +1,394 @@
+"""ArduCopter's heading control, and the modes that fly by the sticks, land and return."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from aerokit.sim.ardupilot.host import ArduPilotMode
+from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.commands import rotated
+from aerokit.sim.motion import Ned, wrap_pi
+
+_MIN_LOOK_AHEAD_M_S = 0.5
+
+
+class AutoYaw:
+    """Heading control: hold, look ahead, fixed heading, turn rate, or region of interest."""
+
+    def __init__(self, copter: ArduPilotVehicle) -> None:
+        self._copter = copter
+        self._apply: Callable[[], None] = self._hold
+        self._roi: tuple[float, float] | None = None
+        self._heading = 0.0
+        self._rate = 0.0
+
+    def hold(self) -> None:
+        self._apply = self._hold
+        self._copter.motion.turn(0.0)
+
+    def default(self, *, returning: bool = False) -> None:
+        """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
+
+        Every new guided target calls this, and so ends a commanded heading or region of interest.
+        """
+        behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
+        if behaviour == 1 or (behaviour == 2 and not returning):
+            self._apply = self._look_ahead
+        else:
+            self.hold()
+
+    def fixed(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
+        """Turn to a heading (radians). ``rate`` 0 is the default rate, ``direction`` 1 clockwise, -1 the other way."""
+        motion = self._copter.motion
+        self._heading, self._apply = wrap_pi(heading), self._go_to_heading
+        self._rate = 0.0
+        offset = wrap_pi(self._heading - motion.yaw)
+        if direction and math.copysign(1, offset) != direction and abs(offset) > 0.02:
+            self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
+
+    def keep_fixed(self, tolerance: float) -> bool:
+        """Turn to the last `fixed` heading again; return True if it is reached within ``tolerance`` radians."""
+        self._apply = self._go_to_heading
+        return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
+
+    @property
+    def has_region_of_interest(self) -> bool:
+        return self._apply == self._look_at_roi
+
+    def turn(self, rate: float) -> None:
+        """Turn continuously, in radians per second."""
+        self._rate, self._apply = rate, self._turn
+
+    def region_of_interest(self, point: Ned | None) -> None:
+        """Look at a place until the next target; None ends it. A gimbal, if fitted, turns instead of the vehicle."""
+        gimbal = self._copter.gimbal
+        gimbal.look_at(point)
+        if point is None:
+            self.default()
+        elif not gimbal.is_fitted:
+            self._roi = point[:2]
+            self._apply = self._look_at_roi
+
+    def stop_turning(self) -> None:
+        """End a turn rate because its stream has stopped."""
+        if self._apply == self._turn:
+            self.hold()
+
+    def update(self) -> None:
+        self._apply()
+
+    def _hold(self) -> None:
+        pass
+
+    def _turn(self) -> None:
+        self._copter.motion.turn(self._rate)
+
+    def _look_ahead(self) -> None:
+        motion = self._copter.motion
+        if motion.ground_speed_m_s > _MIN_LOOK_AHEAD_M_S:
+            motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
+
+    def _go_to_heading(self) -> None:
+        motion = self._copter.motion
+        offset = wrap_pi(self._heading - motion.yaw)
+        if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
+            motion.turn(self._rate)  # the long way round
+            return
+        self._rate = 0.0
+        motion.face(self._heading)
+
+    def _look_at_roi(self) -> None:
+        assert self._roi is not None
+        motion = self._copter.motion
+        motion.face(math.atan2(self._roi[1] - motion.east, self._roi[0] - motion.north))
+
+
+class CopterHost(ArduPilotVehicle):
+    """A copter as its modes and failsafes see it."""
+
+    def reset_controllers(self) -> None:
+        self.yaw: AutoYaw = AutoYaw(self)
+        self.path: SmartPath = SmartPath(self, only_armed=True)
+
+    def _become_ready(self) -> None:
+        super()._become_ready()
+        self.path.start()
+
+    def look_at(self, place: Ned | None) -> None:
+        self.yaw.region_of_interest(place)
+
+    @property
+    def ground_or_home_down(self) -> float:
+        """Down coordinate of home, or of the ground while home is not set."""
+        home = self.navigation.home
+        return self.motion.ground_down if home is None else home[2]
+
+    def speed_limit(self, name: str) -> float:
+        """Return a parameter in cm/s as m/s."""
+        return self.parameters[name] / 100.0
+
+    def fly_to(self, target: Ned, speed: float) -> float:
+        """Fly towards a target with the default climb and sink rates; return the distance in metres."""
+        self.motors.wanted = True
+        climb, descent = self.speed_limit("WPNAV_SPEED_UP"), self.speed_limit("WPNAV_SPEED_DN")
+        self.motion.seek_position(*target, speed=speed, climb=climb, descent=descent)
+        self.yaw.update()
+        return math.dist(target, self.motion.place)
+
+    def hold_position(self) -> None:
+        """Keep still; on the ground the motors idle."""
+        self.motors.wanted = not self.is_landed
+        self.motion.seek_velocity(0.0, 0.0, 0.0)
+
+    def descend(self) -> None:
+        """Descend with the speeds of LAND; on the ground let the motors idle."""
+        self.motors.wanted = not self.is_landed
+        if self.is_landed:
+            return
+        speed = self.speed_limit("LAND_SPEED")
+        if self.navigation.altitude_above_home > self.parameters["LAND_ALT_LOW"] / 100.0:
+            speed = self.speed_limit("LAND_SPEED_HIGH") or self.speed_limit("WPNAV_SPEED_DN")
+        self.motion.seek_velocity(0.0, 0.0, speed)
+
+    def land(self) -> None:
+        """Descend, and disarm once the motors idle on the ground."""
+        self.descend()
+        if self.is_landed and self.motors.is_armed and self.motors.is_idle:
+            self.arming.disarm()
+
+
+class CopterModeBase(ArduPilotMode):
+    vehicle: CopterHost
+
+
+class CopterTakeOff:
+    """Vertical climb that waits for the motors, for the modes with take-off by command."""
+
+    def __init__(self, copter: CopterHost, altitude_m: float) -> None:
+        self._copter = copter
+        motion = copter.motion
+        self.target: Ned = (motion.north, motion.east, copter.ground_or_home_down - altitude_m)
+        self.is_complete: bool = False
+
+    def update(self, climb_m_s: float) -> None:
+        copter, motion = self._copter, self._copter.motion
+        copter.motors.wanted = True
+        if copter.is_landed:
+            copter.is_landed = not copter.motors.can_lift
+            return
+        motion.seek_position(*self.target, speed=2.0, climb=climb_m_s, descent=1.0)
+        if abs(motion.down - self.target[2]) < 0.1 and abs(motion.velocity_down) < 0.2:
+            self.is_complete = True
+
+
+_MID_STICK, _STICK_RANGE, _THROTTLE_DEADZONE = 1500, 500, 100
+_FULL_STICK_LEAN_RAD = math.radians(30.0)
+_FULL_STICK_TURN_RAD_S = math.radians(200.0)
+_LOITER_SPEED_M_S = 12.5
+_STABILIZE_CLIMB_M_S = 6.0
+
+
+class CopterPilotedMode(CopterModeBase):
+    """Attitude by stick, altitude held. Sticks keep the position of RC_CHANNELS_OVERRIDE or of the test."""
+
+    takes_off: bool = True
+    """True if the mode supports take-off by command."""
+
+    def __init__(self, copter: CopterHost) -> None:
+        super().__init__(copter)
+        self._take_off: CopterTakeOff | None = None
+
+    def enter(self, *, force: bool) -> bool:
+        self._take_off, self.is_taking_off = None, False
+        return True
+
+    def climb_from_stick(self) -> float:
+        """Return the climb rate of the throttle stick in m/s; the middle holds the altitude."""
+        stick = self.vehicle.rc[2] - _MID_STICK
+        if abs(stick) <= _THROTTLE_DEADZONE:
+            return 0.0
+        share = (abs(stick) - _THROTTLE_DEADZONE) / (_STICK_RANGE - _THROTTLE_DEADZONE)
+        return math.copysign(min(1.0, share) * self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0, stick)
+
+    def update(self, dt: float) -> None:
+        copter = self.vehicle
+        if self._take_off is not None:
+            self._take_off.update(copter.speed_limit("PILOT_SPEED_UP"))
+            if self._take_off.is_complete:
+                self._take_off, self.is_taking_off = None, False
+            return
+        climb = self.climb_from_stick()
+        copter.motors.wanted = not copter.is_landed or climb > 0
+        if copter.is_landed and climb > 0 and copter.motors.can_lift:
+            copter.is_landed = False
+        if copter.is_landed:
+            return
+        roll, pitch, _, yaw = ((copter.rc[i] - _MID_STICK) / _STICK_RANGE for i in range(4))
+        self.fly(roll, pitch, climb)
+        copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
+
+    def fly(self, roll: float, pitch: float, climb: float) -> None:
+        """Follow the roll and pitch sticks (-1 to 1) and a climb rate in m/s."""
+        self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
+
+    def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
+        # Without position control the pilot has to do the horizontal part.
+        if not self.takes_off or (must_navigate and not self.needs_position):
+            return False
+        self._take_off = CopterTakeOff(self.vehicle, altitude_m)
+        self.is_taking_off: bool = True
+        return True
+
+
+class CopterStabilize(CopterPilotedMode):
+    """Attitude and throttle by stick. With a low throttle stick it descends fast."""
+
+    needs_position = False
+    has_manual_throttle = True
+    takes_off = False
+
+    def climb_from_stick(self) -> float:
+        # A throttle rather than a climb rate: half a stick hovers.
+        throttle = self.vehicle.rc[2]
+        if self.vehicle.is_landed and throttle <= _MID_STICK:
+            return 0.0
+        return _STABILIZE_CLIMB_M_S * (throttle - _MID_STICK) / _STICK_RANGE
+
+
+class CopterLoiter(CopterPilotedMode):
+    """Position and altitude held; sticks move them. A low throttle stick descends and lands."""
+
+    def fly(self, roll: float, pitch: float, climb: float) -> None:
+        velocity = (-pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S, -climb)
+        self.vehicle.motion.seek_velocity(*rotated(velocity, self.vehicle.motion.yaw))
+
+
+_RTL_MIN_ALTITUDE_M = 2.0
+_ARRIVED_M = 0.5
+_SMART_RTL_EXTRA_ALTITUDE_M = 2.0
+
+
+class CopterLand(CopterModeBase):
+    """Vertical landing: WPNAV_SPEED_DN down to LAND_ALT_LOW, then LAND_SPEED; disarms on the ground."""
+
+    needs_position = False
+    can_arm = False
+    is_landing = True
+
+    def enter(self, *, force: bool) -> bool:
+        self.vehicle.yaw.hold()
+        return True
+
+    def update(self, dt: float) -> None:
+        self.vehicle.land()
+
+
+class CopterRtl(CopterModeBase):
+    """Climb to RTL_ALT (less near home), return to home or a rally point, wait RTL_LOIT_TIME, land."""
+
+    can_arm = False
+    can_change_speed = True
+
+    def __init__(self, copter: CopterHost) -> None:
+        super().__init__(copter)
+        self._phase = "climb"
+        self._altitude_down = 0.0
+        self._waiting_since = 0.0
+        self._place: Ned = (0.0, 0.0, 0.0)
+        self.speed: float = 0.0
+
+    def enter(self, *, force: bool) -> bool:
+        copter = self.vehicle
+        self._phase, self.is_landing = "climb", False
+        self.speed = copter.speed_limit("RTL_SPEED") or copter.speed_limit("WPNAV_SPEED")
+        home = copter.navigation.home or (0.0, 0.0, copter.motion.ground_down)
+        self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
+        north, east, down = self._place
+        distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
+        self._altitude_down = min(down, home[2] - self._return_altitude(distance))
+        copter.yaw.default(returning=True)
+        return True
+
+    def _return_altitude(self, distance: float) -> float:
+        """Return the altitude of the way back in metres above home."""
+        parameters = self.vehicle.parameters
+        now = self.vehicle.navigation.altitude_above_home
+        lowest = now + parameters["RTL_CLIMB_MIN"] / 100.0
+        target = max(lowest, parameters["RTL_ALT"] / 100.0, _RTL_MIN_ALTITUDE_M)
+        if parameters["RTL_CONE_SLOPE"] > 0:
+            target = min(target, max(distance * parameters["RTL_CONE_SLOPE"], _RTL_MIN_ALTITUDE_M, now))
+        return max(target, now)
+
+    @property
+    def destination(self) -> Ned | None:
+        """Place of return at the altitude of the present phase."""
+        north, east, down = self._place
+        if self._phase == "climb":
+            return (self.vehicle.motion.north, self.vehicle.motion.east, self._altitude_down)
+        return (north, east, down if self._phase == "land" else self._altitude_down)
+
+    def update(self, dt: float) -> None:
+        copter, target = self.vehicle, self.destination
+        if self._phase == "land":
+            copter.land()
+        elif copter.is_landed:  # waits for DISARM_DELAY
+            copter.motors.wanted = False
+        elif target is not None:
+            self._next_phase(copter.fly_to(target, self.speed))
+
+    def _next_phase(self, distance: float) -> None:
+        if self._phase == "climb" and distance < _ARRIVED_M:
+            self._phase = "return"
+        elif self._phase == "return" and distance < _ARRIVED_M:
+            self._phase, self._waiting_since = "wait", self.vehicle.now
+        elif self._phase == "wait":
+            waited = self.vehicle.now - self._waiting_since
+            if waited >= self.vehicle.parameters["RTL_LOIT_TIME"] / 1000.0:
+                self._phase = "land"
+                self.is_landing: bool = True
+
+
+class CopterSmartRtl(CopterModeBase):
+    """Return along the recorded path without its loops and land at its start. See `SmartPath`."""
+
+    can_arm = False
+    returns_on_path = True
+
+    def __init__(self, copter: CopterHost) -> None:
+        super().__init__(copter)
+        self._way: list[Ned] = []
+
+    def enter(self, *, force: bool) -> bool:
+        if not self.vehicle.path.is_active:
+            return False
+        self._way, self.is_landing = self.vehicle.path.take_way_back(), False
+        self._raise_last(_SMART_RTL_EXTRA_ALTITUDE_M)
+        self.vehicle.yaw.default(returning=True)
+        return True
+
+    def _raise_last(self, metres: float) -> None:
+        if self._way:
+            north, east, down = self._way[-1]
+            self._way[-1] = (north, east, down - metres)
+
+    def leave(self) -> None:
+        """Restore the points that were not reached, because they are still the way back."""
+        if self._way:
+            self._raise_last(-_SMART_RTL_EXTRA_ALTITUDE_M)
+            self.vehicle.path.restore(self._way)
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._way[0] if self._way else None
+
+    def update(self, dt: float) -> None:
+        copter = self.vehicle
+        if copter.is_landed or not self._way:
+            self.is_landing: bool = True
+            copter.land()
+            return
+        radius = _ARRIVED_M if len(self._way) == 1 else copter.parameters["WPNAV_RADIUS"] / 100
+        if copter.fly_to(self._way[0], copter.speed_limit("WPNAV_SPEED")) < radius:
+            del self._way[0]

@@ -1,0 +1,206 @@
+"""`SimulatedPlane`: an ArduPlane 4.7 with fixed wings without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from aerokit.mavlink.enums import (
+    MavCmd,
+    MavDoRepositionFlags,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    PlaneMode,
+    SpeedType,
+)
+from aerokit.sim.ardupilot import plane_modes as modes
+from aerokit.sim.ardupilot.commands import common_commands
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming
+from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, variant
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.plane_auto import PlaneAuto, PlaneGuided, PlaneSetpoints, guided_commands
+from aerokit.sim.ardupilot.plane_failsafes import PlaneFailsafes, PlaneFence
+from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneModeBase, PlaneNavigatingMode
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+
+_SHORT_DISABLED = 3
+_MIN_ANGLE_DEG, _MIN_AIRSPEED_M_S = 3.0, 5
+
+
+class PlaneArming(ArduPilotArming[PlaneHost]):
+    """Needs GPS in every mode, plausible limits, and a mode that can start on the ground."""
+
+    def own_reasons(self) -> list[str]:
+        parameters, mode = self.vehicle.parameters, self.vehicle.mode
+        roll, up, down = (parameters[name] for name in ("ROLL_LIMIT_DEG", "PTCH_LIM_MAX_DEG", "PTCH_LIM_MIN_DEG"))
+        airspeed = int(parameters["AIRSPEED_MIN"])
+        is_long_shorter = parameters["FS_LONG_TIMEOUT"] < parameters["FS_SHORT_TIMEOUT"]
+        checks = (
+            (
+                is_long_shorter and parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED,
+                "FS_LONG_TIMEOUT < FS_SHORT_TIMEOUT",
+            ),
+            (roll < _MIN_ANGLE_DEG, f"ROLL_LIMIT_DEG too small ({roll:.1f})"),
+            (up < _MIN_ANGLE_DEG, f"PTCH_LIM_MAX_DEG too small ({up:.1f})"),
+            (down > -_MIN_ANGLE_DEG, f"PTCH_LIM_MIN_DEG too large ({down:.1f})"),
+            (airspeed < _MIN_AIRSPEED_M_S, f"AIRSPEED_MIN too low ({airspeed} < {_MIN_AIRSPEED_M_S})"),
+            (not mode.can_arm, f"{mode.name} mode not armable"),
+        )
+        return [text for failed, text in checks if failed]
+
+
+_FULL_AMPERES = 25.0
+
+
+class PlaneEngine(ArduPilotMotors):
+    """Engine whose throttle follows the motion model."""
+
+    @property
+    def current_a(self) -> float:
+        return self.throttle * _FULL_AMPERES
+
+    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
+        self.throttle: float = motion.throttle if self.is_armed and not landed else 0.0
+        self.spool: float = self.throttle
+
+
+_REST_S = 1.0
+_LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
+
+# In the order of AVAILABLE_MODES. The modes of lifting rotors do not exist, as without Q_ENABLE.
+_MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
+    variant(
+        modes.PlanePilotedMode, PlaneMode.MANUAL, "MANUAL",
+        flags=MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.STABILIZE_ENABLED,
+    ),
+    variant(modes.PlaneCircle, PlaneMode.CIRCLE, "CIRCLE"),
+    variant(modes.PlanePilotedMode, PlaneMode.STABILIZE, "STABILIZE"),
+    variant(modes.PlanePilotedMode, PlaneMode.TRAINING, "TRAINING"),
+    variant(modes.PlanePilotedMode, PlaneMode.ACRO, "ACRO"),
+    variant(modes.PlanePilotedMode, PlaneMode.FLY_BY_WIRE_A, "FLY_BY_WIRE_A"),
+    variant(modes.PlaneAltitudeMode, PlaneMode.FLY_BY_WIRE_B, "FLY_BY_WIRE_B"),
+    variant(modes.PlaneCruise, PlaneMode.CRUISE, "CRUISE"),
+    variant(
+        modes.PlanePilotedMode, PlaneMode.AUTOTUNE, "AUTOTUNE",
+        entry_texts=("Started autotune", "Autotuning roll pitch yaw"),
+    ),
+    PlaneAuto,
+    variant(modes.PlaneRtl, PlaneMode.RTL, "RTL"),
+    variant(PlaneNavigatingMode, PlaneMode.LOITER, "LOITER"),
+    variant(PlaneNavigatingMode, PlaneMode.AVOID_ADSB, "AVOID_ADSB"),
+    PlaneGuided,
+    variant(modes.PlaneModeBase, PlaneMode.INITIALIZING, "INITIALISING", is_available=False, can_arm=False),
+    variant(modes.PlaneTakeOff, PlaneMode.TAKEOFF, "TAKEOFF"),
+    variant(modes.PlaneModeBase, PlaneMode.THERMAL, "THERMAL", is_available=False, can_arm=False),
+    variant(modes.PlaneAutoland, PlaneMode.AUTOLAND, "AUTOLAND"),
+)  # fmt: skip
+
+
+class SimulatedPlane(PlaneHost):
+    """Behaves as ArduPlane does where a client can observe it; flies with `FixedWing`.
+
+    Takes the arguments of `ArduPilotVehicle`. It starts on a runway along its heading. Not simulated: lifting rotors,
+    parachutes.
+    """
+
+    KIND: ClassVar[Kind] = "plane"
+    FIRMWARE: ClassVar[str] = "ArduPlane"
+    MAV_TYPE: ClassVar[int] = MavType.FIXED_WING
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    CAPABILITIES: ClassVar[int] = 0xF36F
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["plane"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = _MODES
+    ARMING: ClassVar[type[PlaneArming]] = PlaneArming
+    FAILSAFES: ClassVar[type[PlaneFailsafes]] = PlaneFailsafes
+    FENCE: ClassVar[type[PlaneFence]] = PlaneFence
+    MOTORS: ClassVar[type[PlaneEngine]] = PlaneEngine
+
+    fence: PlaneFence  # pyright: ignore[reportIncompatibleVariableOverride]
+    failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        # NAV_TAKEOFF is for lifting rotors; there is no command to land.
+        return {
+            **common_commands(self),
+            MavCmd.NAV_TAKEOFF: lambda _: MavResult.FAILED,
+            MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(PlaneMode.RTL),
+            MavCmd.NAV_LOITER_UNLIM: lambda _: self.change_to(PlaneMode.LOITER),
+            MavCmd.MISSION_START: self._start_mission,
+            MavCmd.DO_REPOSITION: self._reposition,
+            MavCmd.DO_CHANGE_SPEED: self._change_speed,
+            **guided_commands(self),
+            MavCmd.DO_FLIGHTTERMINATION: self._terminate,
+        }
+
+    def listen_for_setpoints(self) -> None:
+        PlaneSetpoints(self)
+
+    def unknown_mode(self, number: int) -> tuple[int, str]:
+        if number in _LIFTING_MODES:
+            return MavSeverity.INFO, "Q_ENABLE 0"
+        return super().unknown_mode(number)
+
+    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+        return "Flight mode change failed"
+
+    @property
+    def guided(self) -> PlaneGuided:
+        return self.mode_of(PlaneGuided)
+
+    @property
+    def base_mode(self) -> int:
+        flags = int(self.mode.flags) if isinstance(self.mode, PlaneModeBase) else 0
+        armed = MavModeFlag.SAFETY_ARMED if self.motors.is_armed else 0
+        return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
+
+    def move(self, dt: float) -> None:
+        wing = self.wing
+        was_on_ground = wing.is_on_ground
+        wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
+        if wing.is_on_ground and not was_on_ground:
+            self.info(f"SIM Hit ground at {wing.impact_speed_m_s:f} m/s")
+        if self.rest_timer.seconds(wing.is_at_rest and wing.throttle <= 0, self.now) >= _REST_S:
+            self.is_landed: bool = True
+            wing.settle()
+
+    def _terminate(self, command: ReceivedCommand) -> int:
+        # Termination needs the advanced failsafe, which is not simulated.
+        if command.param1 > 0.5:
+            self.failsafes.refuse_termination()
+        return MavResult.FAILED
+
+    def _start_mission(self, command: ReceivedCommand) -> int:
+        if command.param1 or command.param2:
+            return MavResult.DENIED
+        return self.change_to(PlaneMode.AUTO)
+
+    def _reposition(self, command: ReceivedCommand) -> int:
+        """Circle at a place. Param 3 is the radius, a param 4 other than 0 means anticlockwise."""
+        if command.is_long:  # ArduPilot defines no altitude frame for COMMAND_LONG here
+            return MavResult.UNSUPPORTED
+        point = self.point(*command.place(), command.z, command.altitude_frame)
+        if point is None:
+            return MavResult.DENIED
+        if self.mode is not self.guided and not whole(command.param2) & MavDoRepositionFlags.CHANGE_MODE:
+            return MavResult.FAILED
+        if not self.set_mode(PlaneMode.GUIDED):
+            return MavResult.FAILED
+        self.guided.go_to(point)
+        if command.param3 > 0:
+            anticlockwise = not math.isnan(command.param4) and command.param4 != 0
+            self.guided.radius = -command.param3 if anticlockwise else command.param3
+        return MavResult.ACCEPTED
+
+    def _change_speed(self, command: ReceivedCommand) -> int:
+        """Set the airspeed of GUIDED or AUTO; a ground speed is accepted but not simulated."""
+        mode = self.mode
+        if not isinstance(mode, PlaneNavigatingMode) or not mode.can_change_speed:
+            return MavResult.FAILED
+        if command.param1 == SpeedType.AIRSPEED and self.is_valid_airspeed(command.param2):
+            mode.speed = command.param2
+            return MavResult.ACCEPTED
+        return MavResult.ACCEPTED if command.param1 == SpeedType.GROUNDSPEED else MavResult.FAILED

@@ -1,1 +1,0 @@
-"""What is ArduPlane's own: its modes, missions, commands, arming, failsafes."""

@@ -1,0 +1,383 @@
+"""AUTO and GUIDED of a simulated ArduPlane.
+
+Simulated in AUTO: take-off, waypoints, loitering without limit, for a time, for turns and to an altitude, landing,
+return to launch, delays, speed, home, jumps; servo and camera commands. Other commands are skipped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import AttitudeTargetTypemask as Mask
+from aerokit.mavlink.enums import HeadingType, MavCmd, MavFrame, MavResult, MavSeverity, PlaneMode, SpeedType
+from aerokit.mavlink.enums import PositionTargetTypemask as PositionMask
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
+from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
+
+_C = MavCmd
+_FLY, _LOITER, _CLIMB, _LAND = range(4)
+_REACHED_HEIGHT_M = 5.0
+_ON_CIRCLE_SHARE = 1.3
+
+
+class PlaneAuto(PlaneNavigatingMode, MissionMode):
+    """Flies the mission. `MissionRun` selects the commands; after the last one the mode changes to RTL."""
+
+    number: int = PlaneMode.AUTO
+    name = "AUTO"
+
+    def __init__(self, plane: PlaneHost) -> None:
+        super().__init__(plane)
+        self._manoeuvre = _LOITER
+        self._landing: PlaneLanding | None = None
+        self._since = math.nan
+        self._turned = 0.0
+        self._last_bearing = 0.0
+        self._condition_from = 0.0
+        self._start: Ned = (0.0, 0.0, 0.0)
+        self.handlers: dict[int, Callable[[MissionItem], None]] = {
+            _C.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
+            **dict.fromkeys((_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
+            **dict.fromkeys((_C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME), self._loiter),
+            **dict.fromkeys((_C.NAV_LOITER_TURNS, _C.NAV_LOITER_TO_ALT), self._loiter),
+            _C.NAV_LAND: self._land,
+            _C.NAV_RETURN_TO_LAUNCH: self._return,
+            _C.CONDITION_DELAY: self._wait,
+            _C.DO_CHANGE_SPEED: self._change_speed,
+            _C.DO_SET_HOME: self._set_home,
+            **dict.fromkeys((_C.DO_LAND_START, _C.DO_RETURN_PATH_START, _C.DO_FENCE_ENABLE), lambda _: None),
+        }
+
+    @property
+    def is_taking_off(self) -> bool:  # type: ignore[override]
+        return self._manoeuvre == _CLIMB
+
+    @property
+    def is_landing(self) -> bool:  # type: ignore[override]
+        return self._manoeuvre == _LAND
+
+    def enter(self, *, force: bool) -> bool:
+        """Start or resume the mission; without one return at once."""
+        plane = self.vehicle
+        if plane.mode is self and plane.is_armed and plane.mission.is_running:
+            return True
+        super().enter(force=force)
+        self._manoeuvre = _LOITER
+        plane.call_later(0.0, self._begin if plane.mission.is_present else self._return_at_once)
+        return True
+
+    def _begin(self) -> None:
+        if self.vehicle.mode is self and not self.vehicle.mission.is_running:
+            self.vehicle.mission.start_or_resume()
+
+    def disarmed(self) -> None:
+        """Do nothing: disarming has reset the progress."""
+
+    def update(self, dt: float) -> None:
+        plane = self.vehicle
+        plane.mission.update()
+        if plane.mode is not self:
+            return
+        if self._manoeuvre == _CLIMB:
+            plane.climb_out()
+        elif self._manoeuvre == _LAND:
+            assert self._landing is not None
+            self._landing.update(dt)
+        elif self._manoeuvre == _FLY and not plane.is_landed and self._place is not None:
+            plane.wing.fly_to(*self._place, airspeed=self.airspeed)
+        else:
+            super().update(dt)
+            self._count_turns()
+
+    def _count_turns(self) -> None:
+        wing = self.vehicle.wing
+        if self._place is None:
+            return
+        bearing = math.atan2(wing.east - self._place[1], wing.north - self._place[0])
+        if not math.isnan(self._since):
+            self._turned += abs(wrap_pi(bearing - self._last_bearing))
+        elif self._is_on_circle:
+            self._since = self.vehicle.now
+        self._last_bearing = bearing
+
+    @property
+    def _is_on_circle(self) -> bool:
+        radius = abs(self.radius or self.vehicle.parameters["WP_LOITER_RAD"])
+        return horizontal_distance(self.vehicle, self._place) < _ON_CIRCLE_SHARE * radius
+
+    def is_complete(self, index: int, item: MissionItem) -> bool:
+        if self.vehicle.mode is not self or not self.vehicle.is_armed or not self._is_done(index, item):
+            return False
+        if item.command <= _C.NAV_LAST:
+            self.vehicle.send(m.MissionItemReached(index))
+        return True
+
+    def end_mission(self) -> None:
+        if not self.vehicle.is_landed:
+            self._return_at_once()
+
+    def _return_at_once(self) -> None:
+        if self.vehicle.mode is self:
+            self.vehicle.info("Mission complete, changing mode to RTL")
+            self.vehicle.set_mode(PlaneMode.RTL)
+
+    def _is_done(self, index: int, item: MissionItem) -> bool:
+        plane, command = self.vehicle, item.command
+        if command == _C.NAV_TAKEOFF:
+            assert self._place is not None
+            is_high = plane.wing.down <= self._place[2]
+            return is_high and self._report(f"Takeoff complete at {plane.altitude_m:.2f}m")
+        if command in (_C.NAV_WAYPOINT, _C.NAV_SPLINE_WAYPOINT):
+            return self._has_passed(index)
+        if command == _C.NAV_LOITER_TIME:
+            return plane.now - self._since >= item.param1 and self._report("Loiter time complete")
+        if command == _C.NAV_LOITER_TURNS:
+            return self._turned >= 2 * math.pi * item.param1 and self._report("Loiter orbits complete")
+        if command == _C.NAV_LOITER_TO_ALT:
+            assert self._place is not None
+            is_at_height = abs(plane.wing.down - self._place[2]) < _REACHED_HEIGHT_M
+            return is_at_height and self._is_on_circle and self._report("Loiter to alt complete")
+        if command == _C.CONDITION_DELAY:
+            return plane.now - self._condition_from > max(0.0, item.param1)
+        if command in (_C.NAV_LOITER_UNLIM, _C.NAV_LAND, _C.NAV_RETURN_TO_LAUNCH):
+            return False
+        self.warn_if_unknown(item)
+        return True
+
+    def _report(self, text: str) -> bool:
+        self.vehicle.info(text)
+        return True
+
+    def _has_passed(self, index: int) -> bool:
+        """Return True within WP_RADIUS of the waypoint, or beyond it."""
+        assert self._place is not None
+        wing, (north, east, _), start = self.vehicle.wing, self._place, self._start
+        distance = horizontal_distance(self.vehicle, self._place)
+        if distance <= self.vehicle.parameters["WP_RADIUS"]:
+            return self._report(f"Reached waypoint #{index} dist {int(distance)}m")
+        along = (north - start[0]) * (wing.north - north) + (east - start[1]) * (wing.east - east)
+        return along > 0 and self._report(f"Passed waypoint #{index} dist {int(distance)}m")
+
+    def _go(self, item: MissionItem, manoeuvre: int) -> None:
+        wing, before = self.vehicle.wing, self._place
+        self._start = wing.place
+        point = self.vehicle.point(int(item.x), int(item.y), item.z, item.frame) or self._start
+        north, east = self._start[:2] if (item.x, item.y) == (0, 0) else point[:2]
+        down = point[2] if item.z != 0 else (wing.down if before is None else before[2])
+        self._place, self._manoeuvre = (north, east, down), manoeuvre
+        self._since, self._turned, self.radius = math.nan, 0.0, 0.0
+
+    def _loiter(self, item: MissionItem) -> None:
+        self._go(item, _LOITER)
+        self.radius: float = item.param2 if item.command == _C.NAV_LOITER_TO_ALT else item.param3
+
+    def _land(self, item: MissionItem) -> None:
+        self._go(item, _LAND)
+        wing, plane = self.vehicle.wing, self.vehicle
+        point = plane.point(int(item.x), int(item.y), item.z, item.frame)
+        north, east = self._start[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
+        self._landing = PlaneLanding(plane, (north, east, wing.ground_down if point is None else point[2]))
+        plane.info(f"Landing approach start at {plane.altitude_m:.1f}m")
+
+    def _return(self, _: MissionItem) -> None:
+        # RTL is a mode change (`start_command` in ArduPlane's commands_logic.cpp); the mission stops here.
+        self.vehicle.set_mode(PlaneMode.RTL)
+
+    def _wait(self, _: MissionItem) -> None:
+        self._condition_from = self.vehicle.now
+
+    def _change_speed(self, item: MissionItem) -> None:
+        if self.vehicle.is_valid_airspeed(item.param2):
+            self.speed: float = item.param2
+            self.vehicle.info(f"Set airspeed {item.param2:.0f} m/s")
+
+    def _set_home(self, item: MissionItem) -> None:
+        plane = self.vehicle
+        point: Ned | None = plane.wing.place
+        if item.param1 != 1:  # unlike on Copter, zeros are a position
+            point = plane.point(int(item.x), int(item.y), item.z, item.frame)
+        if point is not None:
+            plane.navigation.set_home(point, lock=False)
+
+
+_ATTITUDE_TIMEOUT_S = 3.0
+_UNLIMITED_M_S = 1000.0
+_RATES = Mask.BODY_ROLL_RATE_IGNORE | Mask.BODY_PITCH_RATE_IGNORE | Mask.BODY_YAW_RATE_IGNORE
+_INVALID_ALTITUDES = (0.0, -1.0)
+
+
+@dataclass(frozen=True)
+class _TimedValue:
+    value: float
+    since: float
+
+
+class PlaneGuided(PlaneNavigatingMode):
+    """Circles around its target.
+
+    A commanded course is valid until a new target or no course is commanded. Bank, pitch and throttle of
+    SET_ATTITUDE_TARGET expire after three seconds each.
+    """
+
+    number: int = PlaneMode.GUIDED
+    name = "GUIDED"
+    can_change_speed = True
+
+    def enter(self, *, force: bool) -> bool:
+        self._climb_limit = _UNLIMITED_M_S
+        self._course: float | None = None
+        self._bank = self._pitch = self._throttle = _TimedValue(0.0, -math.inf)
+        return super().enter(force=force)
+
+    def go_to(self, position: Ned) -> None:
+        """Fly to a point of the world frame and circle there."""
+        self._place, self._course, self._climb_limit = position, None, _UNLIMITED_M_S
+
+    def change_altitude(self, down: float, climb_m_s: float = _UNLIMITED_M_S) -> None:
+        if self._place is not None:
+            self._place = (self._place[0], self._place[1], down)
+            self._climb_limit = climb_m_s
+
+    def change_course(self, course: float | None) -> None:
+        """Fly on a course (radians from north); None circles again."""
+        self._course = course
+
+    def set_attitude(self, message: m.SetAttitudeTarget) -> None:
+        """Follow the parts that the mask selects. A rate that is not ignored selects its angle."""
+        ignored, now = message.type_mask, self.vehicle.now
+        roll, pitch, _ = euler_from_quaternion(*message.q)
+        whole = not ignored & Mask.ATTITUDE_IGNORE and ignored & _RATES == _RATES
+        if whole or not ignored & Mask.BODY_ROLL_RATE_IGNORE:
+            self._bank = _TimedValue(roll, now)
+        if whole or not ignored & Mask.BODY_PITCH_RATE_IGNORE:
+            self._pitch = _TimedValue(pitch, now)
+        if not ignored & Mask.THROTTLE_IGNORE:
+            self._throttle = _TimedValue(max(0.0, min(1.0, message.thrust)), now)
+
+    def update(self, dt: float) -> None:
+        wing, now = self.vehicle.wing, self.vehicle.now
+        banks, pitches, throttles = (
+            now - target.since < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
+        )
+        if self.vehicle.is_landed or not (banks or pitches or throttles or self._course is not None):
+            super().update(dt)
+            return
+        speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if throttles else self.airspeed
+        climb = wing.climb_to(wing.down if self._place is None else self._place[2])
+        climb = max(-self._climb_limit, min(self._climb_limit, climb))
+        if pitches:
+            climb = max(-wing.wing.sink_m_s, min(wing.wing.climb_m_s, speed * math.sin(self._pitch.value)))
+        if not banks and self._course is not None:
+            wing.head(self._course, speed, climb)
+            return
+        bank = max(-wing.wing.bank_rad, min(wing.wing.bank_rad, self._bank.value)) if banks else 0.0
+        wing.bank_and_climb(speed, bank, climb)
+
+
+class PlaneSetpoints:
+    """Handlers of set-point messages in GUIDED. Of position targets ArduPlane uses the altitude only."""
+
+    def __init__(self, plane: PlaneHost) -> None:
+        self._plane = plane
+        plane.on(m.SetPositionTargetLocalNed, self._on_local)
+        plane.on(m.SetPositionTargetGlobalInt, self._on_global)
+        plane.on(m.SetAttitudeTarget, self._on_attitude)
+
+    @property
+    def _guided(self) -> PlaneGuided:
+        return self._plane.mode_of(PlaneGuided)
+
+    @property
+    def _is_guided(self) -> bool:
+        return self._plane.mode is self._guided
+
+    def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
+        """Change the altitude of the target by ``z`` metres down."""
+        plane, target = self._plane, self._guided.destination
+        if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
+            return
+        down = target[2] + message.z
+        self._guided.change_altitude(down)
+        plane.info(f"Change alt to {plane.home_or_ground[2] - down:.1f}")
+
+    def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
+        plane = self._plane
+        if not self._is_guided:
+            return
+        point = plane.point(0, 0, message.alt, message.coordinate_frame)
+        if point is None:
+            plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
+            plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
+        elif not message.type_mask & PositionMask.Z_IGNORE:
+            self._guided.change_altitude(point[2])
+
+    def _on_attitude(self, message: m.SetAttitudeTarget, _: Channel) -> None:
+        if self._is_guided:
+            self._guided.set_attitude(message)
+
+
+def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
+    """Return the handlers of the commands that change speed, altitude and course in GUIDED."""
+
+    def in_guided(handler: Callable[[PlaneHost, PlaneGuided, ReceivedCommand], int]) -> CommandHandler:
+        def handle(command: ReceivedCommand) -> int:
+            guided = plane.mode_of(PlaneGuided)
+            return handler(plane, guided, command) if plane.mode is guided else MavResult.FAILED
+
+        return handle
+
+    return {
+        _C.GUIDED_CHANGE_SPEED: in_guided(_change_speed),
+        _C.GUIDED_CHANGE_ALTITUDE: in_guided(_change_altitude),
+        _C.GUIDED_CHANGE_HEADING: in_guided(_change_heading),
+        _C.DO_CHANGE_ALTITUDE: lambda command: _change_target_altitude(plane, command),
+    }
+
+
+def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
+    if whole(command.param1) != SpeedType.AIRSPEED:
+        return MavResult.DENIED
+    if not plane.is_valid_airspeed(command.param2):
+        return MavResult.FAILED
+    guided.speed = command.param2
+    return MavResult.ACCEPTED
+
+
+def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
+    """Param 3 is the climb rate in m/s, 0 the maximum. The firmware refuses the altitudes 0 and -1."""
+    point = plane.point(0, 0, command.z, command.altitude_frame)
+    if command.z in _INVALID_ALTITUDES or point is None:
+        return MavResult.DENIED
+    guided.change_altitude(point[2], abs(command.param3) or _UNLIMITED_M_S)
+    return MavResult.ACCEPTED
+
+
+def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
+    """Params: HEADING_TYPE, degrees. Heading and course over ground are the same here; DEFAULT ends it."""
+    if not 0.0 <= command.param2 < 360.0:
+        return MavResult.DENIED
+    if command.param1 == HeadingType.DEFAULT:
+        guided.change_course(None)
+    elif command.param1 in (HeadingType.COURSE_OVER_GROUND, HeadingType.HEADING):
+        guided.change_course(math.radians(command.param2))
+    else:
+        return MavResult.DENIED
+    return MavResult.ACCEPTED
+
+
+def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
+    """Params: metres, MAV_FRAME. Accepted in every mode, but only GUIDED follows it."""
+    point = plane.point(0, 0, command.param1, whole(command.param2))
+    if point is None:
+        return MavResult.DENIED
+    guided = plane.mode_of(PlaneGuided)
+    if plane.mode is guided:
+        guided.change_altitude(point[2])
+    return MavResult.ACCEPTED

@@ -1,0 +1,291 @@
+"""ArduPlane's failsafes and fence: short and long failsafe of the radio, ground station, battery."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+from aerokit.mavlink.enums import MavCmd, MavMissionType, MavSeverity, PlaneMode
+from aerokit.sim.ardupilot.failsafes import ArduPilotFailsafes
+from aerokit.sim.ardupilot.fence import ArduPilotFence
+from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer
+from aerokit.sim.ardupilot.navigation import best_return_place
+from aerokit.sim.ardupilot.plane_modes import PlaneHost
+from aerokit.sim.motion import Ned
+
+_NONE, _SHORT, _LONG, _GCS = range(4)
+# The throttle failsafe starts after 1 s without pulses and a count of 0.2 s.
+_SILENT_S, _COUNT_S = 1.0, 0.2
+# FS_SHORT_ACTN, FS_LONG_ACTN, FS_GCS_ENABL and the battery actions.
+_SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
+_LONG_RTL, _LONG_GLIDE, _LONG_PARACHUTE, _LONG_AUTO, _LONG_AUTOLAND = range(1, 6)
+_HEARTBEAT, _HEARTBEAT_OR_RSSI, _IN_AUTO = 1, 2, 3
+_BATTERY_RTL, _LAND, _TERMINATE, _QLAND, _PARACHUTE, _LOITER_QLAND, _AUTOLAND_OR_RTL = range(1, 8)
+_PILOTED = frozenset(
+    {PlaneMode.MANUAL, PlaneMode.STABILIZE, PlaneMode.ACRO, PlaneMode.FLY_BY_WIRE_A, PlaneMode.AUTOTUNE}
+    | {PlaneMode.FLY_BY_WIRE_B, PlaneMode.CRUISE, PlaneMode.TRAINING}
+)
+_NAVIGATING = frozenset({PlaneMode.AUTO, PlaneMode.GUIDED, PlaneMode.LOITER, PlaneMode.AUTOLAND})
+_LONG_AS_PILOTED = _PILOTED | {PlaneMode.CIRCLE, PlaneMode.LOITER, PlaneMode.TAKEOFF}
+_SHORT_MODES = {_SHORT_FBWA: PlaneMode.FLY_BY_WIRE_A, _SHORT_FBWB: PlaneMode.FLY_BY_WIRE_B}
+_LONG_MODES: dict[int, tuple[int, ...]] = {
+    _LONG_GLIDE: (PlaneMode.FLY_BY_WIRE_A,),
+    _LONG_AUTO: (PlaneMode.AUTO,),
+    _LONG_AUTOLAND: (PlaneMode.AUTOLAND, PlaneMode.RTL),
+    _LONG_RTL: (PlaneMode.RTL,),
+}
+
+
+class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
+    """FS_SHORT_ACTN a second after the loss of the radio, FS_LONG_ACTN FS_LONG_TIMEOUT later; armed or not.
+
+    If the radio returns during the short failsafe, the previous mode is restored. Not simulated: the weak signal of
+    FS_GCS_ENABL 2, parachutes, termination.
+    """
+
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
+
+    def __init__(self, plane: PlaneHost) -> None:
+        super().__init__(plane)
+        self.state: int = _NONE  # 0 none, 1 short and 2 long failsafe of the radio, 3 ground station.
+        self._short_since = math.nan
+        self._radio_bad = ConditionTimer()
+        self._mode_before = self._mode_after = 0
+        self._is_pending = False
+
+    @property
+    def is_any_active(self) -> bool:
+        return self.state != _NONE or self.battery_is_low
+
+    @property
+    def is_radio_healthy(self) -> bool:
+        """True while pulses are received and the throttle is above THR_FS_VALUE."""
+        return not (self.radio or self._is_radio_bad())
+
+    def update(self) -> None:
+        self._check_radio()
+        self._check_long()
+        self._check_short()
+        self._resume_pending()
+        super().update()
+
+    def _is_radio_bad(self) -> bool:
+        plane = self.vehicle
+        low = plane.parameters["THR_FAILSAFE"] != 0 and plane.rc[2] <= plane.parameters["THR_FS_VALUE"]
+        return low or plane.now - self.radio_received_at > _SILENT_S
+
+    def _check_radio(self) -> None:
+        plane = self.vehicle
+        if plane.rc.is_receiving:
+            self.radio_received_at: float = plane.now
+        is_bad = self._is_radio_bad()
+        bad_for = self._radio_bad.seconds(is_bad, plane.now)
+        if not is_bad:
+            self._set_radio(False)
+        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:
+            self._set_radio(True)
+
+    def _set_radio(self, lost: bool) -> None:
+        if lost != self.radio:
+            self.radio = lost
+            self.warn(f"Throttle failsafe {'on' if lost else 'off'}")
+
+    def _check_short(self) -> None:
+        action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
+        is_landing = self.vehicle.mode.is_landing
+        if self.state == _NONE and self.radio and action != _SHORT_DISABLED and not is_landing:
+            self._start_short(action)
+        elif self.state == _SHORT and (not self.radio or action == _SHORT_DISABLED):
+            self._end_short()
+
+    def _start_short(self, action: int) -> None:
+        plane = self.vehicle
+        self.state, self._short_since = _SHORT, plane.now
+        self._mode_before = before = plane.mode.number
+        if before in _PILOTED or (before in _NAVIGATING and action != _SHORT_BEST_GUESS):
+            plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))
+        self._mode_after = plane.mode.number
+        if self._mode_after != before:
+            self.warn(f"RC Short Failsafe: switched to {plane.mode.name}")
+        else:
+            self.warn("RC Short Failsafe On")
+
+    def _end_short(self) -> None:
+        plane = self.vehicle
+        self.warn("Short Failsafe Cleared")
+        self.state = _NONE
+        if self._mode_after != self._mode_before and plane.mode.number == self._mode_after:
+            plane.set_mode(self._mode_before)
+            self.warn(f"Flight mode {plane.mode.name} restored", MavSeverity.INFO)
+
+    def _check_long(self) -> None:
+        if self.state in (_LONG, _GCS):
+            self._check_end_of_long()
+            return
+        plane = self.vehicle
+        if plane.mode.is_landing:
+            return
+        since = self._short_since if self.state == _SHORT else self.radio_received_at
+        timeout = plane.parameters["FS_LONG_TIMEOUT"]
+        enabled = int(plane.parameters["FS_GCS_ENABL"])
+        in_auto = enabled == _IN_AUTO and plane.mode.number == PlaneMode.AUTO
+        if self.radio and plane.now - since > timeout:
+            self._start_long(_LONG)
+        elif (in_auto or enabled in (_HEARTBEAT, _HEARTBEAT_OR_RSSI)) and self.ground_station_silence > timeout:
+            self.ground_station = True
+            self._start_long(_GCS)
+
+    def _check_end_of_long(self) -> None:
+        parameters = self.vehicle.parameters
+        name = "FS_LONG_TIMEOUT" if parameters["FS_SHORT_ACTN"] == _SHORT_DISABLED else "FS_SHORT_TIMEOUT"
+        if self.state == _GCS and self.ground_station_silence < parameters[name]:
+            self.ground_station: bool = False
+            self._end_long("GCS Failsafe Off")
+        elif self.state == _LONG and not self.radio:
+            self._end_long("RC Long Failsafe Cleared")
+
+    def _end_long(self, text: str) -> None:
+        self.state, self._is_pending = _NONE, False
+        self.warn(text)
+
+    def _start_long(self, state: int) -> None:
+        plane = self.vehicle
+        plane.rc.release_overrides()
+        self.state = state
+        mode = plane.mode.number
+        action = int(plane.parameters["FS_LONG_ACTN"])
+        if mode in _LONG_AS_PILOTED:
+            glides = action in (_LONG_GLIDE, _LONG_PARACHUTE)
+            if self._is_in_take_off and not glides:
+                self._is_pending = True
+            else:
+                self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
+        elif mode == PlaneMode.RTL:
+            if action in (_LONG_AUTO, _LONG_AUTOLAND):
+                self.change_to(*_LONG_MODES[action])
+        elif mode in (PlaneMode.AUTO, PlaneMode.GUIDED) and not plane.mode.is_landing:
+            self.change_to(*_LONG_MODES.get(action, ()))
+        self.warn(f"{'GCS' if state == _GCS else 'RC Long'} Failsafe On: {plane.mode.name}")
+
+    @property
+    def _is_in_take_off(self) -> bool:
+        return self.vehicle.mode.number == PlaneMode.TAKEOFF and self.vehicle.mode.is_taking_off
+
+    def _resume_pending(self) -> None:
+        """Start the long failsafe that had to wait for the end of a take-off."""
+        if self._is_pending and not self._is_in_take_off:
+            self._is_pending = False
+            if self.vehicle.mode.number == PlaneMode.TAKEOFF:
+                self._start_long(_LONG)
+
+    def act_on_battery(self, action: int) -> None:
+        is_landing = self.vehicle.mode.is_landing
+        lands = action in (_LAND, _QLAND, _LOITER_QLAND)
+        if action == _TERMINATE:
+            self.refuse_termination()
+        elif not is_landing and (lands or action in (_BATTERY_RTL, _AUTOLAND_OR_RTL)):
+            if lands and self._land_by_mission():
+                return
+            first = (PlaneMode.AUTOLAND,) if action == _AUTOLAND_OR_RTL else ()
+            if not self.vehicle.mode.is_landing:
+                self.change_to(*first, PlaneMode.RTL)
+
+    def refuse_termination(self) -> None:
+        """Report why the flight is not terminated: AFS_ENABLE is 0, or AFS_TERM_ACTION is not set."""
+        text = "AFS not enabled, can't terminate the vehicle"
+        if self.vehicle.parameters["AFS_ENABLE"]:
+            text = "Unable to terminate, termination is not configured"
+        self.warn(text, MavSeverity.INFO)
+
+    def _land_by_mission(self) -> bool:
+        """Jump to DO_LAND_START and change to AUTO; return False if there is none."""
+        plane = self.vehicle
+        items = enumerate(plane.missions.commands.items())
+        start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)
+        if start is None:
+            self.warn("Unable to start landing sequence")
+            return False
+        plane.mission.set_current(start)
+        self.warn("Landing sequence start", MavSeverity.INFO)
+        return plane.set_mode(PlaneMode.AUTO)
+
+
+# FENCE_ACTION.
+_RTL, _GUIDED, _GUIDED_THROTTLE, _AUTOLAND = 1, 6, 7, 8
+_RETURNS = frozenset({_RTL, _GUIDED, _GUIDED_THROTTLE, _AUTOLAND})
+
+
+class PlaneFence(ArduPilotFence[PlaneHost]):
+    """FENCE_ACTION: nothing (0), RTL (1), GUIDED to the return point (6, 7), AUTOLAND or RTL (8).
+
+    During a return other breaches are ignored. If the fence is disabled on the way to the return point, the previous
+    mode is restored.
+    """
+
+    CIRCLE_BACKUP_M: ClassVar[float] = 100.0
+    CHECKS_DISARMED: ClassVar[bool] = True
+
+    def __init__(self, plane: PlaneHost) -> None:
+        super().__init__(plane)
+        self._mode_before: int | None = None
+
+    def update(self) -> None:
+        super().update()
+        if not self.enabled and self.caused_mode and self._mode_before is not None:
+            if self.vehicle.mode.number == PlaneMode.GUIDED and self._action in _RETURNS:
+                self.vehicle.set_mode(self._mode_before)
+            self.caused_mode = False
+
+    def act(self, new: int) -> None:
+        plane = self.vehicle
+        if self.caused_mode:
+            return
+        self.report("breached", new)
+        before = plane.mode.number
+        if self._action == _RTL:
+            self._turn_back(before, PlaneMode.RTL)
+        elif self._action == _AUTOLAND and before != PlaneMode.AUTOLAND:
+            self._turn_back(before, PlaneMode.AUTOLAND, PlaneMode.RTL)
+        elif self._action in (_GUIDED, _GUIDED_THROTTLE):
+            self._turn_back(before, PlaneMode.GUIDED)
+            plane.guided.go_to(self.return_place())
+
+    def return_place(self) -> Ned:
+        """Return the fence's return point or home, at FENCE_RET_ALT or half-way between the altitude limits."""
+        plane, parameters = self.vehicle, self.vehicle.parameters
+        home = plane.home_or_ground
+        if parameters["FENCE_RET_RALLY"]:
+            return best_return_place(plane, (home[0], home[1], home[2] - parameters["RTL_ALTITUDE"]))
+        lowest = parameters["FENCE_ALT_MIN"] + parameters["FENCE_MARGIN"]
+        highest = parameters["FENCE_ALT_MAX"] - parameters["FENCE_MARGIN"]
+        height = parameters["FENCE_RET_ALT"]
+        if height <= 0:
+            height = parameters["RTL_ALTITUDE"] if lowest >= highest else (lowest + highest) / 2.0
+        points = (
+            plane.frame.to_local(int(item.x), int(item.y))
+            for item in plane.missions.items(MavMissionType.FENCE)
+            if item.command == MavCmd.NAV_FENCE_RETURN_POINT
+        )
+        north, east = next(points, home[:2])
+        return (north, east, home[2] - height)
+
+    def cleared(self) -> None:
+        if self.vehicle.is_armed and not self.caused_mode:
+            self.vehicle.send_text(MavSeverity.NOTICE, "Fence breach cleared")
+
+    def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
+        if not self.forbids_modes() or not self.vehicle.is_armed:
+            return None
+        return MavSeverity.NOTICE, f"Mode change to {mode.name} denied, in fence recovery"
+
+    def mode_changed(self) -> None:
+        super().mode_changed()
+        self.recover_by_hand()
+
+    @property
+    def _action(self) -> int:
+        return int(self.vehicle.parameters["FENCE_ACTION"])
+
+    def _turn_back(self, before: int, *modes: int) -> None:
+        self.caused_mode: bool = any(self.vehicle.set_mode(mode) for mode in modes)
+        self._mode_before = before

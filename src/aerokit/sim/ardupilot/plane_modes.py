@@ -1,0 +1,351 @@
+"""ArduPlane's landing, and its flight modes except AUTO and GUIDED. The table of modes is in `plane`."""
+
+from __future__ import annotations
+
+import math
+
+from aerokit.mavlink.enums import MavModeFlag, MavSeverity
+from aerokit.sim.ardupilot.host import ArduPilotMode, ConditionTimer
+from aerokit.sim.ardupilot.navigation import best_return_place
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.motion import Motion, Ned, SimulatedWind
+from aerokit.sim.vehicle_motion import FixedWing
+
+
+class PlaneHost(ArduPilotVehicle):
+    """An aeroplane as its modes and failsafes see it."""
+
+    def make_motion(self, wind: SimulatedWind | None) -> Motion:
+        self.wing: FixedWing = FixedWing(self.rng, wind=wind)
+        """The motion model; the same as ``motion``."""
+        self._read_limits()
+        return self.wing
+
+    def _read_limits(self) -> None:
+        limits, parameters = self.wing.wing, self.parameters
+        limits.airspeed_min_m_s = parameters["AIRSPEED_MIN"]
+        limits.airspeed_max_m_s = parameters["AIRSPEED_MAX"]
+        limits.climb_m_s = parameters["TECS_CLMB_MAX"]
+        limits.sink_m_s = parameters["TECS_SINK_MAX"]
+        limits.glide_sink_m_s = parameters["TECS_SINK_MIN"]
+        limits.bank_rad = math.radians(parameters["ROLL_LIMIT_DEG"])
+
+    def reset_controllers(self) -> None:
+        self.take_off_yaw: float | None = None
+        """Heading of the take-off in radians; None before."""
+        self.rest_timer: ConditionTimer = ConditionTimer()
+
+    @property
+    def cruise_m_s(self) -> float:
+        return self.parameters["AIRSPEED_CRUISE"]
+
+    @property
+    def home_or_ground(self) -> Ned:
+        """Home, or the ground at the power-on location while home is not set."""
+        return self.navigation.home or (0.0, 0.0, self.wing.ground_down)
+
+    def is_valid_airspeed(self, airspeed: float) -> bool:
+        """Return True from AIRSPEED_MIN to AIRSPEED_MAX (m/s)."""
+        return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
+
+    def lift_off(self) -> None:
+        """Start to move: first on the ground, then in the air."""
+        if self.is_landed:
+            self._read_limits()
+            self.is_landed: bool = False
+            self.rest_timer.reset()
+            self.take_off_yaw = self.wing.yaw
+
+    def climb_out(self) -> None:
+        """Fly straight on with full throttle, and climb once the airspeed suffices."""
+        wing = self.wing
+        self.lift_off()
+        if wing.is_on_ground:
+            wing.bank_and_climb(self.cruise_m_s, 0.0, wing.wing.climb_m_s)
+        else:
+            yaw = wing.yaw if self.take_off_yaw is None else self.take_off_yaw
+            wing.head(yaw, self.cruise_m_s, wing.wing.climb_m_s)
+
+
+_FLARE_SINK_M_S = 0.5
+_APPROACH_SHARE = 0.85
+_JOINED_M = 60.0
+_CORRECTION_LENGTH_M = 80.0
+
+
+class PlaneLanding:
+    """Landing on ``point``: approach, flare, roll-out, disarming. With ``start`` the approach begins there."""
+
+    def __init__(self, plane: PlaneHost, point: Ned, start: Ned | None = None) -> None:
+        self._plane = plane
+        self.point: Ned = point
+        self._start = start
+        self._from: Ned = plane.wing.place
+        self._flares = self._is_reported = False
+        self._stopped_at = math.nan
+
+    def update(self, dt: float) -> None:
+        plane, wing = self._plane, self._plane.wing
+        if plane.is_landed:
+            self._wait()
+        elif wing.is_on_ground:
+            wing.roll_out()
+        elif self._start is not None:
+            self._join(self._start)
+        else:
+            self._approach()
+
+    def _join(self, start: Ned) -> None:
+        wing = self._plane.wing
+        distance = math.hypot(start[0] - wing.north, start[1] - wing.east)
+        if distance < _JOINED_M and abs(wing.down - start[2]) < _JOINED_M / 4:
+            self._from, self._start = wing.place, None
+            return
+        wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
+
+    def _approach(self) -> None:
+        plane, wing, (north, east, down) = self._plane, self._plane.wing, self.point
+        course = math.atan2(east - self._from[1], north - self._from[0])
+        cos_course, sin_course = math.cos(course), math.sin(course)
+        # Metres to go along the approach (negative beyond the point), and metres off the approach line.
+        remaining = (north - wing.north) * cos_course + (east - wing.east) * sin_course
+        aside = (east - wing.east) * cos_course - (north - wing.north) * sin_course
+        flare_time = wing.velocity_down * plane.parameters["LAND_FLARE_SEC"]
+        if down - wing.down < max(plane.parameters["LAND_FLARE_ALT"], flare_time):
+            self._flare(down - wing.down, remaining)
+        length = max(1.0, math.hypot(north - self._from[0], east - self._from[1]))
+        wanted = down + (self._from[2] - down) * max(0.0, remaining) / length
+        slope_sink = (down - self._from[2]) * wing.ground_speed_m_s / length
+        climb = -_FLARE_SINK_M_S if self._flares else -slope_sink + wing.climb_to(wanted)
+        speed = wing.wing.airspeed_min_m_s if self._flares else _APPROACH_SHARE * plane.cruise_m_s
+        wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
+
+    def _flare(self, height: float, remaining: float) -> None:
+        if self._flares:
+            return
+        self._flares, wing = True, self._plane.wing
+        speed, sink = wing.ground_speed_m_s, wing.velocity_down
+        self._plane.info(f"Flare {height:.1f}m sink={sink:.2f} speed={speed:.1f} dist={remaining:.1f}")
+
+    def _wait(self) -> None:
+        """Disarm LAND_DISARMDELAY after the stop."""
+        plane, wing = self._plane, self._plane.wing
+        if math.isnan(self._stopped_at):
+            self._stopped_at = plane.now
+        delay = plane.parameters["LAND_DISARMDELAY"]
+        if plane.is_armed and delay > 0 and plane.now - self._stopped_at >= delay:
+            plane.arming.disarm()
+            plane.info("Auto disarmed")
+            if not self._is_reported:
+                self._is_reported = True
+                aside = math.hypot(self.point[0] - wing.north, self.point[1] - wing.east)
+                plane.info(f"Distance from LAND point={aside:.2f}m")
+
+
+_MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
+_CIRCLE_BANK_SHARE = 1 / 3
+_TAKE_OFF_DONE_M = 5.0
+_NAVIGATES = MavModeFlag.GUIDED_ENABLED | MavModeFlag.STABILIZE_ENABLED
+
+
+class PlaneModeBase(ArduPilotMode):
+    """Base of ArduPlane's modes, which can be entered without a position."""
+
+    vehicle: PlaneHost
+    needs_position = False
+    flags: int = MavModeFlag.STABILIZE_ENABLED
+    """MAV_MODE_FLAGs in HEARTBEAT."""
+
+    def stick(self, index: int) -> float:
+        """Return a stick position, -1 to 1."""
+        return (self.vehicle.rc[index] - _MID_STICK) / _STICK_RANGE
+
+
+class PlanePilotedMode(PlaneModeBase):
+    """Bank, climb and speed by the sticks; it glides with a low throttle."""
+
+    has_manual_throttle = True
+
+    def update(self, dt: float) -> None:
+        plane, wing = self.vehicle, self.vehicle.wing
+        throttle = max(0.0, min(1.0, (plane.rc[2] - 1000) / 1000))
+        if plane.is_landed and plane.rc[2] <= _LOW_THROTTLE:
+            wing.roll_out()
+            return
+        plane.lift_off()
+        climb = self.stick(1) * wing.wing.climb_m_s  # a stick that is pulled back is above the middle
+        if plane.rc[2] <= _LOW_THROTTLE:
+            climb = min(climb, 0.0) - wing.wing.glide_sink_m_s
+        speed = max(throttle * 2 * plane.cruise_m_s, 0.0)
+        wing.bank_and_climb(speed, self.stick(0) * wing.wing.bank_rad, climb)
+
+
+class PlaneAltitudeMode(PlaneModeBase):
+    """Base of modes that hold altitude and speed and roll out on the ground."""
+
+    def __init__(self, plane: PlaneHost) -> None:
+        super().__init__(plane)
+        self._down = 0.0
+
+    def enter(self, *, force: bool) -> bool:
+        self._down = self.vehicle.wing.down
+        return True
+
+    def update(self, dt: float) -> None:
+        wing = self.vehicle.wing
+        if self.vehicle.is_landed:
+            wing.roll_out()
+            return
+        self._down -= self.climb_rate() * dt
+        self.steer(wing.climb_to(self._down))
+
+    def climb_rate(self) -> float:
+        """Return the rate at which the altitude changes, in m/s."""
+        return self.stick(1) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
+
+    def steer(self, climb: float) -> None:
+        """Bank by the stick."""
+        wing = self.vehicle.wing
+        wing.bank_and_climb(self.vehicle.cruise_m_s, self.stick(0) * wing.wing.bank_rad, climb)
+
+
+class PlaneCruise(PlaneAltitudeMode):
+    """Like FBWB, but holds the course over ground while the roll stick is centred."""
+
+    def __init__(self, plane: PlaneHost) -> None:
+        super().__init__(plane)
+        self._course: float | None = None
+
+    def steer(self, climb: float) -> None:
+        wing = self.vehicle.wing
+        if abs(self.stick(0)) > 0.05:
+            self._course = None
+            super().steer(climb)
+            return
+        if self._course is None:
+            self._course = math.atan2(wing.velocity_east, wing.velocity_north)
+        wing.head(self._course, self.vehicle.cruise_m_s, climb)
+
+
+class PlaneCircle(PlaneAltitudeMode):
+    """Turns gently at a constant altitude, without GPS."""
+
+    flags: int = _NAVIGATES
+
+    def climb_rate(self) -> float:
+        return 0.0
+
+    def steer(self, climb: float) -> None:
+        wing = self.vehicle.wing
+        wing.bank_and_climb(self.vehicle.cruise_m_s, _CIRCLE_BANK_SHARE * wing.wing.bank_rad, climb)
+
+
+class PlaneNavigatingMode(PlaneModeBase):
+    """Flies to a place and circles there: by default the place where the mode was entered."""
+
+    flags: int = _NAVIGATES
+
+    def __init__(self, plane: PlaneHost) -> None:
+        super().__init__(plane)
+        self.speed: float = 0.0  # Commanded airspeed in m/s; 0 means AIRSPEED_CRUISE.
+        self.radius: float = 0.0  # Radius of the circle in metres; 0 means WP_LOITER_RAD.
+        self._place: Ned | None = None
+
+    def enter(self, *, force: bool) -> bool:
+        self.speed = self.radius = 0.0
+        self._place = self.vehicle.wing.place
+        return True
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._place
+
+    @property
+    def airspeed(self) -> float:
+        return self.speed or self.vehicle.cruise_m_s
+
+    def update(self, dt: float) -> None:
+        wing = self.vehicle.wing
+        if self.vehicle.is_landed or self._place is None:
+            wing.roll_out()
+            return
+        radius = self.radius or self.vehicle.parameters["WP_LOITER_RAD"]
+        wing.circle(*self._place, radius=radius, airspeed=self.airspeed)
+
+
+class PlaneRtl(PlaneNavigatingMode):
+    """Returns to home at RTL_ALTITUDE (negative: the present altitude) or to a rally point, and circles there."""
+
+    can_arm = False
+
+    def enter(self, *, force: bool) -> bool:
+        super().enter(force=force)
+        plane = self.vehicle
+        home, height = plane.home_or_ground, plane.parameters["RTL_ALTITUDE"]
+        self.radius: float = plane.parameters["RTL_RADIUS"]
+        down = plane.wing.down if height < 0 else home[2] - height
+        self._place = best_return_place(plane, (home[0], home[1], down))
+        return True
+
+
+class PlaneTakeOff(PlaneNavigatingMode):
+    """Takes off once armed, climbs to TKOFF_ALT and circles TKOFF_DIST ahead."""
+
+    def enter(self, *, force: bool) -> bool:
+        super().enter(force=force)
+        self._place = None
+        self._climbs = False
+        return True
+
+    @property
+    def is_taking_off(self) -> bool:  # type: ignore[override]
+        return self._climbs
+
+    def update(self, dt: float) -> None:
+        plane, wing = self.vehicle, self.vehicle.wing
+        if self._place is None:
+            self._start()
+        assert self._place is not None
+        if self._climbs:
+            plane.climb_out()
+            self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
+        else:
+            super().update(dt)
+
+    def _start(self) -> None:
+        plane, wing = self.vehicle, self.vehicle.wing
+        height, distance = plane.parameters["TKOFF_ALT"], plane.parameters["TKOFF_DIST"]
+        along = (distance * math.cos(wing.yaw), distance * math.sin(wing.yaw))
+        self._place = (wing.north + along[0], wing.east + along[1], plane.home_or_ground[2] - height)
+        self._climbs = wing.down > self._place[2] + _TAKE_OFF_DONE_M
+        heading = math.degrees(wing.yaw) % 360.0
+        text = "Climbing to TKOFF alt then loitering" if self._climbs else "Above TKOFF alt - loitering"
+        if plane.is_landed:
+            text = f"Takeoff to {height:.0f}m for {distance:.1f}m heading {heading:.1f} deg"
+        plane.info(text)
+
+
+class PlaneAutoland(PlaneNavigatingMode):
+    """Lands where it took off, in the same direction. Needs flight; armed again after landing, it disarms at once."""
+
+    is_landing = True
+
+    def enter(self, *, force: bool) -> bool:
+        plane = self.vehicle
+        if plane.mode is self and plane.is_landed:  # armed again after landing
+            return True
+        if plane.is_landed:
+            plane.send_text(MavSeverity.WARNING, "Must already be flying!")
+            return False
+        if plane.take_off_yaw is None:
+            plane.send_text(MavSeverity.WARNING, "Takeoff initial direction not set")
+            return False
+        home = plane.home_or_ground
+        far, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
+        north, east = math.cos(plane.take_off_yaw), math.sin(plane.take_off_yaw)
+        start = (home[0] - far * north, home[1] - far * east, home[2] - height)
+        self._place, self._landing = home, PlaneLanding(plane, home, start)
+        return True
+
+    def update(self, dt: float) -> None:
+        self._landing.update(dt)

@@ -1,0 +1,344 @@
+"""`SimulatedRover`: an ArduRover 4.7 car without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
+from aerokit.mavlink.enums import (
+    FenceMitigate,
+    MavCmd,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    RoverMode,
+)
+from aerokit.mavlink.messages import SetAttitudeTarget
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
+from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
+from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors, ConditionTimer
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.radio import RoverJoystick
+from aerokit.sim.ardupilot.rover_modes import ROVER_MODES, RoverGuided, RoverHost
+from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.commands import CommandHandler, PositionTarget
+from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
+from aerokit.sim.vehicle_motion import GroundLimits, GroundMotion
+
+_NEEDS_LOCATION = 1
+
+
+class RoverArming(ArduPilotArming[RoverHost]):
+    """Needs a position only in modes that use it, or always with ARMING_NEED_LOC."""
+
+    def ahrs_reasons(self) -> Sequence[str]:
+        return ()  # checked after GPS, in `position_reasons`
+
+    def position_reasons(self) -> Sequence[str]:
+        """Check GPS, then the estimator and its position."""
+        rover = self.vehicle
+        if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
+            return ()
+        if reasons := super().position_reasons() or super().ahrs_reasons():
+            return reasons
+        if rover.failsafes.estimator:
+            return ("EKF failsafe",)
+        return () if rover.navigation.has_position else ("Need Position Estimate",)
+
+    def own_reasons(self) -> list[str]:
+        reasons = []
+        if self.is_checked(ArmingCheck.PARAMETERS) and not self.vehicle.parameters["WP_SPEED"] > 0:
+            reasons.append("WP_SPEED too low")
+        return reasons + ([] if self.vehicle.mode.can_arm else ["Mode not armable"])
+
+    def armed(self) -> None:
+        self.vehicle.path.reset()
+
+    def disarm(self, *, force: bool = True) -> bool:
+        """Disarm at any time. The place becomes home unless home was set by a command."""
+        rover, was_armed = self.vehicle, self.vehicle.is_armed
+        if not super().disarm(force=True):
+            return False
+        if was_armed and rover.navigation.home is not None and not rover.navigation.home_is_locked:
+            rover.navigation.set_home(rover.motion.place, lock=False)
+        return True
+
+
+# FS_ACTION, FENCE_ACTION and the battery actions.
+_NONE, _RTL, _HOLD, _SMART_RTL, _SMART_RTL_OR_HOLD, _TERMINATE, _LOITER_OR_HOLD = range(7)
+_MODES: dict[int, tuple[int, ...]] = {
+    _RTL: (RoverMode.RTL, RoverMode.HOLD),
+    _HOLD: (RoverMode.HOLD,),
+    _SMART_RTL: (RoverMode.SMART_RTL, RoverMode.RTL, RoverMode.HOLD),
+    _SMART_RTL_OR_HOLD: (RoverMode.SMART_RTL, RoverMode.HOLD),
+    _LOITER_OR_HOLD: (RoverMode.LOITER, RoverMode.HOLD),
+}
+_RADIO, _GCS = "Radio", "GCS"
+_SILENT_S = 0.5
+_CONTINUE_MISSION = 2
+_ACTIVE_IN_HOLD = 1
+_EKF_REPORT_ONLY = 2
+_ESTIMATOR_TIMEOUT_S, _STUCK_S, _STUCK_M_S = 1.0, 2.0, 0.08
+_HOLD_AND_DISARM = 2
+_DRIVES_ITSELF = frozenset(
+    {RoverMode.AUTO, RoverMode.GUIDED, RoverMode.RTL, RoverMode.SMART_RTL, RoverMode.LOITER, RoverMode.CIRCLE}
+)
+
+
+class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
+    """FS_ACTION follows FS_TIMEOUT after the loss of radio or ground station, armed or not, except in RTL and HOLD.
+
+    Both are one failsafe in the firmware. The link that is checked first after the time-out gives it its name, so a
+    lost ground station is reported as "Radio Failsafe" if the radio is checked too.
+    """
+
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
+        _TERMINATE, _HOLD, _RTL, _SMART_RTL_OR_HOLD, _SMART_RTL, _NONE,
+    )  # fmt: skip
+
+    def __init__(self, rover: RoverHost) -> None:
+        super().__init__(rover)
+        self._lost: set[str] = set()
+        self._triggered: set[str] = set()
+        self._lost_since = math.nan
+        self._position_lost, self._stuck = ConditionTimer(), ConditionTimer()
+
+    @property
+    def is_any_active(self) -> bool:
+        return bool(self._triggered) or self.estimator  # a low battery is not critical here
+
+    def update(self) -> None:
+        self._check_radio()
+        self._check_ground_station()
+        self._check_estimator()
+        self._check_wheels()
+        super().update()
+
+    def _check_radio(self) -> None:
+        rover, parameters = self.vehicle, self.vehicle.parameters
+        if rover.rc.is_receiving:
+            self.radio_received_at: float = rover.now
+        if not parameters["FS_THR_ENABLE"]:
+            self.radio = False
+            return
+        low = rover.rc[2] < parameters["FS_THR_VALUE"]
+        self.radio: bool = low or rover.now - self.radio_received_at > _SILENT_S
+        self._trigger(_RADIO, self.radio)
+
+    def _check_ground_station(self) -> None:
+        parameters = self.vehicle.parameters
+        if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
+            return
+        self.ground_station: bool = self.ground_station_silence >= parameters["FS_GCS_TIMEOUT"]
+        self._trigger(_GCS, self.ground_station)
+
+    def _trigger(self, name: str, lost: bool) -> None:
+        rover, was_any = self.vehicle, bool(self._lost)
+        self._lost = self._lost | {name} if lost else self._lost - {name}
+        if self._lost and not was_any:
+            self._lost_since = rover.now
+        if self._triggered and not self._lost:
+            self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
+        self._triggered &= self._lost
+        is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
+        if self._triggered or not self._lost or is_waiting or not self._may_act():
+            return
+        self._triggered = set(self._lost)
+        self.warn(f"{name} Failsafe")
+        rover.rc.release_overrides()
+        enabled = rover.parameters["FS_THR_ENABLE" if name == _RADIO else "FS_GCS_ENABLE"]
+        if rover.mode.number == RoverMode.AUTO and enabled == _CONTINUE_MISSION:
+            self.warn("Failsafe - Continuing Auto Mode")
+        else:
+            self.act_on_battery(int(rover.parameters["FS_ACTION"]))
+
+    def _may_act(self) -> bool:
+        rover = self.vehicle
+        if rover.mode.number == RoverMode.HOLD:
+            return bool(int(rover.parameters["FS_OPTIONS"]) & _ACTIVE_IN_HOLD)
+        return rover.mode.number != RoverMode.RTL
+
+    def act_on_battery(self, action: int) -> None:
+        """Execute an action; those of FS_ACTION and the battery are the same."""
+        if action == _TERMINATE:
+            self.vehicle.arming.disarm()
+        else:
+            self.change_to(*_MODES.get(action, ()))
+
+    def _check_estimator(self) -> None:
+        rover = self.vehicle
+        is_lost = rover.is_armed and not rover.navigation.has_position
+        lost_for = self._position_lost.seconds(is_lost, rover.now)
+        if not is_lost:
+            if self.estimator:
+                self.estimator = False
+                self.warn("EKF failsafe cleared", MavSeverity.CRITICAL)
+            return
+        if self.estimator or lost_for < _ESTIMATOR_TIMEOUT_S:
+            return
+        self.estimator: bool = True
+        self.warn("EKF variance", MavSeverity.CRITICAL)
+        action = int(rover.parameters["FS_EKF_ACTION"])
+        if action and rover.mode.needs_position:
+            if action != _EKF_REPORT_ONLY:
+                rover.set_mode(RoverMode.HOLD)
+            self.warn("EKF failsafe", MavSeverity.CRITICAL)
+
+    def _check_wheels(self) -> None:
+        """Detect that the rover does not move although it should (FS_CRASH_CHECK)."""
+        rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
+        tries = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
+        is_stuck = bool(action) and tries and rover.motion.ground_speed_m_s < _STUCK_M_S
+        if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
+            self._stuck.reset()
+            self.warn("Crash: Going to HOLD", MavSeverity.EMERGENCY)
+            rover.set_mode(RoverMode.HOLD)
+            if action == _HOLD_AND_DISARM:
+                rover.arming.disarm()
+
+
+_HOLD_BEYOND_M = 100.0
+
+
+class RoverFence(ArduPilotFence[RoverHost]):
+    """FENCE_ACTION has the actions of FS_ACTION; HOLD far outside. There are no altitude limits and no texts."""
+
+    PERIOD_S: ClassVar[float] = 0.1
+    CHECKS_DISARMED: ClassVar[bool] = True
+    MITIGATION: ClassVar[int] = FenceMitigate.NONE
+
+    def act(self, new: int) -> None:
+        vehicle = self.vehicle
+        action = int(vehicle.parameters["FENCE_ACTION"])
+        if action == REPORT_ONLY:
+            return
+        if self.beyond_m(new) > _HOLD_BEYOND_M:
+            vehicle.set_mode(RoverMode.HOLD)
+        elif action == _TERMINATE:
+            vehicle.arming.disarm()
+        else:
+            self.caused_mode: bool = any(vehicle.set_mode(mode) for mode in _MODES.get(action, ()))
+
+    def mode_changed(self) -> None:
+        super().mode_changed()
+        self.recover_by_hand()
+
+
+class RoverSetpoints(GuidedSetpoints):
+    """Accepts a heading or turn rate without a velocity; thrust is a share of the waypoint speed."""
+
+    vehicle: RoverHost
+
+    def refuse_acceleration(self, message: PositionTarget) -> None:
+        self.vehicle.info(f"Ignoring {message.NAME}; set ACC_IGNORE in mask")
+
+    def is_complete(self, target: GuidedTarget) -> bool:
+        # Heading and turn rate together are refused without a velocity.
+        return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
+
+    def steer(self, message: SetAttitudeTarget) -> None:
+        """Drive with the thrust; a turn rate has precedence over the heading."""
+        if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
+            return
+        speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))
+        heading = euler_from_quaternion(*message.q)[2]
+        velocity = (abs(speed) * math.cos(heading), abs(speed) * math.sin(heading), 0.0)
+        if message.type_mask & AttitudeMask.BODY_YAW_RATE_IGNORE:
+            self.mode.set_target(GuidedTarget(None, velocity, speed < 0, heading))
+        else:
+            self.mode.set_target(GuidedTarget(None, velocity, speed < 0, None, message.body_yaw_rate))
+
+
+_AMPERES_AT_FULL = 16.0
+
+
+class RoverMotors(ArduPilotMotors):
+    """The motor that drives the wheels."""
+
+    @property
+    def current_a(self) -> float:
+        return abs(self.throttle) * _AMPERES_AT_FULL
+
+    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
+        self.throttle: float = max(-1.0, min(1.0, motion.speed_m_s / motion.wheels.top_speed_m_s / 2.0))
+        if not self.is_armed:
+            self.throttle = 0.0
+
+
+_GUIDED_MODES = frozenset({"LOIT", "CIRC", "AUTO", "RTL", "SRTL", "GUID"})
+_MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
+
+
+class SimulatedRover(RoverHost):
+    """Behaves as ArduRover does where a client can observe it; drives with `GroundMotion`.
+
+    Takes the arguments of `ArduPilotVehicle`. It has 1,235 parameters. Simulated: MANUAL, ACRO, STEERING and SIMPLE by
+    the sticks, HOLD, LOITER and CIRCLE (standing), AUTO, GUIDED, RTL and SMART_RTL. Take-off and landing are unknown
+    commands.
+
+    Not simulated: boats, driving in circles, slowing down before a fence.
+    """
+
+    KIND: ClassVar[Kind] = "rover"
+    FIRMWARE: ClassVar[str] = "ArduRover"
+    MAV_TYPE: ClassVar[int] = MavType.GROUND_ROVER
+    HOME_NEEDS_ORIGIN: ClassVar[bool] = False
+    REPORTS_HOME: ClassVar[bool] = True
+    CAPABILITIES: ClassVar[int] = 0xF1EF
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["rover"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = ROVER_MODES
+    ARMING: ClassVar[type[RoverArming]] = RoverArming
+    FAILSAFES: ClassVar[type[RoverFailsafes]] = RoverFailsafes
+    FENCE: ClassVar[type[RoverFence]] = RoverFence
+    MOTORS: ClassVar[type[RoverMotors]] = RoverMotors
+    JOYSTICK: ClassVar[type[RoverJoystick]] = RoverJoystick
+
+    def make_motion(self, wind: SimulatedWind | None) -> GroundMotion:
+        """Create the motion model with the present limits; wind is reported but has no effect."""
+        parameters = self.parameters
+        limits = GroundLimits(
+            acceleration_m_s2=parameters["ATC_ACCEL_MAX"] or 1.0,
+            top_speed_m_s=self.top_speed,
+            turn_rate_rad_s=math.radians(parameters["ATC_STR_RAT_MAX"] or 120.0),
+            turn_radius_m=parameters["TURN_RADIUS"] or 0.9,
+            sideways_m_s2=9.81 * (parameters["ATC_TURN_MAX_G"] or 0.6),
+        )
+        return GroundMotion(self.rng, limits, wind)
+
+    def listen_for_setpoints(self) -> None:
+        RoverSetpoints(self, self.guided)
+
+    @property
+    def is_standby(self) -> bool:
+        return self.mode.number == RoverMode.HOLD
+
+    @property
+    def guided(self) -> RoverGuided:
+        return self.mode_of(RoverGuided)
+
+    @property
+    def base_mode(self) -> int:
+        base, name = int(MavModeFlag.CUSTOM_MODE_ENABLED), self.mode.name
+        if name in _MANUAL_INPUT:
+            base |= MavModeFlag.MANUAL_INPUT_ENABLED
+        if name in _GUIDED_MODES:
+            base |= MavModeFlag.GUIDED_ENABLED
+        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+
+    @property
+    def is_at_rest(self) -> bool:
+        return abs(self.motion.speed_m_s) < 0.01
+
+    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+        return "Flight mode change failed"
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        return {
+            **super().make_commands(),
+            MavCmd.NAV_RETURN_TO_LAUNCH: lambda _: self.change_to(RoverMode.RTL),
+            MavCmd.DO_FLIGHTTERMINATION: lambda _: MavResult.UNSUPPORTED,
+        }

@@ -1,1 +1,0 @@
-"""What is ArduRover's own: its modes, arming, failsafes, fence."""

@@ -1,0 +1,258 @@
+"""Flight modes of a simulated ArduRover. FOLLOW, DOCK and INITIALISING are refused; SIMPLE drives like MANUAL."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from aerokit.mavlink.enums import MavSeverity, RoverMode
+from aerokit.mavlink.messages import MissionItemReached
+from aerokit.sim.ardupilot.host import ArduPilotMode, variant
+from aerokit.sim.ardupilot.navigation import SmartPath, best_return_place
+from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
+from aerokit.sim.motion import Ned, wrap_pi
+from aerokit.sim.vehicle_motion import GroundMotion
+
+_ARRIVED_M, _STANDING_M_S = 0.3, 0.1
+_FULL_STEERING_RAD_S = math.radians(90.0)
+_THROTTLE = 2
+
+
+class RoverHost(RoverSubVehicle):
+    """A rover as its modes and failsafes see it."""
+
+    motion: GroundMotion  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def reset_controllers(self) -> None:
+        self.rc[_THROTTLE] = 1500
+        self.path: SmartPath = SmartPath(self, only_armed=False)
+
+    def _become_ready(self) -> None:
+        super()._become_ready()
+        self.path.start()
+
+    @property
+    def top_speed(self) -> float:
+        """SPEED_MAX in m/s, or the speed that CRUISE_SPEED at CRUISE_THROTTLE implies."""
+        parameters = self.parameters
+        return parameters["SPEED_MAX"] or 100.0 * parameters["CRUISE_SPEED"] / parameters["CRUISE_THROTTLE"]
+
+    @property
+    def waypoint_speed(self) -> float:
+        return self.parameters["WP_SPEED"] or self.parameters["CRUISE_SPEED"]
+
+    def has_arrived(self, place: Ned) -> bool:
+        """Return True at a place where the rover stops, or just beyond it."""
+        motion = self.motion
+        north, east = place[0] - motion.north, place[1] - motion.east
+        away = math.hypot(north, east)
+        behind = abs(wrap_pi(math.atan2(east, north) - motion.yaw)) > math.pi / 2
+        near = self.parameters["WP_RADIUS"] / 2.0
+        return away <= _ARRIVED_M or (behind and away <= near and motion.ground_speed_m_s > _STANDING_M_S)
+
+    def has_passed(self, place: Ned) -> bool:
+        """Return True within WP_RADIUS of a place where the rover does not stop."""
+        motion = self.motion
+        away = math.hypot(place[0] - motion.north, place[1] - motion.east)
+        return away <= self.parameters["WP_RADIUS"]
+
+
+class _Mode(ArduPilotMode):
+    vehicle: RoverHost
+
+
+class _Manual(_Mode):
+    needs_position = False
+    has_manual_throttle = True
+
+    def update(self, dt: float) -> None:
+        throttle, steering = self.vehicle.stick(_THROTTLE), self.vehicle.stick(0)
+        self.vehicle.motion.drive(throttle * self.vehicle.top_speed, steering * _FULL_STEERING_RAD_S)
+
+
+class _Hold(_Mode):
+    """Stands still; a boat would drive back."""
+
+    def update(self, dt: float) -> None:
+        self.vehicle.motion.stop()
+
+
+class _Rtl(_Mode):
+    """Drives straight to home or a rally point with RTL_SPEED or WP_SPEED, and stays armed there."""
+
+    can_arm = False
+    can_change_speed = True
+
+    def __init__(self, rover: RoverHost) -> None:
+        super().__init__(rover)
+        self.speed = 0.0
+        self._way: list[Ned] = []
+
+    def enter(self, *, force: bool) -> bool:
+        rover, home = self.vehicle, self.vehicle.navigation.home
+        if home is None:
+            return False
+        self._set_out([best_return_place(rover, home, is_allowed=rover.fence.contains)])
+        return True
+
+    def _set_out(self, way: list[Ned]) -> None:
+        self._way, self._has_arrived = way, False
+        self.speed = self.vehicle.parameters["RTL_SPEED"] or self.vehicle.parameters["WP_SPEED"]
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._way[0] if self._way else None
+
+    def update(self, dt: float) -> None:
+        rover = self.vehicle
+        if not self._way:
+            rover.motion.stop()
+            if not self._has_arrived:
+                self._has_arrived = True
+                rover.info("Reached destination")
+            return
+        is_last = len(self._way) == 1
+        if rover.has_arrived(self._way[0]) if is_last else rover.has_passed(self._way[0]):
+            del self._way[0]
+        else:
+            north, east, _ = self._way[0]
+            rover.motion.drive_to(north, east, speed=self.speed, stops=is_last)
+
+
+class _SmartRtl(_Rtl):
+    """Returns along the recorded path without its loops. See `SmartPath`."""
+
+    returns_on_path = True
+
+    def enter(self, *, force: bool) -> bool:
+        if not self.vehicle.path.is_active:
+            return False
+        self._set_out(self.vehicle.path.take_way_back())
+        return True
+
+    def leave(self) -> None:
+        self.vehicle.path.restore(self._way)
+
+
+class RoverAuto(RoverSubAuto):
+    """AUTO of ArduRover."""
+
+    number: int = RoverMode.AUTO
+    name = "AUTO"
+
+    vehicle: RoverHost
+
+    def default_speed(self) -> float:
+        return self.vehicle.waypoint_speed
+
+    def refuse(self) -> None:
+        self.vehicle.send_text(MavSeverity.NOTICE, "No Mission. Can't set AUTO.")
+
+    def travel(self, place: Ned, *, stops: bool) -> None:
+        if stops and self.has_arrived(place):
+            self.vehicle.motion.stop()
+        else:
+            self.vehicle.motion.drive_to(place[0], place[1], speed=self.speed, stops=stops)
+
+    def has_arrived(self, place: Ned) -> bool:
+        return self.vehicle.has_arrived(place) if self._stops else self.vehicle.has_passed(place)
+
+    def stay(self) -> None:
+        self.vehicle.motion.stop()
+
+    def reached_text(self, index: int, seconds: float) -> str:
+        text = f"Reached waypoint #{index}"
+        return f"{text}. Loiter for {seconds:.0f} seconds" if seconds > 0 else text
+
+    def finish(self) -> None:
+        # Of MIS_DONE_BEHAVE only standing is simulated.
+        self.vehicle.send_text(MavSeverity.NOTICE, "Mission Complete")
+
+
+class RoverGuided(_Mode):
+    """GUIDED: drives to a place, or with a velocity and turn rate for three seconds."""
+
+    number: int = RoverMode.GUIDED
+    name = "GUID"
+
+    def __init__(self, rover: RoverHost) -> None:
+        super().__init__(rover)
+        self.speed: float = 0.0
+        self._place: Ned | None = None
+        self._has_arrived = False
+        self._target: GuidedTarget | None = None
+        self._target_at = 0.0
+
+    @property
+    def can_change_speed(self) -> bool:  # type: ignore[override]
+        return self._place is not None and not self._has_arrived
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._place
+
+    def enter(self, *, force: bool) -> bool:
+        self._place = self._target = None
+        return True
+
+    def go_to(self, position: Ned) -> None:
+        self._place, self._has_arrived, self._target = position, False, None
+        self.speed = self.vehicle.waypoint_speed
+
+    def set_target(self, target: GuidedTarget) -> None:
+        """Follow a target; a position has precedence over a velocity."""
+        if target.position is not None:
+            self.go_to(target.position)
+            return
+        self._place, self._target, self._target_at = None, target, self.vehicle.now
+
+    def update(self, dt: float) -> None:
+        rover, place, target = self.vehicle, self._place, self._target
+        if place is not None:
+            if not self._has_arrived and rover.has_arrived(place):
+                self._has_arrived = True
+                rover.send(MissionItemReached(0))
+            if not self._has_arrived:
+                rover.motion.drive_to(place[0], place[1], speed=self.speed)
+                return
+        elif target is not None and rover.now - self._target_at <= target.timeout_s:
+            self._follow(target)
+            return
+        elif target is not None:
+            self._target = None
+            rover.send_text(MavSeverity.WARNING, "target not received last 3secs, stopping")
+        rover.motion.stop()
+
+    def _follow(self, target: GuidedTarget) -> None:
+        north, east, _ = target.velocity or (0.0, 0.0, 0.0)
+        motion = self.vehicle.motion
+        speed = min(self.vehicle.waypoint_speed, math.hypot(north, east)) * (-1.0 if target.backwards else 1.0)
+        if target.yaw_rate is not None:
+            motion.drive(speed, target.yaw_rate)
+        elif speed == 0.0:
+            motion.stop()
+        else:
+            course = math.atan2(east, north) + (math.pi if target.backwards else 0.0)
+            motion.head(speed, course if target.yaw is None else target.yaw)
+
+
+ROVER_MODES: tuple[Callable[[RoverHost], ArduPilotMode], ...] = (
+    variant(_Manual, RoverMode.MANUAL, "MANU"),
+    variant(_Manual, RoverMode.ACRO, "ACRO"),
+    variant(_Manual, RoverMode.STEERING, "STER", needs_position=True),
+    variant(_Hold, RoverMode.HOLD, "HOLD", needs_position=False),
+    variant(_Hold, RoverMode.LOITER, "LOIT"),
+    variant(_Mode, RoverMode.FOLLOW, "FOLL", is_available=False),
+    variant(_Manual, RoverMode.SIMPLE, "SMPL"),
+    variant(_Hold, RoverMode.CIRCLE, "CIRC"),
+    RoverAuto,
+    variant(_Rtl, RoverMode.RTL, "RTL"),
+    variant(_SmartRtl, RoverMode.SMART_RTL, "SRTL"),
+    RoverGuided,
+    variant(_Mode, RoverMode.INITIALIZING, "INIT", is_available=False),
+    variant(
+        _Mode, RoverMode.DOCK, "DOCK", is_available=False,
+        entry_texts=("Dock: target not acquired",), entry_severity=MavSeverity.NOTICE,
+    ),
+)  # fmt: skip
+"""Modes with the names and in the order of AVAILABLE_MODES."""

@@ -1,0 +1,301 @@
+"""Base of the simulated Rover and Sub: vehicles without take-off and landing, their guided targets and missions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, cast
+
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, SpeedType
+from aerokit.mavlink.messages import (
+    MissionItemReached,
+    SetAttitudeTarget,
+    SetPositionTargetGlobalInt,
+    SetPositionTargetLocalNed,
+)
+from aerokit.missions import MissionItem
+from aerokit.sim.ardupilot.commands import common_commands
+from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance, set_home_from
+from aerokit.sim.ardupilot.vehicle import ArduPilotVehicle
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import CommandHandler, PositionTarget, ReceivedCommand, Setpoint, is_finite, rotated
+from aerokit.sim.motion import Ned
+
+_BODY = frozenset({MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED})
+_FIXED = frozenset({MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED})
+
+
+@dataclass(frozen=True)
+class GuidedTarget:
+    """Target of one set-point message in the world frame; None is not given."""
+
+    position: Ned | None = None
+    velocity: Ned | None = None
+    backwards: bool = False
+    """Reverse: a velocity against the first axis together with a heading or a turn rate."""
+    yaw: float | None = None
+    yaw_rate: float | None = None
+    timeout_s: float = 3.0
+    """Validity of a velocity; a position stays."""
+
+
+class GuidedTargetMode(Protocol):
+    """The mode that follows targets."""
+
+    number: int
+
+    def set_target(self, target: GuidedTarget) -> None: ...
+
+
+class GuidedSetpoints:
+    """Handlers of the set-point messages, which ignore invalid messages. A subclass sets what its firmware supports."""
+
+    BODY_FRAMES: ClassVar[frozenset[int]] = _BODY
+    """MAV_FRAMEs with vectors relative to the heading."""
+    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = _BODY
+    """MAV_FRAMEs with a yaw relative to the heading."""
+    GLOBAL_YAW: ClassVar[bool] = True
+    """True if yaw and turn rate of global targets are used."""
+
+    def __init__(self, vehicle: ArduPilotVehicle, mode: GuidedTargetMode) -> None:
+        self.vehicle: ArduPilotVehicle = vehicle
+        self.mode: GuidedTargetMode = mode
+        vehicle.on(SetPositionTargetLocalNed, self._on_local)
+        vehicle.on(SetPositionTargetGlobalInt, self._on_global)
+        vehicle.on(SetAttitudeTarget, self._on_attitude)
+
+    def refuse_acceleration(self, message: PositionTarget) -> None:
+        """Called for a message with an acceleration, which is ignored."""
+
+    def steer(self, message: SetAttitudeTarget) -> None:
+        """Execute SET_ATTITUDE_TARGET."""
+        raise NotImplementedError
+
+    def is_complete(self, target: GuidedTarget) -> bool:
+        """Return True if the target is sufficient to move."""
+        return target.position is not None or target.velocity is not None
+
+    @property
+    def _is_guided(self) -> bool:
+        return self.vehicle.mode.number == self.mode.number
+
+    def _on_attitude(self, message: SetAttitudeTarget, _: Channel) -> None:
+        if self._is_guided and all(map(math.isfinite, (*message.q, message.thrust, message.body_yaw_rate))):
+            self.steer(message)
+
+    def _on_local(self, message: SetPositionTargetLocalNed, _: Channel) -> None:
+        if message.coordinate_frame in _FIXED | self.BODY_FRAMES:
+            self._apply(message, self.vehicle.local_point(message, self.BODY_FRAMES), has_yaw=True)
+
+    def _on_global(self, message: SetPositionTargetGlobalInt, _: Channel) -> None:
+        frame = message.coordinate_frame
+        point = self.vehicle.point(message.lat_int, message.lon_int, message.alt, frame)
+        if point is not None or not Setpoint.of(message).has_position:
+            self._apply(message, point, has_yaw=self.GLOBAL_YAW)
+
+    def _apply(self, message: PositionTarget, point: Ned | None, *, has_yaw: bool) -> None:
+        setpoint, frame = Setpoint.of(message), message.coordinate_frame
+        if not self._is_guided:
+            return
+        if setpoint.has_acceleration:
+            self.refuse_acceleration(message)
+            return
+        position = point if setpoint.has_position else None
+        velocity = setpoint.velocity if setpoint.has_velocity else None
+        if not is_finite(position, velocity):
+            return
+        here = self.vehicle.motion.yaw if frame in self.RELATIVE_YAW_FRAMES else 0.0
+        yaw = None if setpoint.yaw is None or not has_yaw else setpoint.yaw + here
+        rate = setpoint.yaw_rate if has_yaw else None
+        backwards = message.vx < 0 and not (yaw is None and rate is None)
+        if velocity is not None and frame in self.BODY_FRAMES:
+            velocity = rotated(velocity, self.vehicle.motion.yaw)
+        target = GuidedTarget(position, velocity, backwards, yaw, rate)
+        if self.is_complete(target):
+            self.mode.set_target(target)
+
+
+_STICK_MIDDLE, _STICK_RANGE = 1500.0, 500.0
+
+
+class RoverSubVehicle(ArduPilotVehicle):
+    """Base of Rover and Sub. Takes the arguments of `ArduPilotVehicle`."""
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if nothing moves while the vehicle is disarmed."""
+        raise NotImplementedError
+
+    @property
+    def is_standby(self) -> bool:
+        """True if the heartbeat reports STANDBY instead of ACTIVE."""
+        raise NotImplementedError
+
+    @property
+    def is_landed(self) -> bool:
+        return self.is_standby
+
+    @is_landed.setter
+    def is_landed(self, _: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Ignored: there is no take-off."""
+
+    def stick(self, index: int) -> float:
+        """Return a stick position, -1 to 1."""
+        return (self.rc[index] - _STICK_MIDDLE) / _STICK_RANGE
+
+    def tick(self, dt: float) -> None:
+        if self.motors.is_armed:
+            self.mode.update(dt)
+        self.motors.update(self.now, dt, self.motion, landed=False)
+        self.move(dt)
+        self.battery.drain(self.motors.current_a, dt)
+        if not self.motors.is_armed and self.is_at_rest:
+            self.set_ticking(False)
+
+    def move(self, dt: float) -> None:
+        self.motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        return {**common_commands(self), MavCmd.DO_CHANGE_SPEED: self._change_speed}
+
+    def _change_speed(self, command: ReceivedCommand) -> int:
+        if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
+            return MavResult.DENIED
+        kinds = (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
+        if not self.mode.can_change_speed or command.param1 not in kinds or not command.param2 > 0:
+            return MavResult.FAILED
+        cast("Any", self.mode).speed = command.param2
+        return MavResult.ACCEPTED
+
+
+_C = MavCmd
+_WAYPOINTS = frozenset({_C.NAV_WAYPOINT, _C.NAV_LOITER_UNLIM, _C.NAV_LOITER_TIME})
+_HOME = _C.NAV_RETURN_TO_LAUNCH
+_WITHOUT_EFFECT = (
+    _C.DO_SET_ROI, _C.DO_SET_ROI_LOCATION, _C.DO_SET_ROI_NONE, _C.DO_FENCE_ENABLE, _C.DO_GUIDED_LIMITS,
+    _C.CONDITION_DISTANCE,
+)  # fmt: skip
+
+
+class RoverSubAuto(MissionMode):
+    """AUTO of Rover and Sub. A subclass moves the vehicle and reports its progress."""
+
+    vehicle: RoverSubVehicle
+
+    def __init__(self, vehicle: RoverSubVehicle) -> None:
+        super().__init__(vehicle)
+        self._place: Ned | None = None
+        self._stops = True
+        self._reached_at: float | None = None
+        self._wait_until = 0.0
+        self.handlers: dict[int, Callable[[MissionItem], None]] = {
+            **dict.fromkeys((*_WAYPOINTS, _HOME), self._go),
+            **dict.fromkeys((_C.NAV_DELAY, _C.CONDITION_DELAY), self._wait),
+            _C.DO_CHANGE_SPEED: self._change_speed,
+            _C.DO_SET_HOME: lambda item: set_home_from(vehicle, item),
+            **dict.fromkeys(_WITHOUT_EFFECT, lambda _: None),
+        }
+
+    def default_speed(self) -> float:
+        """Return the speed of the parameters in m/s."""
+        raise NotImplementedError
+
+    def refuse(self) -> None:
+        """Report that there is no mission."""
+
+    def travel(self, place: Ned, *, stops: bool) -> None:
+        """Move towards a place for one tick."""
+        raise NotImplementedError
+
+    def has_arrived(self, place: Ned) -> bool:
+        raise NotImplementedError
+
+    def stay(self) -> None:
+        raise NotImplementedError
+
+    def reached_text(self, index: int, seconds: float) -> str:
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Called at the end of the mission."""
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._place
+
+    def enter(self, *, force: bool) -> bool:
+        if self.vehicle.mode is self:
+            return True
+        if not self.vehicle.mission.is_present:
+            self.refuse()
+            return False
+        self.speed, self._place = self.default_speed(), None
+        self.wait_for_origin()
+        return True
+
+    def update(self, dt: float) -> None:
+        self.start_if_waiting()
+        if not self.is_waiting:
+            self.vehicle.mission.update()
+        if self.vehicle.mode is not self:
+            return
+        if self._place is None:
+            self.stay()
+        else:
+            self.travel(self._place, stops=self._stops)
+
+    def is_complete(self, index: int, item: MissionItem) -> bool:
+        if self.vehicle.mode is not self or not self._is_done(index, item):
+            return False
+        self.vehicle.call_later(0.0, lambda: self.vehicle.send(MissionItemReached(index)))
+        return True
+
+    def end_mission(self) -> None:
+        self._place = None
+        self.finish()
+
+    def _is_done(self, index: int, item: MissionItem) -> bool:
+        command, now = item.command, self.vehicle.now
+        if command in _WAYPOINTS:
+            return self._has_stayed(index, item) and command != _C.NAV_LOITER_UNLIM
+        if command == _HOME:
+            return self._place is None or self.has_arrived(self._place)
+        if command in (_C.NAV_DELAY, _C.CONDITION_DELAY):
+            return now >= self._wait_until
+        if command == _C.CONDITION_DISTANCE:
+            return horizontal_distance(self.vehicle, self._place) < item.param1
+        self.warn_if_unknown(item)
+        return True
+
+    def _has_stayed(self, index: int, item: MissionItem) -> bool:
+        if self._place is None or (self._reached_at is None and not self.has_arrived(self._place)):
+            return False
+        now = self.vehicle.now
+        if self._reached_at is None:
+            self._reached_at = now
+            self.vehicle.info(self.reached_text(index, item.param1))
+        return now - self._reached_at >= max(0.0, item.param1)
+
+    def _go(self, item: MissionItem) -> None:
+        vehicle = self.vehicle
+        here: Ned = self._place or vehicle.motion.place
+        self._reached_at = None
+        if item.command == _HOME:
+            self._place, self._stops = vehicle.navigation.home or here, True
+            return
+        point = vehicle.point(int(item.x), int(item.y), item.z, item.frame)
+        north, east = here[:2] if point is None or (item.x, item.y) == (0, 0) else point[:2]
+        self._place = (north, east, here[2] if point is None or item.z == 0 else point[2])
+        following = next(vehicle.mission.navigation_from(vehicle.mission.nav_index + 1), None)
+        self._stops = item.param1 > 0 or following is None or following[1].command not in _WAYPOINTS
+
+    def _wait(self, item: MissionItem) -> None:
+        self._wait_until = self.vehicle.now + max(0.0, item.param1)
+        if item.command == _C.NAV_DELAY:
+            self._place = None
+            self.vehicle.info(f"Delaying {int(item.param1)} sec")
+
+    def _change_speed(self, item: MissionItem) -> None:
+        if item.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED) and item.param2 > 0:
+            self.speed: float = item.param2

@@ -1,0 +1,324 @@
+"""`SimulatedSub`: an ArduSub 4.7 with vectored thrusters, without sockets, threads or a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import cycle
+from typing import Any, ClassVar
+
+from aerokit.mavlink.enums import AttitudeTargetTypemask as AttitudeMask
+from aerokit.mavlink.enums import (
+    MavCmd,
+    MavFrame,
+    MavModeFlag,
+    MavResult,
+    MavSeverity,
+    MavType,
+    SpeedType,
+    SubMode,
+)
+from aerokit.mavlink.messages import SetAttitudeTarget
+from aerokit.sim.ardupilot.commands import relative_heading
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.host import ArduPilotMode, ArduPilotMotors
+from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.ardupilot.radio import SubJoystick
+from aerokit.sim.ardupilot.requests import DISPLAY_VALUES
+from aerokit.sim.ardupilot.rover_sub_base import GuidedSetpoints, GuidedTarget
+from aerokit.sim.ardupilot.sub_modes import SUB_MODES, SubAuto, SubGuided, SubHost
+from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
+from aerokit.sim.commands import CommandHandler, ReceivedCommand
+from aerokit.sim.motion import SimulatedWind, euler_from_quaternion
+from aerokit.sim.vehicle_motion import UnderwaterMotion
+
+_BUTTONS = range(16)
+# BTNn_FUNCTION.
+_SHIFT, _ARM_TOGGLE, _DISARM = 1, 2, 4
+_DISARMS = frozenset({_ARM_TOGGLE, _DISARM})
+
+
+class SubArming(ArduPilotArming[SubHost]):
+    """Checks radio and battery by default (ARMING_CHECK 448), never a position. A joystick button must disarm."""
+
+    ARMED_TEXT: ClassVar[str] = "Arming motors"
+    DISARMED_TEXT: ClassVar[str] = "Disarming motors"
+
+    def reasons(self) -> list[str]:
+        if self.vehicle.is_initialised and not self._has_disarm_button():
+            return ["Must assign a disarm or arm_toggle button or disarm aux function"]
+        return super().reasons()
+
+    def disarm(self, *, force: bool = True) -> bool:
+        return super().disarm(force=True)
+
+    def _has_disarm_button(self) -> bool:
+        parameters = self.vehicle.parameters
+        names = [f"BTN{number}_" for number in _BUTTONS if f"BTN{number}_FUNCTION" in parameters]
+        plain = {int(parameters[f"{name}FUNCTION"]) for name in names}
+        if not names or plain & _DISARMS:
+            return True
+        return _SHIFT in plain and any(int(parameters[f"{name}SFUNCTION"]) in _DISARMS for name in names)
+
+
+# FS_GCS_ENABLE; 1 only warns.
+_FAILSAFE_DISARM, _HOLD, _SURFACE = 2, 3, 4
+_GCS_MODES = {_HOLD: SubMode.ALT_HOLD, _SURFACE: SubMode.SURFACE}
+_BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
+_PILOT_DISARM, _LEAK_SURFACE, _RADIO_SURFACE = 2, 2, 2
+_GCS_REPORT_INTERVAL_S, _LEAK_REPORT_INTERVAL_S, _HULL_REPORT_INTERVAL_S = 30.0, 20.0, 30.0
+_HULL_TIMEOUT_S = 2.0
+_SILENT_S = 1.0
+_STICKS, _STICK_MIDDLE = 6, 1500
+
+
+class SubFailsafes(ArduPilotFailsafes[SubHost]):
+    """Most failsafes act only while the vehicle is armed. Terrain, estimator and crash are not checked."""
+
+    BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_BATTERY_DISARM, _BATTERY_SURFACE, 1, 0)
+
+    def __init__(self, sub: SubHost) -> None:
+        super().__init__(sub)
+        self.pilot: bool = False  # True without RC pulses and MANUAL_CONTROL for FS_PILOT_TIMEOUT.
+        self.leak: bool = False
+        self.pressure: _HullLimit = _HullLimit("pressure", "FS_PRESS")
+        self.temperature: _HullLimit = _HullLimit("temperature", "FS_TEMP")
+        self._gcs_reported_at = self._leak_reported_at = -math.inf
+
+    @property
+    def is_any_active(self) -> bool:
+        # A lost radio alone is not critical here.
+        hull = self.pressure.is_exceeded or self.temperature.is_exceeded
+        return self.pilot or self.battery_is_low or self.ground_station or self.leak or hull
+
+    def update(self) -> None:
+        self._check_radio()
+        self._check_pilot()
+        self._check_ground_station()
+        self._check_leak()
+        self.pressure.update(self.vehicle, self.vehicle.hull_pressure_pa)
+        self.temperature.update(self.vehicle, self.vehicle.hull_temperature_c)
+        super().update()
+
+    def _check_radio(self) -> None:
+        """Apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
+        sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_THR_ENABLE"])
+        receives = sub.rc.is_receiving
+        if receives:
+            self.radio_received_at: float = sub.now
+        low = receives and sub.rc[2] < sub.parameters["FS_THR_VALUE"]
+        lost = low or sub.now - self.radio_received_at >= _SILENT_S
+        if not enabled:
+            lost = False
+        elif not receives and not lost:
+            return
+        if lost == self.radio:
+            return
+        self.radio = lost
+        self.warn("RC Failsafe" if lost else "Radio Failsafe Cleared")
+        if lost and enabled == _RADIO_SURFACE:
+            sub.set_mode(SubMode.SURFACE)
+
+    def _check_pilot(self) -> None:
+        sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
+        silence = sub.now - self.radio_received_at
+        if not enabled or not silence >= sub.parameters["FS_PILOT_TIMEOUT"]:
+            self.pilot = False
+            return
+        if self.pilot:
+            return
+        self.pilot = True
+        self.warn("Lost manual control", MavSeverity.CRITICAL)
+        for index in range(_STICKS):
+            sub.rc[index] = _STICK_MIDDLE
+        if enabled == _PILOT_DISARM:
+            sub.arming.disarm()
+
+    def _check_ground_station(self) -> None:
+        sub, action = self.vehicle, int(self.vehicle.parameters["FS_GCS_ENABLE"])
+        if not action or math.isnan(self.ground_station_seen_at):
+            return
+        if self.ground_station_silence < sub.parameters["FS_GCS_TIMEOUT"]:
+            if self.ground_station:
+                self.ground_station = False
+                self.warn("GCS Failsafe Cleared")
+            return
+        if sub.now - self._gcs_reported_at > _GCS_REPORT_INTERVAL_S:
+            self._gcs_reported_at = sub.now
+            self.warn(f"MYGCS: {int(sub.parameters['MAV_GCS_SYSID'])}, heartbeat lost")
+        if self.ground_station or not sub.is_armed:
+            return
+        self.ground_station: bool = True
+        if action == _FAILSAFE_DISARM or (action in _GCS_MODES and not sub.set_mode(_GCS_MODES[action])):
+            sub.arming.disarm()
+
+    def act_on_battery(self, action: int) -> None:
+        if action == _BATTERY_SURFACE:
+            self.vehicle.set_mode(SubMode.SURFACE)
+        elif action == _BATTERY_DISARM:
+            self.vehicle.arming.disarm()
+
+    def _check_leak(self) -> None:
+        sub, action = self.vehicle, int(self.vehicle.parameters["FS_LEAK_ENABLE"])
+        if not sub.faults.leak or not action:
+            self.leak = False
+            return
+        if sub.now - self._leak_reported_at > _LEAK_REPORT_INTERVAL_S:
+            self._leak_reported_at = sub.now
+            self.warn("Leak Detected", MavSeverity.CRITICAL)
+        if not self.leak:
+            self.leak = True
+            if action == _LEAK_SURFACE and sub.is_armed:
+                sub.set_mode(SubMode.SURFACE)
+
+
+class _HullLimit:
+    """Limit FS_PRESS_MAX (Pa) or FS_TEMP_MAX (°C), exceeded after two seconds and reported every 30 s."""
+
+    def __init__(self, quantity: str, prefix: str) -> None:
+        self.is_exceeded: bool = False
+        self._quantity, self._prefix = quantity, prefix
+        self._good_at = self._reported_at = 0.0
+
+    def update(self, sub: SubHost, value: float) -> None:
+        if not sub.parameters[f"{self._prefix}_ENABLE"]:
+            return
+        if value < sub.parameters[f"{self._prefix}_MAX"]:
+            self._good_at = self._reported_at = sub.now
+            self.is_exceeded = False
+            return
+        if sub.now - self._good_at > _HULL_TIMEOUT_S:
+            self.is_exceeded = True
+        if self.is_exceeded and sub.now - self._reported_at > _HULL_REPORT_INTERVAL_S:
+            self._reported_at = sub.now
+            sub.send_text(MavSeverity.WARNING, f"Internal {self._quantity} critical!")
+
+
+class SubSetpoints(GuidedSetpoints):
+    """Thrust is a climb rate, 0.5 holds the depth; lean angles have no effect. Yaw is relative in one frame only."""
+
+    BODY_FRAMES: ClassVar[frozenset[int]] = GuidedSetpoints.BODY_FRAMES | {MavFrame.BODY_FRD}
+    RELATIVE_YAW_FRAMES: ClassVar[frozenset[int]] = frozenset({MavFrame.BODY_OFFSET_NED})
+    GLOBAL_YAW: ClassVar[bool] = False
+
+    def steer(self, message: SetAttitudeTarget) -> None:
+        """Follow attitude and thrust together for one second."""
+        if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
+            return
+        share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)
+        name = "WPNAV_SPEED_UP" if share > 0 else "WPNAV_SPEED_DN"
+        climb = share * self.vehicle.parameters[name] / 100.0
+        _, _, yaw = euler_from_quaternion(*message.q)
+        self.mode.set_target(GuidedTarget(None, (0.0, 0.0, -climb), False, yaw, timeout_s=1.0))
+
+
+_HOLDING_THROTTLE, _PER_CLIMB = 0.45, 0.44
+_AMPERES_AT_FULL = 26.3
+_THROTTLE = 2
+
+
+class SubMotors(ArduPilotMotors):
+    """Thrusters that hold the depth or follow the stick; a throttle of 0.5 is no thrust."""
+
+    @property
+    def current_a(self) -> float:
+        follows_stick = self.vehicle.mode.has_manual_throttle
+        thrust = abs(2.0 * self.throttle - 1.0) if follows_stick else self.throttle
+        return float(thrust**2.7) * _AMPERES_AT_FULL
+
+    def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
+        throttle = _HOLDING_THROTTLE - _PER_CLIMB * motion.velocity_down
+        if self.vehicle.mode.has_manual_throttle:
+            throttle = (self.vehicle.rc[_THROTTLE] - 1000) / 1000.0
+        self.throttle: float = max(0.0, min(1.0, throttle)) if self.is_armed else 0.0
+
+
+_GUIDED_MODES = frozenset({"AUTO", "GUIDED", "CIRCLE", "POSHOLD"})
+_BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavModeFlag.MANUAL_INPUT_ENABLED
+
+
+class SimulatedSub(SubHost):
+    """Behaves as ArduSub does where a client can observe it; moves with `UnderwaterMotion`.
+
+    Takes the arguments of `ArduPilotVehicle`; ``home`` is at the surface, so altitudes above home are negative. It has
+    1,386 parameters. Simulated: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD by the sticks, GUIDED, AUTO and SURFACE.
+    It can be armed without a position in modes that need none. Take-off is an unknown command.
+
+    Not simulated: CIRCLE, SURFTRAK and MOTORDETECT (they hold still), currents. After a reboot it is at the surface.
+    """
+
+    KIND: ClassVar[Kind] = "sub"
+    FIRMWARE: ClassVar[str] = "ArduSub"
+    MAV_TYPE: ClassVar[int] = MavType.SUBMARINE
+    CAPABILITIES: ClassVar[int] = 0xF9E7
+    BUILDERS: ClassVar[Builders] = BUILDERS_OF_KIND["sub"]
+    MODES: ClassVar[tuple[Callable[[Any], ArduPilotMode], ...]] = SUB_MODES
+    ARMING: ClassVar[type[SubArming]] = SubArming
+    FAILSAFES: ClassVar[type[SubFailsafes]] = SubFailsafes
+    MOTORS: ClassVar[type[SubMotors]] = SubMotors
+    JOYSTICK: ClassVar[type[SubJoystick]] = SubJoystick
+
+    def make_motion(self, wind: SimulatedWind | None) -> UnderwaterMotion:
+        """Create the motion model. SIM_BUOYANCY 1 lifts with 0.1 m/s; wind has no effect."""
+        return UnderwaterMotion(self.rng, buoyancy_m_s2=self.parameters["SIM_BUOYANCY"] / 10.0)
+
+    def listen_for_setpoints(self) -> None:
+        SubSetpoints(self, self.guided)
+
+    def reset_controllers(self) -> None:
+        self.display_names: cycle[str] = cycle(DISPLAY_VALUES)
+        for index in range(len(self.rc)):
+            self.rc[index] = _STICK_MIDDLE
+
+    @property
+    def first_mode(self) -> int:
+        return SubMode.MANUAL
+
+    @property
+    def is_standby(self) -> bool:
+        return not self.motors.is_armed
+
+    @property
+    def guided(self) -> SubGuided:
+        return self.mode_of(SubGuided)
+
+    @property
+    def base_mode(self) -> int:
+        base = int(_BASE)
+        if self.mode.name in _GUIDED_MODES:
+            base |= MavModeFlag.GUIDED_ENABLED
+        return base | MavModeFlag.SAFETY_ARMED if self.motors.is_armed else base
+
+    @property
+    def is_at_rest(self) -> bool:
+        return self.motion.is_still
+
+    def refusal(self, mode: ArduPilotMode, reason: str) -> str:
+        if reason == "requires position":
+            return f"Mode change failed: {mode.name} requires position"
+        return f"Flight mode change failed {mode.name}"
+
+    def make_commands(self) -> dict[int, CommandHandler]:
+        return {
+            **super().make_commands(),
+            MavCmd.DO_CHANGE_SPEED: self._change_speed_at_any_time,
+            MavCmd.NAV_LAND: lambda _: self.change_to(SubMode.SURFACE),
+            MavCmd.NAV_LOITER_UNLIM: lambda _: self.change_to(SubMode.POSHOLD),
+            MavCmd.CONDITION_YAW: self._turn,
+        }
+
+    def _change_speed_at_any_time(self, command: ReceivedCommand) -> int:
+        """Accept a speed in every mode; only GUIDED and AUTO use it."""
+        if not command.param2 > 0 or command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
+            return MavResult.DENIED
+        if isinstance(self.mode, SubGuided | SubAuto):
+            self.mode.speed = command.param2
+        return MavResult.ACCEPTED
+
+    def _turn(self, command: ReceivedCommand) -> int:
+        heading = relative_heading(command, self.motion.yaw)
+        if heading is None:
+            return MavResult.FAILED
+        if self.mode is self.guided:
+            self.guided.face(heading)
+        return MavResult.ACCEPTED

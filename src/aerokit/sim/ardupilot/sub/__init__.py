@@ -1,1 +1,0 @@
-"""What is ArduSub's own: its modes, arming, failsafes."""

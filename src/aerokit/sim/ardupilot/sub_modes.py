@@ -1,0 +1,210 @@
+"""Flight modes of a simulated ArduSub. MOTORDETECT and SURFTRAK hold still; ACRO and STABILIZE move by the sticks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import cycle
+
+from aerokit.mavlink.enums import SubMode
+from aerokit.sim.ardupilot.host import ArduPilotMode, variant
+from aerokit.sim.ardupilot.rover_sub_base import GuidedTarget, RoverSubAuto, RoverSubVehicle
+from aerokit.sim.commands import rotated
+from aerokit.sim.motion import Ned, wrap_pi
+from aerokit.sim.vehicle_motion import UnderwaterMotion
+
+_MIN_LOOK_AHEAD_M = 1.0
+_DEADZONE = 0.06
+_FULL_STICK_M_S = 1.0
+_FULL_STICK_TURN_RAD_S = math.radians(90.0)
+_THROTTLE, _YAW, _FORWARD, _LATERAL = 2, 3, 4, 5
+
+
+class SubHost(RoverSubVehicle):
+    """A submarine as its modes and failsafes see it."""
+
+    display_names: cycle[str]
+    """Names of `DISPLAY_VALUES` in the order in which they are sent."""
+    motion: UnderwaterMotion  # pyright: ignore[reportIncompatibleVariableOverride]
+    hull_pressure_pa: float = 101_325.0
+    hull_temperature_c: float = 28.0
+
+    @property
+    def is_at_surface(self) -> bool:
+        """True within SURFACE_DEPTH of the surface."""
+        return self.motion.down <= max(0.0, -self.parameters["SURFACE_DEPTH"] / 100.0)
+
+    def distance(self, place: Ned) -> float:
+        """Return the distance to a place in metres."""
+        return math.dist(self._below_surface(place), self.motion.place)
+
+    def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
+        """Move towards a place with a speed in m/s, vertically within WPNAV_SPEED_UP and WPNAV_SPEED_DN."""
+        motion, parameters = self.motion, self.parameters
+        north, east, down = self._below_surface(place)
+        up, dn = parameters["WPNAV_SPEED_UP"] / 100.0, parameters["WPNAV_SPEED_DN"] / 100.0
+        ahead = math.hypot(north - motion.north, east - motion.east)
+        if looks_ahead and ahead > _MIN_LOOK_AHEAD_M:
+            motion.face(math.atan2(east - motion.east, north - motion.north))
+        slope = abs(down - motion.down)
+        horizontal = speed * min(1.0, ahead / max(slope, 1e-3))
+        vertical = speed * min(1.0, slope / max(ahead, 1e-3))
+        motion.seek_position(
+            north, east, down, speed=max(horizontal, 0.05), climb=min(up, vertical), descent=min(dn, vertical)
+        )
+
+    def _below_surface(self, place: Ned) -> Ned:
+        return (place[0], place[1], max(place[2], self.motion.ground_down))
+
+
+class _Mode(ArduPilotMode):
+    vehicle: SubHost
+
+    def stick(self, index: int) -> float:
+        """Return a stick position, -1 to 1, with a dead zone around 0."""
+        share = self.vehicle.stick(index)
+        return 0.0 if abs(share) < _DEADZONE else share
+
+    def sideways(self) -> tuple[float, float]:
+        """Turn by the stick; return the velocity of the sticks, north and east."""
+        motion = self.vehicle.motion
+        motion.turn(self.stick(_YAW) * _FULL_STICK_TURN_RAD_S)
+        forward, right = self.stick(_FORWARD) * _FULL_STICK_M_S, self.stick(_LATERAL) * _FULL_STICK_M_S
+        north, east, _ = rotated((forward, right, 0.0), motion.yaw)
+        return north, east
+
+    def climb(self) -> float:
+        """Return the climb rate of the throttle stick in m/s."""
+        return self.stick(_THROTTLE) * (self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0)
+
+
+class _Manual(_Mode):
+    """Thrust by the sticks; with a centred throttle it drifts up."""
+
+    needs_position = False
+    has_manual_throttle = True
+
+    def update(self, dt: float) -> None:
+        climb = self.climb()
+        if climb == 0.0:
+            self.vehicle.motion.push(*self.sideways())
+        else:
+            self.vehicle.motion.seek_velocity(*self.sideways(), -climb)
+
+
+class _AltHold(_Mode):
+    """Depth held; the throttle stick changes it."""
+
+    needs_position = False
+
+    def update(self, dt: float) -> None:
+        self.vehicle.motion.seek_velocity(*self.sideways(), -self.climb())
+
+
+class _Surface(_AltHold):
+    """Rises with WPNAV_SPEED_UP; changes to ALT_HOLD at the surface."""
+
+    is_landing = True
+
+    def update(self, dt: float) -> None:
+        if self.vehicle.is_at_surface:
+            self.vehicle.set_mode(SubMode.ALT_HOLD)
+        else:
+            self.vehicle.motion.seek_velocity(*self.sideways(), -self.vehicle.parameters["WPNAV_SPEED_UP"] / 100.0)
+
+
+class SubAuto(RoverSubAuto):
+    """AUTO of ArduSub: straight to each place, looking ahead; after the last command it stays."""
+
+    number: int = SubMode.AUTO
+    name = "AUTO"
+
+    vehicle: SubHost
+
+    def default_speed(self) -> float:
+        return self.vehicle.parameters["WPNAV_SPEED"] / 100.0
+
+    def travel(self, place: Ned, *, stops: bool) -> None:
+        self.vehicle.travel(place, self.speed)
+
+    def has_arrived(self, place: Ned) -> bool:
+        return self.vehicle.distance(place) <= self.vehicle.parameters["WPNAV_RADIUS"] / 100.0
+
+    def stay(self) -> None:
+        self.vehicle.motion.seek_velocity(0.0, 0.0, 0.0)
+
+    def reached_text(self, index: int, seconds: float) -> str:
+        return f"Reached command #{index}"
+
+
+class SubGuided(_Mode):
+    """GUIDED: a place that stays, or a velocity for three seconds; at first it holds still."""
+
+    number: int = SubMode.GUIDED
+    name = "GUIDED"
+    can_change_speed = True
+
+    def __init__(self, sub: SubHost) -> None:
+        super().__init__(sub)
+        self.speed: float = 0.0
+        self._place: Ned | None = None
+        self._target: GuidedTarget | None = None
+        self._target_at = 0.0
+        self._heading: float | None = None
+
+    @property
+    def destination(self) -> Ned | None:
+        return self._place
+
+    def enter(self, *, force: bool) -> bool:
+        self._place = self._target = self._heading = None
+        self.speed = self.vehicle.parameters["WPNAV_SPEED"] / 100.0
+        return True
+
+    def go_to(self, position: Ned) -> None:
+        """Go to a place and stay there; above the surface means at the surface."""
+        self._place, self._target, self._heading = position, None, None
+
+    def set_target(self, target: GuidedTarget) -> None:
+        """Follow a target; a position has precedence over a velocity, and its path starts from rest (seen in SITL)."""
+        if target.position is not None:
+            motion = self.vehicle.motion
+            motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0
+            self.go_to(target.position)
+        else:
+            self._place, self._target, self._target_at = None, target, self.vehicle.now
+        self._heading = target.yaw
+
+    def face(self, heading: float) -> None:
+        """Turn to a heading in radians."""
+        self._heading = wrap_pi(heading)
+
+    def update(self, dt: float) -> None:
+        motion, target = self.vehicle.motion, self._target
+        fresh = target is not None and self.vehicle.now - self._target_at <= target.timeout_s
+        if self._place is not None:
+            self.vehicle.travel(self._place, self.speed, looks_ahead=False)
+        elif target is not None and target.velocity is not None and fresh:
+            motion.seek_velocity(*target.velocity)
+        else:
+            motion.seek_velocity(0.0, 0.0, 0.0)
+        if self._heading is not None:
+            motion.face(self._heading)
+        else:
+            motion.turn(target.yaw_rate or 0.0 if target is not None and fresh else 0.0)
+
+
+SUB_MODES: tuple[Callable[[SubHost], ArduPilotMode], ...] = (
+    variant(_Manual, SubMode.MANUAL, "MANUAL"),
+    variant(_Manual, SubMode.STABILIZE, "STABILIZE"),
+    variant(_Manual, SubMode.ACRO, "ACRO"),
+    variant(_AltHold, SubMode.ALT_HOLD, "ALT_HOLD"),
+    SubAuto,
+    SubGuided,
+    variant(_AltHold, SubMode.CIRCLE, "CIRCLE", needs_position=True),
+    variant(_Surface, SubMode.SURFACE, "SURFACE"),
+    variant(_AltHold, SubMode.POSHOLD, "POSHOLD", needs_position=True),
+    variant(_AltHold, SubMode.MOTORDETECT, "MOTORDETECT"),
+    variant(_AltHold, SubMode.SURFTRAK, "SURFTRAK", entry_texts=("waiting for a rangefinder reading",)),
+)
+"""Modes with the names and in the order of AVAILABLE_MODES."""

@@ -1,0 +1,213 @@
+"""Output of a simulated PX4 by link: stream rates, status texts, and the events of those texts.
+
+https://mavlink.io/en/services/events.html. Event ids and log levels were recorded from a real PX4. Not simulated:
+events without a text, the health report of the components, REQUEST_EVENT.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import pkgutil
+import re
+import struct
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavResult
+from aerokit.mavlink.messages import CurrentEventSequence, Event, Statustext
+from aerokit.sim.channel import Channel
+from aerokit.sim.px4.host import Px4Host
+
+_INITIAL_SEQUENCE = 65526
+_INFO_LEVELS = 102
+_ARMED_BY = {"external command": 4, "mission start": 5}
+_DISARMED_BY = {"external command": 4, "landing": 6, "auto preflight disarming": 7}
+_EVENT_IDS = {
+    "Takeoff detected": 21054825,
+    "Landing detected": 26622124,
+    "Returning to launch": 20262116,
+    "RTL: land at destination": 16962474,
+}
+_ARMED, _DISARMED, _RETURN = 26266355, 32794487, 22161044
+_RETURN_TEXT = re.compile(r"RTL: start return at (-?\d+) m \((-?\d+) m above destination\)")
+
+
+class Px4Events:
+    """Sends events. The sequence starts ten below its overflow, so that clients are tested with it."""
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self._next = _INITIAL_SEQUENCE
+
+    def current(self) -> CurrentEventSequence:
+        """Return CURRENT_EVENT_SEQUENCE."""
+        return CurrentEventSequence((self._next - 1) & 0xFFFF, 0)
+
+    def send_for(self, text: str) -> None:
+        """Send the event of a status text, if it has one."""
+        event = _event_of(text)
+        if event is None:
+            return
+        (number, arguments), px4 = event, self._px4
+        px4.send(Event(0, 0, number, px4.time_boot_ms, self._next, _INFO_LEVELS, arguments))
+        self._next = (self._next + 1) & 0xFFFF
+
+
+def _event_of(text: str) -> tuple[int, bytes] | None:
+    if text in _EVENT_IDS:
+        return _EVENT_IDS[text], b""
+    for start, number, causes in (
+        ("Armed by ", _ARMED, _ARMED_BY),
+        ("Disarmed by ", _DISARMED, _DISARMED_BY),
+    ):
+        if text.startswith(start):
+            return number, bytes([causes.get(text[len(start) :], 0)])
+    found = _RETURN_TEXT.fullmatch(text)
+    return None if found is None else (_RETURN, struct.pack("<ii", int(found[1]), int(found[2])))
+
+
+NO_STATION = "Preflight Fail: No connection to the GCS"
+TOO_FAR = "Geofence: exceeding maximum distance to Home"
+TOO_HIGH = "Geofence: exceeding maximum altitude above Home"
+OUTSIDE = "Geofence: approaching or outside geofence"
+
+_WITHOUT_TAB = (
+    "Preflight Fail: ",
+    "Geofence: ",
+    "Figure 8 command",
+    "Assuming vehicle is facing",
+    "Mag quick calibration",
+    "[cal] ",
+    "MAVLink signing",
+)
+
+
+_STATION_TIMEOUT_S = 2.5
+_MAX_QUEUED, _MAX_AGE_S = 8, 5.0
+
+
+class Px4TextLinks:
+    """Sends texts on links with a ground station (streams/STATUSTEXT.hpp), and queues them shortly on others."""
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self._station_at: dict[Channel, float] = {}
+        self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}
+
+    def on_station_heartbeat(self, channel: Channel) -> None:
+        """Handle a ground station's HEARTBEAT: send the texts that were queued recently."""
+        self._station_at[channel] = self._px4.now
+        for sent_at, chunks in self._waiting.pop(channel, ()):
+            if self._px4.now - sent_at < _MAX_AGE_S:
+                self._send(chunks, channel)
+
+    def send(self, chunks: list[Statustext]) -> None:
+        """Send a text on links with a ground station; queue it on others."""
+        now = self._px4.now
+        for channel in self._px4.channels:
+            if now - self._station_at.get(channel, -math.inf) <= _STATION_TIMEOUT_S:
+                self._send(chunks, channel)
+            else:
+                self._waiting.setdefault(channel, deque(maxlen=_MAX_QUEUED)).append((now, chunks))
+
+    def _send(self, chunks: list[Statustext], channel: Channel) -> None:
+        for chunk in chunks:
+            self._px4.send(chunk, channel)
+
+
+def on_the_wire(text: str) -> str:
+    return text if text.startswith(_WITHOUT_TAB) else text + "\t"
+
+
+LINK_MODES = ("normal", "onboard", "config", "minimal")
+"""Names of MAV_n_MODE: Normal, Onboard, Config and Minimal."""
+
+_FAST_MESSAGES = (
+    m.Attitude.ID,
+    m.AttitudeQuaternion.ID,
+    m.AttitudeTarget.ID,
+    m.GlobalPositionInt.ID,
+    m.LocalPositionNed.ID,
+    m.PositionTargetLocalNed.ID,
+    m.ServoOutputRaw.ID,
+)
+_SIMULATION_RATES_HZ = {m.RcChannels.ID: 20.0, m.OpticalFlowRad.ID: 10.0, m.Statustext.ID: 20.0}
+# Rates that are fixed on every link.
+_ALWAYS_HZ = {m.Heartbeat.ID: 1.0, m.MissionCurrent.ID: 1.0, m.CurrentEventSequence.ID: 0.3}
+
+_OFF, _ON_CHANGE = -1, 0
+
+
+class Px4StreamRates:
+    """Stream rates by link. The position in ``modes`` is the link; further links use the last mode.
+
+    "normal" is the ground-station link of PX4's simulation, where some messages are sent at ``fast_hz``.
+    """
+
+    def __init__(self, modes: Sequence[str], is_built: Callable[[int], bool], fast_hz: float) -> None:
+        unknown = sorted(set(modes) - set(LINK_MODES))
+        if unknown or not modes:
+            reason = f"unknown mode {unknown[0]!r}" if unknown else "no entry"
+            raise ValueError(f"link_modes has {reason}; modes: {', '.join(LINK_MODES)}")
+        self._modes, self._is_built, self._fast_hz = tuple(modes), is_built, fast_hz
+        self._intervals_us: dict[Channel, dict[int, int]] = {}
+        self._mode_of: dict[Channel, str] = {}
+
+    def start(self, channel: Channel, number: int, first: float) -> None:
+        """Start the streams of link ``number`` at time ``first``."""
+        mode = self._modes[min(number, len(self._modes) - 1)]
+        self._mode_of[channel], intervals_us = mode, {}
+        for message_id, rate in self._rates_at_start(mode).items():
+            intervals_us[message_id] = _interval_us(rate)
+            if rate and self._is_built(message_id) and message_id != m.GpsGlobalOrigin.ID:
+                channel.streams.set_interval(message_id, 1.0 / rate, first)
+        self._intervals_us[channel] = intervals_us
+        for message_id, rate in _ALWAYS_HZ.items():
+            channel.streams.set_interval(message_id, 1.0 / rate, first)
+
+    def _rates_at_start(self, mode: str) -> dict[int, float]:
+        rates = _table()[mode]
+        if mode != "normal":
+            return rates
+        fast = dict.fromkeys(_FAST_MESSAGES, self._fast_hz)
+        return {**rates, **fast, **_SIMULATION_RATES_HZ}
+
+    def interval_us(self, channel: Channel, message_id: int) -> int:
+        """Return the interval for MESSAGE_INTERVAL: -1 is off or unknown, 0 is on change."""
+        if message_id == m.Heartbeat.ID:
+            return 1_000_000
+        return self._intervals_us.get(channel, {}).get(message_id, _OFF)
+
+    def set_interval_us(self, channel: Channel, message_id: int, interval_us: float, now: float) -> int:
+        """Set an interval and return the MAV_RESULT; 0 restores the rate of the link mode."""
+        rates = _table()[self._mode_of[channel]]
+        if message_id not in rates:
+            return MavResult.FAILED
+        wanted = round(interval_us) if math.isfinite(interval_us) else 0
+        wanted = _interval_us(rates[message_id]) if wanted == 0 else max(_OFF, wanted)
+        self._intervals_us[channel][message_id] = wanted
+        if self._is_built(message_id):
+            channel.streams.set_interval(message_id, max(0, wanted) / 1e6, now)
+        return MavResult.ACCEPTED
+
+    def on_requested(self, channel: Channel, message_id: int) -> None:
+        """Handle a single request: the message is now reported as sent on change."""
+        intervals_us = self._intervals_us.get(channel, {})
+        if intervals_us.get(message_id) == _OFF:
+            intervals_us[message_id] = _ON_CHANGE
+
+
+def _interval_us(rate_hz: float) -> int:
+    return int(1e6 / rate_hz) if rate_hz else _OFF
+
+
+@lru_cache(maxsize=1)
+def _table() -> dict[str, dict[int, float]]:
+    """Link mode → message id → rate in Hz; 0 is on request only."""
+    data = pkgutil.get_data(__name__, "stream_rates.csv")
+    assert data is not None
+    rows = list(csv.DictReader(data.decode().splitlines()))
+    return {mode: {int(row["message_id"]): float(row[mode]) for row in rows} for mode in LINK_MODES}

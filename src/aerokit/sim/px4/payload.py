@@ -1,0 +1,329 @@
+"""Payload of a simulated PX4: gimbal and camera trigger.
+
+Gimbal on its AUX outputs (MNT_MODE_OUT 0), with gimbal manager; enabled by MNT_MODE_IN 0 or 4.
+
+Servos report nothing, so the telemetry is the set-point. It accepts commands only from the component in control, but
+a region of interest from everyone. It has no secondary control, no retracted position, and ignores
+GIMBAL_MANAGER_SET_PITCHYAW. When a return starts, PX4 takes control for a moment and turns the gimbal to neutral.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import GimbalDeviceFlags, GimbalManagerCapFlags, MavCmd, MavMountMode, MavResult
+from aerokit.mavlink.enums import GimbalManagerFlags as Flags
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, whole
+from aerokit.sim.components.component import pose_of
+from aerokit.sim.motion import euler_from_quaternion, quaternion_from_euler
+from aerokit.sim.px4.host import Px4Host
+from aerokit.sim.px4.modes import RTL
+from aerokit.sim.vehicle import sender_of
+
+# Values of MNT_MODE_IN: radio and MAVLink, MAVLink only.
+_FITTED_BY = frozenset({0, 4})
+_DEVICE_ID = 1
+_LIMITS = ((-45.0, 45.0), (-45.0, 45.0), (-180.0, 180.0))
+_TAU_S, _STEP_S = 0.3, 0.0187
+# PX4 filters the integrated angle, so that it turns more slowly than commanded.
+_RATE_FACTOR = _STEP_S / (_TAU_S + _STEP_S)
+_RATE_TIMEOUT_S = 2.0
+_POLL_INTERVAL_S = 0.25
+_Can = GimbalManagerCapFlags
+_CAPABILITIES = (
+    _Can.HAS_NEUTRAL | _Can.HAS_ROLL_LOCK | _Can.HAS_PITCH_AXIS | _Can.HAS_PITCH_LOCK
+    | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_LOCK | _Can.CAN_POINT_LOCATION_GLOBAL
+)  # fmt: skip
+Angles = tuple[float, float, float]
+_NEUTRAL: Angles = (0.0, 0.0, 0.0)
+
+
+class Px4Gimbal:
+    """Set-point and control of the gimbal."""
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self.in_control: tuple[int, int] = (0, 0)  # System and component id; zeros if no one is in control.
+        self._target, self._rates, self._since = _NEUTRAL, _NEUTRAL, 0.0
+        self._flags = 0
+        self._place: tuple[int, int, float] | None = None
+        self._was_returning = False
+        self.is_fitted: bool = False  # True if MNT_MODE_IN enabled it at power-on.
+        px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
+
+    def start(self) -> None:
+        """Called at power-on: neutral, and no one in control."""
+        parameters = self._px4.parameters
+        self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
+        self.rest()
+        self.in_control = (0, 0)
+        if self.is_fitted:
+            self._px4.every(_POLL_INTERVAL_S, self._poll_return)
+
+    @property
+    def own_ids(self) -> tuple[int, int]:
+        """System and component id of the vehicle."""
+        return self._px4.system_id, self._px4.component_id
+
+    @property
+    def is_from_north(self) -> bool:
+        return self._place is not None or bool(self._flags & Flags.YAW_LOCK)
+
+    @property
+    def flags(self) -> int:
+        """GIMBAL_DEVICE_FLAGS."""
+        locks = self._flags & (Flags.ROLL_LOCK | Flags.PITCH_LOCK)
+        return locks | (GimbalDeviceFlags.YAW_LOCK if self.is_from_north else GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME)
+
+    def angles(self) -> Angles:
+        """Return roll, pitch and yaw of the set-point in radians."""
+        if self._place is not None:
+            return self._angles_to(self._place)
+        seconds = min(self._px4.now - self._since, _RATE_TIMEOUT_S) * _RATE_FACTOR
+        moved = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
+        limited = [
+            max(math.radians(low), min(math.radians(high), angle))
+            for angle, (low, high) in zip(moved, _LIMITS, strict=True)
+        ]
+        return (limited[0], limited[1], limited[2])
+
+    def _angles_to(self, place: tuple[int, int, float]) -> Angles:
+        north, east = self._px4.frame.to_local(place[0], place[1])
+        motion = self._px4.motion
+        north, east = north - motion.north, east - motion.east
+        current = self._px4.frame.to_global(*motion.place)
+        pitch = math.atan2(place[2] - current.altitude_m, math.hypot(north, east))
+        return (0.0, max(math.radians(_LIMITS[1][0]), pitch), math.atan2(east, north))
+
+    def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
+        """Apply angles, and rates in addition; RETRACT is accepted without an effect."""
+        if flags & Flags.RETRACT:
+            return
+        current = self.angles()
+        if flags & Flags.NEUTRAL:
+            self.rest()
+            return
+        self._place, self._flags, self._since = None, flags, self._px4.now
+        self._target = current if any(map(math.isnan, angles)) else angles
+        roll, pitch, yaw = (0.0 if math.isnan(rate) else rate for rate in rates)
+        self._rates = (roll, pitch, yaw)
+
+    def rest(self) -> None:
+        self._place, self._flags, self._target, self._rates = None, 0, _NEUTRAL, _NEUTRAL
+
+    def look_at(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> None:
+        """Point at a position (altitude AMSL)."""
+        self._place = (latitude_e7, longitude_e7, altitude_m)
+
+    def _poll_return(self) -> None:
+        is_going_home = self._px4.mode == RTL
+        if is_going_home and not self._was_returning:
+            self.rest()
+            self.in_control = (0, 0)  # PX4 itself was in control for a moment.
+        self._was_returning = is_going_home
+
+    def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        if not self.is_fitted or sender_of(message) != self.in_control:
+            return
+        has_angles = not any(map(math.isnan, message.q))
+        angles = euler_from_quaternion(*message.q) if has_angles else (math.nan,) * 3
+        rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
+        self.apply(message.flags, (angles[0], angles[1], angles[2]), rates)
+
+    def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
+        if not self.is_fitted:
+            return None
+        q = quaternion_from_euler(*self.angles())
+        return m.GimbalDeviceAttitudeStatus(
+            0, 0, self._px4.time_boot_ms, self.flags, q, 0.0, 0.0, 0.0, 0, 0.0, 0.0, _DEVICE_ID
+        )
+
+    def manager_information(self) -> m.GimbalManagerInformation | None:
+        if not self.is_fitted:
+            return None
+        limits = [math.radians(end) for axis in _LIMITS for end in axis]
+        return m.GimbalManagerInformation(self._px4.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
+
+    def manager_status(self) -> m.GimbalManagerStatus | None:
+        if not self.is_fitted:
+            return None
+        return m.GimbalManagerStatus(self._px4.time_boot_ms, self.flags, _DEVICE_ID, *self.in_control, 0, 0)
+
+
+_SELF, _RELEASE = -2, -3
+
+
+def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
+    """Return handlers by MAV_CMD; they do not answer without a gimbal."""
+
+    def if_fitted(handler: Callable[[Px4Gimbal, ReceivedCommand], int]) -> CommandHandler:
+        return lambda command: handler(gimbal, command) if gimbal.is_fitted else None
+
+    return {
+        MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: if_fitted(_configure),
+        MavCmd.DO_GIMBAL_MANAGER_PITCHYAW: if_fitted(_pitch_and_yaw),
+        MavCmd.DO_MOUNT_CONTROL: if_fitted(_control_mount),
+        MavCmd.DO_MOUNT_CONFIGURE: if_fitted(lambda *_: MavResult.ACCEPTED),
+        MavCmd.DO_SET_ROI_LOCATION: lambda command: _set_roi(gimbal, command),
+        MavCmd.DO_SET_ROI_NONE: lambda _: _set_roi(gimbal, None),
+    }
+
+
+def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
+    """Ids; -2 is PX4 itself rather than the sender. Secondary control is not supported."""
+    own = gimbal.own_ids
+    now = []
+    for number, before, mine, sender in zip(
+        (command.param1, command.param2), gimbal.in_control, own, command.sender, strict=True
+    ):
+        wanted = whole(number)
+        if wanted == _SELF:
+            now.append(mine)
+        elif wanted == _RELEASE:
+            now.append(0 if before == sender else before)
+        else:
+            now.append(wanted if 0 <= wanted <= 255 else before)
+    gimbal.in_control = (now[0], now[1])
+    return MavResult.ACCEPTED
+
+
+def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
+    if command.sender != gimbal.in_control:
+        return MavResult.DENIED
+    angles = (0.0, math.radians(command.param1), math.radians(command.param2))
+    rates = (math.nan, math.radians(command.param3), math.radians(command.param4))
+    gimbal.apply(whole(command.x), angles, rates)
+    return MavResult.ACCEPTED
+
+
+def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
+    """Unknown modes are accepted, too."""
+    mode = whole(command.z)
+    if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
+        gimbal.rest()
+    elif mode == MavMountMode.MAVLINK_TARGETING:
+        pitch, roll, yaw = (math.radians(angle) for angle in (command.param1, command.param2, command.param3))
+        angles = (roll, pitch, math.remainder(yaw, math.tau))
+        gimbal.apply(Flags.ROLL_LOCK | Flags.PITCH_LOCK, angles, (0.0, 0.0, 0.0))
+    return MavResult.ACCEPTED
+
+
+def _set_roi(gimbal: Px4Gimbal, command: ReceivedCommand | None) -> int:
+    """The altitude is taken as AMSL in every frame."""
+    if command is None:
+        gimbal.rest()
+    elif math.isfinite(command.z):
+        gimbal.look_at(*command.place(), command.z)
+    return MavResult.ACCEPTED
+
+
+_DEFAULT_CAMERA_ID = 1
+_MIN_INTERVAL_S = 0.04
+_GEOTAG_DELAY_S = 0.02
+
+
+class Px4CameraTrigger:
+    """Reports each image by CAMERA_TRIGGER, and by CAMERA_IMAGE_CAPTURED if ``sends_image_captured``.
+
+    While it is disabled its commands are not answered, as on the real vehicle.
+    """
+
+    sequence: int
+
+    def __init__(self, px4: Px4Host) -> None:
+        self._px4 = px4
+        self.sequence = 0  # Sequence number of the next image.
+        self.interval_s: float = 1.0  # Interval of a series.
+        self.sends_image_captured = True  # True if the geotag module runs.
+        self._is_enabled = False
+        self._is_paused = False
+        self._series = 0
+        self._last_at = -math.inf
+
+    @property
+    def is_fitted(self) -> bool:
+        """True while TRIG_MODE is not 0."""
+        return int(self._px4.parameters.get("TRIG_MODE", 0)) != 0
+
+    @property
+    def is_running(self) -> bool:
+        return self._is_enabled and not self._is_paused
+
+    def restart(self) -> None:
+        self.sequence, self._is_enabled, self._is_paused = 0, False, False
+        self._series += 1
+
+    def commands(self) -> dict[int, CommandHandler]:
+        return {
+            MavCmd.DO_DIGICAM_CONTROL: self._control,
+            MavCmd.DO_TRIGGER_CONTROL: self._switch,
+            MavCmd.DO_SET_CAM_TRIGG_INTERVAL: self._set_interval,
+        }
+
+    def _control(self, command: ReceivedCommand) -> int | None:
+        if not self.is_fitted:
+            return None
+        if self._px4.now - self._last_at < _MIN_INTERVAL_S:
+            return MavResult.TEMPORARILY_REJECTED
+        if command.x == 1:
+            self.shoot()
+        return MavResult.ACCEPTED
+
+    def _switch(self, command: ReceivedCommand) -> int | None:
+        """Param 1 enables, 2 resets the sequence, 3 pauses; -1 leaves each unchanged."""
+        if not self.is_fitted:
+            return None
+        was_running = self.is_running
+        if whole(command.param3) in (0, 1):
+            self._is_paused = whole(command.param3) == 1
+        if whole(command.param2) == 1:
+            self.sequence = 0
+        if whole(command.param1) in (0, 1):
+            self._is_enabled = whole(command.param1) == 1
+        if self.is_running and not was_running:
+            self._series += 1
+            self._take_next(self._series)
+        return MavResult.ACCEPTED
+
+    def _set_interval(self, command: ReceivedCommand) -> int | None:
+        if not self.is_fitted:
+            return None
+        if command.param1 > 0.0:
+            self.interval_s = command.param1 / 1000.0
+        return MavResult.ACCEPTED
+
+    def _take_next(self, series: int) -> None:
+        if series == self._series and self.is_running:
+            self.shoot()
+            self._px4.call_later(self.interval_s, lambda: self._take_next(series))
+
+    def shoot(self) -> None:
+        px4, number = self._px4, self.sequence
+        self.sequence += 1
+        self._last_at = px4.now
+        px4.send(m.CameraTrigger(round(px4.now * 1e6), number))
+        if self.sends_image_captured:
+            px4.call_later(_GEOTAG_DELAY_S, lambda: self._send_captured(number))
+
+    def _send_captured(self, number: int) -> None:
+        px4, pose = self._px4, pose_of(self._px4)
+        if pose is not None:
+            place = pose.place
+            px4.send(
+                m.CameraImageCaptured(
+                    px4.time_boot_ms,
+                    round(px4.unix_time * 1e6),
+                    _DEFAULT_CAMERA_ID,
+                    place.latitude_e7,
+                    place.longitude_e7,
+                    round(place.altitude_m * 1000),
+                    round(pose.height_m * 1000),
+                    quaternion_from_euler(pose.roll, pose.pitch, pose.yaw),
+                    number,
+                    1,
+                    "",
+                )
+            )

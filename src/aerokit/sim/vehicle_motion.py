@@ -1,0 +1,373 @@
+"""Motion of simulated planes, rovers, boats and submarines.
+
+A plane is a point mass that flies where its nose points, through moving air. Modelled: limits of airspeed, climb,
+sink, bank and load; turn radius from bank and speed; wind correction; take-off and landing roll. Not modelled: lift
+and drag, stalls, sideslip, propellers, uneven ground.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass
+
+from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, SimulatedWind, approach_speed, wrap_pi
+
+_BANK_TIME_CONSTANT_S = 0.4
+_CLIMB_TIME_CONSTANT_S = 0.7
+_PITCH_TIME_CONSTANT_S = 0.3
+_TURN_GAIN_PER_S = 0.8
+_HEIGHT_GAIN_PER_S = 0.4
+_ANGLE_OF_ATTACK_RAD = math.radians(2.0)
+_STOPPED_M_S = 0.3
+
+
+@dataclass
+class WingLimits:
+    """Limits of the airframe and its controller."""
+
+    airspeed_min_m_s: float = 10.0
+    airspeed_max_m_s: float = 30.0
+    acceleration_m_s2: float = 3.0
+    roll_out_m_s2: float = 2.0
+    """Deceleration on the ground."""
+    climb_m_s: float = 5.0
+    sink_m_s: float = 5.0
+    glide_sink_m_s: float = 2.0
+    """Sink rate without power."""
+    vertical_acceleration_m_s2: float = 3.0
+    bank_rad: float = math.radians(45.0)
+
+
+class FixedWing(Motion):
+    """Motion of a plane: `bank_and_climb`, `head`, `fly_to`, `circle` or `roll_out` set the target, ``step`` moves.
+
+    It starts at rest on the ground and rolls straight ahead until it is fast enough and a climb is requested.
+    """
+
+    north: float
+    east: float
+    down: float
+
+    roll: float
+    pitch: float
+
+    def __init__(self, rng: random.Random, wing: WingLimits | None = None, wind: SimulatedWind | None = None) -> None:
+        super().__init__(rng, wind=wind)
+        self.wing: WingLimits = wing if wing is not None else WingLimits()
+        self.throttle: float = 0.0
+        """Engine throttle, 0 to 1."""
+        self._speed = 0.0
+        self._wanted_airspeed = 0.0
+        self._wanted_bank = 0.0
+        self._wanted_climb = 0.0
+
+    def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
+        """Hold airspeed (m/s), bank angle (rad, positive right) and climb rate (m/s)."""
+        limit = self.wing.bank_rad
+        self._wanted_airspeed = airspeed
+        self._wanted_bank = max(-limit, min(limit, bank))
+        self._wanted_climb = max(-self.wing.sink_m_s, min(self.wing.climb_m_s, climb))
+
+    def head(self, course: float, airspeed: float, climb: float, *, turn_rate: float = 0.0) -> None:
+        """Fly a ground course (rad from north) with wind correction; ``turn_rate`` is the change of the course."""
+        speed = max(self._speed, self.wing.airspeed_min_m_s)
+        north, east = self._air_movement()
+        across = -north * math.sin(course) + east * math.cos(course)
+        heading = course - math.asin(max(-0.9, min(0.9, across / speed)))
+        rate = turn_rate + _TURN_GAIN_PER_S * wrap_pi(heading - self.yaw)
+        self.bank_and_climb(airspeed, math.atan(speed * rate / GRAVITY_M_S2), climb)
+
+    def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
+        """Fly towards and over a point; a plane cannot stop there."""
+        course = math.atan2(east - self.east, north - self.north)
+        self.head(course, airspeed, self.climb_to(down))
+
+    def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
+        """Circle a point with this radius in metres; negative is counter-clockwise."""
+        size, way = max(1.0, abs(radius)), math.copysign(1.0, radius)
+        distance = math.hypot(north - self.north, east - self.east)
+        inward = math.atan2(east - self.east, north - self.north)
+        # Far away, fly straight to the edge of the circle; on the circle, along its tangent.
+        share = max(-1.0, min(1.0, (distance - size) / size))
+        course = inward - way * (math.pi / 2) * (1.0 - share)
+        rate = way * self.ground_speed_m_s / size if distance < 1.5 * size else 0.0
+        self.head(course, airspeed, self.climb_to(down), turn_rate=rate)
+
+    def roll_out(self) -> None:
+        """Stop on the ground."""
+        self.bank_and_climb(0.0, 0.0, 0.0)
+
+    def climb_to(self, down: float) -> float:
+        """Return the climb rate in m/s that leads to this height."""
+        return _HEIGHT_GAIN_PER_S * (self.down - down)
+
+    @property
+    def is_at_rest(self) -> bool:
+        return self.is_on_ground and self._speed < _STOPPED_M_S
+
+    def step(self, dt: float, *, powered: bool = True) -> None:
+        """Advance by ``dt`` seconds; unpowered, it glides."""
+        if self.wind.gusts_m_s > 0.0:
+            self._update_gusts(dt)
+        was_on_ground = self.is_on_ground
+        before = (self.velocity_north, self.velocity_east, self.velocity_down)
+        if was_on_ground and not self._lifts_off(powered=powered):
+            self._roll_on_ground(dt, powered=powered)
+        else:
+            self._fly(dt, powered=powered)
+            if self.is_on_ground and self.velocity_down >= 0.0 and not was_on_ground:
+                self._touch_down()
+        self._differentiate(before, dt)
+
+    def settle(self) -> None:
+        super().settle()
+        self._speed = self.throttle = 0.0
+        self.roll_out()
+
+    def _lifts_off(self, *, powered: bool) -> bool:
+        return powered and self._wanted_climb > 0.0 and self._speed >= self.wing.airspeed_min_m_s
+
+    def _roll_on_ground(self, dt: float, *, powered: bool) -> None:
+        wanted = self._wanted_airspeed if powered else 0.0
+        self._approach_speed(wanted, dt)
+        self.throttle = 1.0 if powered and wanted > self._speed else 0.0
+        self.roll = self.pitch = 0.0
+        self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
+        self.velocity_north, self.velocity_east = self._along_nose(self._speed)
+        self.velocity_down, self.down = 0.0, self.ground_down
+        self._advance(dt)
+
+    def _fly(self, dt: float, *, powered: bool) -> None:
+        wing = self.wing
+        wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
+        wanted = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
+        self._approach_speed(wanted if powered else 1.3 * wing.airspeed_min_m_s, dt)
+        self._bank(self._wanted_bank if powered else 0.0, dt)
+        rate = (-wanted_climb - self.velocity_down) / _CLIMB_TIME_CONSTANT_S
+        limit = wing.vertical_acceleration_m_s2
+        self.velocity_down += max(-limit, min(limit, rate)) * dt
+        self._tilt(dt)
+        level = math.sqrt(max(0.0, self._speed * self._speed - self.velocity_down * self.velocity_down))
+        air_north, air_east = self._air_movement()
+        north, east = self._along_nose(level)
+        self.velocity_north: float = north + air_north
+        self.velocity_east: float = east + air_east
+        self._advance(dt)
+        climb_share = -self.velocity_down / wing.climb_m_s
+        self.throttle = max(0.0, min(1.0, 0.45 + 0.5 * climb_share)) if powered else 0.0
+
+    def _touch_down(self) -> None:
+        self.impact_speed_m_s: float = self.velocity_down
+        self._speed = self.ground_speed_m_s
+        self.down = self.ground_down
+        self.velocity_down: float = 0.0
+        self.roll = self.pitch = 0.0
+
+    def _approach_speed(self, wanted: float, dt: float) -> None:
+        down = self.wing.roll_out_m_s2 if self.is_on_ground else self.wing.acceleration_m_s2
+        self._speed += max(-down * dt, min(self.wing.acceleration_m_s2 * dt, wanted - self._speed))
+
+    def _bank(self, wanted: float, dt: float) -> None:
+        step = (wanted - self.roll) * min(1.0, dt / _BANK_TIME_CONSTANT_S)
+        self.roll += step
+        self.roll_rate: float = step / dt
+        self.yaw_rate: float = GRAVITY_M_S2 * math.tan(self.roll) / max(self._speed, 1.0)
+        self.yaw: float = wrap_pi(self.yaw + self.yaw_rate * dt)
+
+    def _tilt(self, dt: float) -> None:
+        slope = math.asin(max(-0.7, min(0.7, -self.velocity_down / max(self._speed, 1.0))))
+        step = (slope + _ANGLE_OF_ATTACK_RAD - self.pitch) * min(1.0, dt / _PITCH_TIME_CONSTANT_S)
+        self.pitch += step
+        self.pitch_rate: float = step / dt
+
+    def _along_nose(self, speed: float) -> tuple[float, float]:
+        return speed * math.cos(self.yaw), speed * math.sin(self.yaw)
+
+    def _air_movement(self) -> tuple[float, float]:
+        return self.wind.north_m_s + self._gust_north, self.wind.east_m_s + self._gust_east
+
+    def _advance(self, dt: float) -> None:
+        self.north += self.velocity_north * dt
+        self.east += self.velocity_east * dt
+        self.down += self.velocity_down * dt
+
+    def _differentiate(self, before: tuple[float, float, float], dt: float) -> None:
+        self.acceleration_north: float = (self.velocity_north - before[0]) / dt
+        self.acceleration_east: float = (self.velocity_east - before[1]) / dt
+        self.acceleration_down: float = (self.velocity_down - before[2]) / dt
+
+
+_SPEED_TIME_CONSTANT_S = 0.3
+_HEADING_GAIN_PER_S = 2.0
+_SLOW_M_S = 1.0
+_SLOW_TURN_ERROR_RAD = math.pi / 2
+
+
+@dataclass
+class GroundLimits:
+    """Limits of wheels and steering."""
+
+    acceleration_m_s2: float = 1.0
+    top_speed_m_s: float = 10.0
+    turn_rate_rad_s: float = math.radians(120.0)
+    turn_radius_m: float = 0.9
+    sideways_m_s2: float = 5.9
+
+
+class GroundMotion(Motion):
+    """Motion of a rover or boat: `drive`, `head`, `drive_to` or `stop` set the target, ``step`` moves."""
+
+    north: float
+    east: float
+    down: float
+
+    speed_m_s: float
+
+    def __init__(
+        self, rng: random.Random, wheels: GroundLimits | None = None, wind: SimulatedWind | None = None
+    ) -> None:
+        super().__init__(rng, wind=wind)
+        self.wheels: GroundLimits = wheels if wheels is not None else GroundLimits()
+        self.speed_m_s = 0.0
+        """Forward speed; negative is backwards."""
+        self._wanted_speed = 0.0
+        self._rate = 0.0
+        self._heading: float | None = None
+
+    def stop(self) -> None:
+        self.drive(0.0, 0.0)
+
+    def drive(self, speed: float, turn_rate: float) -> None:
+        """Drive at this speed (m/s, negative backwards) and turn rate (rad/s)."""
+        self._wanted_speed, self._rate, self._heading = speed, turn_rate, None
+
+    def head(self, speed: float, heading: float) -> None:
+        """Drive at this speed towards this heading (rad)."""
+        self._wanted_speed, self._rate, self._heading = speed, 0.0, heading
+
+    def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
+        """Drive to a point at up to this speed (m/s); ``stops`` brakes to stop there."""
+        north, east = north - self.north, east - self.east
+        distance = math.hypot(north, east)
+        if stops:
+            speed = min(speed, approach_speed(distance, 1.0, self.wheels.acceleration_m_s2))
+        course = math.atan2(east, north)
+        if backwards:
+            self.head(-speed, course + math.pi)
+            return
+        off = abs(wrap_pi(course - self.yaw))
+        self.head(min(speed, _SLOW_M_S) if off > _SLOW_TURN_ERROR_RAD else speed, course)
+
+    @property
+    def airspeed_m_s(self) -> float:
+        """Always 0: a rover has no pitot tube."""
+        return 0.0
+
+    def step(self, dt: float, *, powered: bool = True) -> None:
+        """Advance by ``dt`` seconds; unpowered, it rolls out."""
+        rate = self._turn_rate()
+        self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
+        middle = self.yaw + 0.5 * rate * dt
+        self.yaw: float = wrap_pi(self.yaw + rate * dt)
+        self.yaw_rate: float = rate
+        north, east = self.speed_m_s * math.cos(middle), self.speed_m_s * math.sin(middle)
+        self.acceleration_north: float = (north - self.velocity_north) / dt
+        self.acceleration_east: float = (east - self.velocity_east) / dt
+        self.velocity_north: float = north
+        self.velocity_east: float = east
+        self.north += north * dt
+        self.east += east * dt
+
+    def settle(self) -> None:
+        super().settle()
+        self.speed_m_s = 0.0
+        self.stop()
+
+    def _turn_rate(self) -> float:
+        wheels, rate = self.wheels, self._rate
+        if self._heading is not None:
+            rate = _HEADING_GAIN_PER_S * wrap_pi(self._heading - self.yaw)
+        limit = min(wheels.turn_rate_rad_s, abs(self.speed_m_s) / wheels.turn_radius_m)
+        return max(-limit, min(limit, rate))
+
+    def _curve_speed(self, rate: float) -> float:
+        limit = self.wheels.top_speed_m_s
+        if rate:
+            limit = min(limit, max(_SLOW_M_S, self.wheels.sideways_m_s2 / abs(rate)))
+        return max(-limit, min(limit, self._wanted_speed))
+
+    def _accelerate(self, wanted: float, dt: float) -> None:
+        change = (wanted - self.speed_m_s) * min(1.0, dt / _SPEED_TIME_CONSTANT_S)
+        limit = self.wheels.acceleration_m_s2 * dt
+        braking = abs(wanted) < abs(self.speed_m_s)
+        if braking:
+            limit *= 2.0
+        self.speed_m_s += max(-limit, min(limit, change))
+
+
+_DRAG_PER_S = 1.0
+_LIMITS = MotionLimits(
+    acceleration_m_s2=1.0, vertical_acceleration_m_s2=1.0, turn_rate_rad_s=math.radians(60.0), lean_rad=0.0
+)
+
+
+class UnderwaterMotion(Motion):
+    """Motion of a submarine. ``down`` is the depth, ``bottom_down`` the bottom, ``ground_down`` the surface of the
+    water.
+
+    ``buoyancy_m_s2`` is its upward acceleration without thrust.
+    """
+
+    def __init__(self, rng: random.Random, *, bottom_down: float = 200.0, buoyancy_m_s2: float = 0.1) -> None:
+        super().__init__(rng, limits=_LIMITS)
+        self.bottom_down = bottom_down
+        self.buoyancy_m_s2 = buoyancy_m_s2
+        self._is_floating = False
+
+    @property
+    def is_on_ground(self) -> bool:
+        return False
+
+    @property
+    def is_at_surface(self) -> bool:
+        return self.down <= self.ground_down
+
+    @property
+    def is_still(self) -> bool:
+        """True if it floats motionless at the surface."""
+        speed = math.hypot(self.velocity_north, self.velocity_east, self.velocity_down)
+        return self.is_at_surface and speed < 0.01
+
+    @property
+    def airspeed_m_s(self) -> float:
+        """Speed through the water, as the telemetry reports it."""
+        return math.hypot(self.velocity_north, self.velocity_east)
+
+    def seek_velocity(self, north: float, east: float, down: float) -> None:
+        super().seek_velocity(north, east, down)
+        self._is_floating = False
+
+    def push(self, north: float, east: float) -> None:
+        """Move at this horizontal velocity; the depth follows from buoyancy."""
+        super().seek_velocity(north, east, 0.0)
+        self._is_floating = True
+
+    def step(self, dt: float, *, powered: bool = True) -> None:
+        """Advance by ``dt`` seconds; unpowered, it drifts up."""
+        lift = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
+        if powered:
+            north, east, down = self._commanded_acceleration()
+            down = lift if self._is_floating else down
+        else:
+            north, east, down = -_DRAG_PER_S * self.velocity_north, -_DRAG_PER_S * self.velocity_east, lift
+        self._integrate(north, east, down, dt)
+        self._turn(dt, powered=powered)
+
+    def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
+        super()._integrate(north, east, down, dt)
+        if self.down < self.ground_down:
+            self.down, self.velocity_down = self.ground_down, max(0.0, self.velocity_down)
+        elif self.down > self.bottom_down:
+            self.down: float = self.bottom_down
+            self.velocity_down: float = min(0.0, self.velocity_down)

@@ -1,0 +1,72 @@
+"""``ThreadFuture``: a result that one thread waits for and another one sets."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+if TYPE_CHECKING:
+    import concurrent.futures
+
+T = TypeVar("T")
+
+
+class ThreadFuture(Generic[T]):
+    """A result or an error that another thread sets. Waiting for it is safe for Ctrl-C at every moment.
+
+    It uses a plain lock. ``threading.Condition``, and with it ``Event`` and ``Future``, is Python code that Ctrl-C can
+    interrupt between any two lines: KeyboardInterrupt then becomes ``RuntimeError: release unlocked lock``, or a lock
+    that the other thread needs stays acquired.
+    """
+
+    def __init__(self) -> None:
+        self._gate = threading.Lock()
+        self._gate.acquire()
+        self._values: tuple[T, ...] = ()
+        self._error: BaseException | None = None
+        self.is_done: bool = False
+
+    @property
+    def has_result(self) -> bool:
+        return bool(self._values)
+
+    def set_result(self, value: T) -> None:
+        self._values = (value,)
+        self.finish()
+
+    def set_exception(self, error: BaseException) -> None:
+        self._error = error
+        self.finish()
+
+    def finish(self) -> None:
+        """Mark as done, with or without a result. Idempotent on one thread."""
+        if not self.is_done:
+            self.is_done = True
+            self._gate.release()
+
+    def wait(self, timeout: float) -> bool:
+        """Wait at most ``timeout`` seconds and return True if done."""
+        if not self.is_done and self._gate.acquire(timeout=timeout):
+            self._gate.release()  # for other threads that wait
+        return self.is_done
+
+    def result(self) -> T:
+        """Return the result, or raise the error (once), or LookupError if there is neither."""
+        error = self.pop_exception()
+        if error is not None:
+            raise error
+        if not self._values:
+            raise LookupError("finished without a result")
+        return self._values[0]
+
+    def pop_exception(self) -> BaseException | None:
+        # Keeping the error would make a reference cycle: its traceback refers to this object.
+        error, self._error = self._error, None
+        return error
+
+
+def when_done(future: concurrent.futures.Future[Any]) -> ThreadFuture[None]:
+    """Return a ThreadFuture that finishes, without a result, together with ``future``."""
+    done: ThreadFuture[None] = ThreadFuture()
+    future.add_done_callback(lambda _: done.finish())
+    return done

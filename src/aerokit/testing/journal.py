@@ -1,0 +1,103 @@
+"""`Journal`: texts that a simulated vehicle sent, and messages that it received."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TypeVar
+
+from aerokit.mavlink.enums import MavCmd, MavSeverity
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.messages import CommandInt, CommandLong
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+@dataclass(frozen=True)
+class SentText:
+    """A complete status text of the vehicle; it may have been lost in transit."""
+
+    time_s: float
+    """Simulated seconds."""
+    severity: int
+    """MAV_SEVERITY: 0 is an emergency, 7 is for debugging."""
+    text: str
+
+    def __str__(self) -> str:
+        severities = set(MavSeverity)
+        name = MavSeverity(self.severity).name if self.severity in severities else str(self.severity)
+        return f"{self.time_s:.1f} s {name} {self.text!r}"
+
+
+@dataclass(frozen=True)
+class ReceivedMessage:
+    """A message that reached the vehicle, was addressed to it and is supported by it."""
+
+    time_s: float
+    """Simulated seconds."""
+    message: Message
+
+
+class Journal:
+    """Texts and messages, oldest first; it grows while the vehicle runs. Assertions raise AssertionError."""
+
+    def __init__(self) -> None:
+        self._texts: list[SentText] = []
+        self._messages: list[ReceivedMessage] = []
+
+    def on_text_sent(self, time_s: float, severity: int, text: str) -> None:
+        """Append a text."""
+        self._texts.append(SentText(time_s, severity, text.rstrip()))
+
+    def on_message_received(self, time_s: float, message: Message) -> None:
+        """Append a message."""
+        self._messages.append(ReceivedMessage(time_s, message))
+
+    @property
+    def texts(self) -> list[SentText]:
+        """Texts that the vehicle sent."""
+        return list(self._texts)
+
+    @property
+    def messages(self) -> list[ReceivedMessage]:
+        """Messages that the vehicle received."""
+        return list(self._messages)
+
+    def of(self, kind: type[MessageT]) -> list[MessageT]:
+        """Return the received messages of one class."""
+        return [received.message for received in self.messages if isinstance(received.message, kind)]
+
+    def commands(self, command: int) -> list[CommandLong | CommandInt]:
+        """Return the received commands of one MAV_CMD, COMMAND_LONG or COMMAND_INT, including repetitions."""
+        return [order for order in self._orders() if order.command == command]
+
+    def assert_sent_text(self, part: str) -> None:
+        """Assert that the vehicle sent a text that contains ``part``."""
+        __tracebackhide__ = True
+        is_sent = any(part in text.text for text in self.texts)
+        assert is_sent, f"no text with {part!r} was sent; sent texts:{_lines(self.texts)}"
+
+    def assert_received_command(self, command: int, *, times: int | None = None) -> None:
+        """Assert that the vehicle received this MAV_CMD; with ``times``, exactly that often (0: never)."""
+        __tracebackhide__ = True
+        count = len(self.commands(command))
+        right = count > 0 if times is None else count == times
+        wanted = "" if times is None else f", not {times} times"
+        assert right, f"{_name(command)} was received {count} times{wanted}; received commands:{_lines(self._names())}"
+
+    def _orders(self) -> list[CommandLong | CommandInt]:
+        messages = (received.message for received in self.messages)
+        return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
+
+    def _names(self) -> list[str]:
+        """Command names in the order of their first reception, with counts."""
+        counts = Counter(_name(order.command) for order in self._orders())
+        return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
+
+
+def _name(command: int) -> str:
+    return MavCmd(command).name if command in set(MavCmd) else f"command {command}"
+
+
+def _lines(entries: list[SentText] | list[str]) -> str:
+    return "".join(f"\n  - {entry}" for entry in entries) or " none"

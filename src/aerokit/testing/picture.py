@@ -1,0 +1,336 @@
+"""Pictures of tracks, from above and as altitude profile: SVG, or PNG with Pillow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import Any, Protocol
+
+from aerokit._internal.files import write_atomically
+from aerokit.errors import AerokitError, InvalidArgument
+from aerokit.position import Position
+from aerokit.testing.track_points import TrackFailure, TrackPoint, metres_from
+
+__all__ = ["check_picture", "draw_svg", "save_picture"]
+
+_COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
+_GREY = "#dddddd"
+_WIDTH, _MAP_HEIGHT, _PROFILE_HEIGHT, _MARGIN = 800, 520, 160, 60
+_HEIGHT = _MAP_HEIGHT + _PROFILE_HEIGHT
+_FONT_SIZE = 12
+_MAX_NAMES = 8
+_FAILED = "#e00000"
+_LABEL_HEIGHT, _LABEL_WIDTH, _MAX_LABELS = 13, 60, 40
+_CORNERS = 90  # Corners of the polygon that draws a circle.
+
+
+class Drawable(Protocol):
+    """A track, as far as it is drawn."""
+
+    home: Position
+    name: str
+    failure: TrackFailure | None
+
+    def __iter__(self) -> Iterator[TrackPoint]: ...
+
+    def __len__(self) -> int: ...
+
+    def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
+        """Return metres north and east of ``origin`` (default: home), and up from its own home."""
+        ...
+
+    def snapshot(self) -> Drawable:
+        """Return a copy that does not grow."""
+        ...
+
+
+def check_picture(path: str | PathLike[str]) -> None:
+    """Check a file name.
+
+    Raises InvalidArgument for another suffix than .svg and .png, AerokitError if .png needs Pillow.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".svg", ".png"):
+        raise InvalidArgument(f"cannot draw {str(path)!r}: the name must end in .svg or .png")
+    if suffix == ".png":
+        _pillow("Image")
+
+
+def save_picture(tracks: Iterable[Drawable], path: str | PathLike[str]) -> None:
+    """Draw tracks from above and their altitudes over time, as .svg or as .png (with Pillow).
+
+    Raises what `check_picture` raises, and OSError if the file cannot be written.
+    """
+    check_picture(path)
+    tracks = list(tracks)
+    if Path(path).suffix.lower() == ".svg":
+        write_atomically(path, draw_svg(tracks))
+    else:
+        _save_png(_shapes(tracks), path)
+
+
+def draw_svg(tracks: Sequence[Drawable]) -> str:
+    """Return the picture as SVG text: north is up, in metres from the first vehicle's home."""
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{_HEIGHT}"'
+        f' font-family="sans-serif" font-size="{_FONT_SIZE}">',
+        f'<rect width="{_WIDTH}" height="{_HEIGHT}" fill="white"/>',
+        *(shape.svg() for shape in _shapes(tracks)),
+    ]
+    return "\n".join([*lines, "</svg>\n"])
+
+
+@dataclass(frozen=True)
+class _Line:
+    places: Sequence[tuple[float, float]]
+    colour: str
+    is_dashed: bool = False
+
+    def svg(self) -> str:
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in self.places)
+        dashes = ' stroke-dasharray="6 4"' if self.is_dashed else ""
+        return f'<polyline points="{points}" fill="none" stroke="{self.colour}" stroke-width="1.5"{dashes}/>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        image.line([(x * scale, y * scale) for x, y in self.places], self.colour, round(1.5 * scale), "curve")
+
+
+@dataclass(frozen=True)
+class _GridLine:
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    def svg(self) -> str:
+        (x1, y1), (x2, y2) = self.start, self.end
+        return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{_GREY}"/>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        image.line([number * scale for number in (*self.start, *self.end)], _GREY, scale)
+
+
+@dataclass(frozen=True)
+class _Dot:
+    x: float
+    y: float
+    colour: str
+    radius: float = 4
+
+    def svg(self) -> str:
+        return f'<circle cx="{self.x:.1f}" cy="{self.y:.1f}" r="{self.radius:g}" fill="{self.colour}"/>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        image.circle((self.x * scale, self.y * scale), self.radius * scale, self.colour)
+
+
+@dataclass(frozen=True)
+class _Text:
+    x: float
+    y: float
+    text: str
+    anchor: str
+    colour: str = "black"
+
+    def svg(self) -> str:
+        place = f'x="{self.x:.1f}" y="{self.y:.1f}" text-anchor="{self.anchor}"'
+        return f'<text {place} fill="{self.colour}">{escape(self.text)}</text>'
+
+    def draw(self, image: Any, scale: int, font: Any) -> None:
+        anchor = {"start": "ls", "middle": "ms", "end": "rs"}[self.anchor]
+        image.text((self.x * scale, self.y * scale), self.text, self.colour, font, anchor=anchor)
+
+
+_Shape = _Line | _GridLine | _Dot | _Text
+
+
+def _shapes(tracks: Sequence[Drawable]) -> list[_Shape]:
+    drawn = [track.snapshot() for track in tracks if track]
+    return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
+
+
+class _Axes:
+    """Maps values to positions in a rectangle of the picture, with a margin."""
+
+    def __init__(self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, square: bool) -> None:
+        self.left, self.top, self.width, self.height = _MARGIN, top, _WIDTH - 2 * _MARGIN, height
+        self.x_range, self.y_range = _with_margin(xs), _with_margin(ys)
+        if square:
+            scale = max(_span(self.x_range) / self.width, _span(self.y_range) / self.height)
+            self.x_range = _widened(self.x_range, scale * self.width)
+            self.y_range = _widened(self.y_range, scale * self.height)
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        right = (x - self.x_range[0]) / _span(self.x_range) * self.width
+        up = (y - self.y_range[0]) / _span(self.y_range) * self.height
+        return self.left + right, self.top + self.height - up
+
+    def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
+        shapes: list[_Shape] = []
+        bottom, right = self.top + self.height, self.left + self.width
+        for value in _ticks(self.x_range, 6):
+            x, _ = self.place(value, 0.0)
+            shapes.append(_GridLine((x, self.top), (x, bottom)))
+            shapes.append(_Text(x, bottom + 15, f"{value:g} {x_unit}", "middle"))
+        for value in _ticks(self.y_range, 5 if self.height > 200 else 3):
+            _, y = self.place(0.0, value)
+            shapes.append(_GridLine((self.left, y), (right, y)))
+            shapes.append(_Text(self.left - 5, y + 4, f"{value:g} {y_unit}", "end"))
+        return shapes
+
+
+def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
+    paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
+    outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
+    easts, norths = zip(*(place for path in paths + outlines for place in path), strict=True)
+    axes = _Axes(easts, norths, 30, _MAP_HEIGHT - 60, square=True)
+    shapes = axes.grid("m", "m")
+    shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, True) for outline in outlines]
+    labels = _Labels()
+    for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
+        places = [axes.place(east, north) for east, north in path]
+        shapes += [_Line(places, colour), _Dot(*places[0], colour)]
+        shapes += labels.modes(track, places, colour)
+        shapes += _failed_point(track, places)
+    return shapes
+
+
+def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float]]]:
+    """Return the circle or polygon of the failed assertion, in metres east and north."""
+    failure = track.failure
+    if failure is None:
+        return []
+    plane, found = metres_from(origin), []
+    if failure.circle is not None:
+        (north, east), radius = plane(failure.circle[0]), failure.circle[1]
+        angles = [2 * math.pi * number / _CORNERS for number in range(_CORNERS + 1)]
+        found.append([(east + radius * math.sin(angle), north + radius * math.cos(angle)) for angle in angles])
+    if failure.polygon:
+        corners = [plane(corner) for corner in failure.polygon]
+        found.append([(east, north) for north, east in (*corners, corners[0])])
+    return found
+
+
+def _failed_point(track: Drawable, places: Sequence[tuple[float, float]]) -> list[_Shape]:
+    """Return a cross where the assertion failed."""
+    if track.failure is None:
+        return []
+    x, y = places[_index_of(track, track.failure.point)]
+    strokes = [
+        _Line([(x - 7, y - 7), (x + 7, y + 7)], _FAILED),
+        _Line([(x - 7, y + 7), (x + 7, y - 7)], _FAILED),
+    ]
+    return [*strokes, _Text(x, y + 22, "failed here", "middle", _FAILED)]
+
+
+def _index_of(track: Drawable, point: TrackPoint) -> int:
+    distances = [abs(candidate.time_s - point.time_s) for candidate in track]
+    return distances.index(min(distances))
+
+
+class _Labels:
+    """Mode names where modes start; names that would overlap are left out."""
+
+    def __init__(self) -> None:
+        self._places: list[tuple[float, float]] = []
+
+    def modes(
+        self, track: Drawable, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8
+    ) -> list[_Shape]:
+        """Return dots and names where modes start."""
+        shapes: list[_Shape] = []
+        before = None
+        for point, (x, y) in zip(track, places, strict=True):
+            if point.mode == before:
+                continue
+            before = point.mode
+            shapes.append(_Dot(x, y, colour, 2.5))
+            free = (y - above - step * _LABEL_HEIGHT for step in range(4))
+            height = next((level for level in free if self._is_free(x, level)), None)
+            if height is not None and len(self._places) < _MAX_LABELS:
+                self._places.append((x, height))
+                shapes.append(_Text(x + 4, height, point.mode, "start", colour))
+        return shapes
+
+    def _is_free(self, x: float, y: float) -> bool:
+        return all(abs(x - a) > _LABEL_WIDTH or abs(y - b) >= _LABEL_HEIGHT for a, b in self._places)
+
+
+def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
+    paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
+    limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
+    limit = next((altitude for altitude in limits if altitude is not None), None)
+    times, heights = zip(*(place for path in paths for place in path), strict=True)
+    axes = _Axes(
+        times,
+        (*heights, *(() if limit is None else (limit,))),
+        _MAP_HEIGHT,
+        _PROFILE_HEIGHT - 40,
+        square=False,
+    )
+    shapes = axes.grid("s", "m up")
+    if limit is not None:
+        shapes.append(_Line([axes.place(min(times), limit), axes.place(max(times), limit)], _FAILED, True))
+    labels = _Labels()
+    for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
+        places = [axes.place(time, height) for time, height in path]
+        shapes.append(_Line(places, colour))
+        shapes += labels.modes(track, places, colour) if len(tracks) == 1 else []
+        if track.failure is not None:
+            shapes.append(_Dot(*places[_index_of(track, track.failure.point)], _FAILED))
+    return shapes
+
+
+def _legend(tracks: Sequence[Drawable]) -> list[_Shape]:
+    named = list(zip(tracks, _colours(len(tracks)), strict=True))[:_MAX_NAMES]
+    return [
+        _Text(_MARGIN + 90 * number, 18, track.name, "start", colour) for number, (track, colour) in enumerate(named)
+    ]
+
+
+def _colours(count: int) -> list[str]:
+    return [_COLOURS[number % len(_COLOURS)] for number in range(count)]
+
+
+def _with_margin(values: Sequence[float]) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    return _widened((low, high), max(1.1 * (high - low), 2.0))
+
+
+def _widened(bounds: tuple[float, float], span: float) -> tuple[float, float]:
+    middle = (bounds[0] + bounds[1]) / 2
+    return middle - span / 2, middle + span / 2
+
+
+def _span(bounds: tuple[float, float]) -> float:
+    return bounds[1] - bounds[0]
+
+
+def _ticks(bounds: tuple[float, float], about: int) -> list[float]:
+    """Return about ``about`` round numbers in a range."""
+    rough = _span(bounds) / about
+    size: float = 10.0 ** math.floor(math.log10(rough))
+    step = next(factor * size for factor in (1.0, 2.0, 5.0, 10.0) if factor * size >= rough)
+    first = math.ceil(bounds[0] / step)
+    return [round(number * step, 6) for number in range(first, math.floor(bounds[1] / step) + 1)]
+
+
+def _save_png(shapes: Sequence[_Shape], path: str | PathLike[str]) -> None:
+    """Draw at double size and scale down, for smooth lines."""
+    scale = 2
+    image = _pillow("Image").new("RGB", (_WIDTH * scale, _HEIGHT * scale), "white")
+    drawing = _pillow("ImageDraw").Draw(image)
+    font = _pillow("ImageFont").load_default(_FONT_SIZE * scale)
+    for shape in shapes:
+        shape.draw(drawing, scale, font)
+    image.resize((_WIDTH, _HEIGHT), reducing_gap=None).save(path, "PNG")
+
+
+def _pillow(module: str) -> Any:
+    try:
+        return import_module(f"PIL.{module}")
+    except ImportError:
+        raise AerokitError("a .png needs Pillow: pip install pillow, or use .svg") from None

@@ -1,0 +1,390 @@
+"""`RecordedVehicle`: plays a recorded flight as a vehicle."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import BinaryIO
+
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult, MavParamError, MavResult
+from aerokit.mavlink.message import Message
+from aerokit.parameters.encoding import UNKNOWN_INDEX
+from aerokit.parameters.pack import HASH_NAME
+from aerokit.sim.channel import Channel
+from aerokit.sim.commands import CommandServer, ReceivedCommand
+from aerokit.sim.ftp import FtpPacket
+from aerokit.sim.missions import AnyItem, AnyRequest, item_from, item_message_float
+from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle, sender_of
+from aerokit.testing.recording import RecordedAnswer, RecordedFlight
+
+_LIST_INTERVAL_S, _BURST = 0.005, 5
+
+
+class RecordedParameters:
+    """Handles PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET."""
+
+    names: list[str]
+
+    def __init__(self, vehicle: RecordedVehicle) -> None:
+        self._vehicle = vehicle
+        self._written: dict[str, float] = {}
+        values = [value for _, value in vehicle.recording.parameters]
+        counted = {value.param_id: value.param_index for value in values if value.param_index != UNKNOWN_INDEX}
+        uncounted = [value.param_id for value in values if value.param_id not in counted]
+        is_whole = bool(counted) and len(counted) == max(value.param_count for value in values)
+        self.names = sorted(counted, key=lambda name: (counted[name], name))
+        """Names in the order of the list."""
+        self.names += [name for name in dict.fromkeys(uncounted) if name != HASH_NAME]
+        # The hash covers all parameters, so it is unknown if some were not recorded.
+        self._hash = is_whole and HASH_NAME in uncounted
+        vehicle.on(m.ParamRequestList, self._on_list)
+        vehicle.on(m.ParamRequestRead, self._on_read)
+        vehicle.on(m.ParamSet, self._on_set)
+
+    def _has(self, name: str) -> bool:
+        return name in self.names or (name == HASH_NAME and self._hash)
+
+    def value_message(self, name: str, index: int | None = None) -> m.ParamValue:
+        """Return the PARAM_VALUE that was written or recorded last, or else the first one to come."""
+        position, recorded = self._vehicle.position_s, None
+        for time, value in self._vehicle.recording.parameters:
+            if value.param_id == name and (recorded is None or time <= position):
+                recorded = value
+        assert recorded is not None
+        if index is None:
+            index = UNKNOWN_INDEX if name == HASH_NAME else self.names.index(name)
+        written = self._written.get(name, recorded.param_value)
+        return m.ParamValue(name, written, recorded.param_type, len(self.names), index)
+
+    def _on_list(self, request: m.ParamRequestList, channel: Channel) -> None:
+        messages = [self.value_message(HASH_NAME)] if self._hash else []
+        latest = self._latest()
+        count = len(self.names)
+        for index, name in enumerate(self.names):
+            value = latest[name]
+            written = self._written.get(name, value.param_value)
+            messages.append(m.ParamValue(name, written, value.param_type, count, index))
+        for number in range(0, len(messages), _BURST):
+            some = messages[number : number + _BURST]
+            delay = number / _BURST * _LIST_INTERVAL_S
+            self._vehicle.call_later(delay, lambda some=some: self._send(some, channel))  # type: ignore[misc]
+
+    def _latest(self) -> dict[str, m.ParamValue]:
+        position, latest = self._vehicle.position_s, {}
+        for time, value in self._vehicle.recording.parameters:
+            if time <= position or value.param_id not in latest:
+                latest[value.param_id] = value
+        return latest
+
+    def _send(self, messages: list[m.ParamValue], channel: Channel) -> None:
+        for message in messages:
+            self._vehicle.send(message, channel)
+
+    def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
+        index = request.param_index
+        if index < 0 and self._has(request.param_id):
+            self._vehicle.send(self.value_message(request.param_id), channel)
+        elif 0 <= index < len(self.names):
+            self._vehicle.send(self.value_message(self.names[index]), channel)
+        else:
+            self._refuse(request, request.param_id, index, channel)
+
+    def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
+        name = request.param_id
+        if name not in self.names:
+            self._refuse(request, name, -1, channel)
+            return
+        if name in self._vehicle.recording.settable:
+            self._written[name] = request.param_value
+        self._vehicle.send(self.value_message(name))
+
+    def _refuse(self, request: m.ParamRequestRead | m.ParamSet, name: str, index: int, channel: Channel) -> None:
+        if self._vehicle.recording.has_parameter_errors:
+            error = m.ParamError(*sender_of(request), name, index, MavParamError.DOES_NOT_EXIST)
+            self._vehicle.send(error, channel)
+
+
+_RETRY_INTERVAL_S, _MAX_ATTEMPTS = 1.0, 5
+
+
+@dataclass
+class _Upload:
+    mission_type: int
+    count: int
+    sender: tuple[int, int]
+    channel: Channel
+    items: list[AnyItem] = field(default_factory=list)
+    attempts: int = 0
+
+
+class RecordedMissions:
+    """Serves the recorded plans; accepts uploads with their recorded result."""
+
+    def __init__(self, vehicle: RecordedVehicle) -> None:
+        self._vehicle = vehicle
+        self._written: dict[int, tuple[AnyItem, ...]] = {}
+        self._upload: _Upload | None = None
+        self._done: dict[tuple[str, int], int] = {}
+        for kind, handler in (
+            (m.MissionRequestList, self._on_list),
+            (m.MissionRequest, self._on_request),
+            (m.MissionRequestInt, self._on_request),
+            (m.MissionCount, self._on_count),
+            (m.MissionItem, self._on_item),
+            (m.MissionItemInt, self._on_item),
+            (m.MissionClearAll, self._on_clear),
+        ):
+            vehicle.on(kind, handler)
+
+    def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
+        """Return the current plan, or else the first one to come; None if the recording has none."""
+        if mission_type in self._written:
+            return self._written[mission_type]
+        position, found = self._vehicle.position_s, None
+        for plan in self._vehicle.recording.plans:
+            if plan.mission_type == mission_type and (found is None or plan.since <= position):
+                found = plan.items
+        return found
+
+    def _on_list(self, request: m.MissionRequestList, channel: Channel) -> None:
+        items = self.items(request.mission_type)
+        if items is None:
+            self._acknowledge(request, request.mission_type, MavMissionResult.UNSUPPORTED, channel)
+            return
+        count = m.MissionCount(*sender_of(request), len(items), request.mission_type)
+        self._vehicle.send(count, channel)
+
+    def _on_request(self, request: AnyRequest, channel: Channel) -> None:
+        items = self.items(request.mission_type) or ()
+        if request.seq >= len(items):
+            self._acknowledge(request, request.mission_type, MavMissionResult.INVALID_SEQUENCE, channel)
+            return
+        as_float = isinstance(request, m.MissionRequest)
+        self._vehicle.send(_item_message(items[request.seq], request.seq, sender_of(request), as_float), channel)
+
+    def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
+        if message.mission_type not in self._vehicle.recording.uploads:
+            self._acknowledge(message, message.mission_type, MavMissionResult.UNSUPPORTED, channel)
+            return
+        self._upload = upload = _Upload(message.mission_type, message.count, sender_of(message), channel)
+        self._continue(upload)
+
+    def _on_item(self, message: AnyItem, channel: Channel) -> None:
+        upload = self._upload
+        if upload is None or message.mission_type != upload.mission_type or sender_of(message) != upload.sender:
+            return
+        if message.seq == len(upload.items):
+            upload.items.append(message)
+            upload.attempts = 0
+            self._continue(upload)
+
+    def _continue(self, upload: _Upload) -> None:
+        if len(upload.items) < upload.count:
+            self._request_item(upload, len(upload.items))
+            return
+        self._upload = None
+        result = self._result("upload", self._vehicle.recording.uploads[upload.mission_type], upload.mission_type)
+        if result == MavMissionResult.ACCEPTED:
+            self._written[upload.mission_type] = tuple(upload.items)
+        ack = m.MissionAck(*upload.sender, result, upload.mission_type)
+        self._vehicle.send(ack, upload.channel)
+
+    def _request_item(self, upload: _Upload, seq: int) -> None:
+        if self._upload is not upload or len(upload.items) != seq:
+            return
+        if upload.attempts >= _MAX_ATTEMPTS:
+            self._upload = None
+            return
+        upload.attempts += 1
+        kind = m.MissionRequestInt if self._vehicle.recording.uses_int else m.MissionRequest
+        self._vehicle.send(kind(*upload.sender, seq, upload.mission_type), upload.channel)
+        self._vehicle.call_later(_RETRY_INTERVAL_S, lambda: self._request_item(upload, seq))
+
+    def _on_clear(self, message: m.MissionClearAll, channel: Channel) -> None:
+        clears = self._vehicle.recording.clears.get(message.mission_type)
+        result = MavMissionResult.UNSUPPORTED
+        if clears is not None:
+            result = MavMissionResult(self._result("clear", clears, message.mission_type))
+        if result == MavMissionResult.ACCEPTED:
+            self._written[message.mission_type] = ()
+        self._acknowledge(message, message.mission_type, result, channel)
+
+    def _result(self, what: str, results: list[int], mission_type: int) -> int:
+        """Return the recorded results in order; the last one is repeated."""
+        number = self._done.get((what, mission_type), 0)
+        self._done[what, mission_type] = number + 1
+        return results[min(number, len(results) - 1)]
+
+    def _acknowledge(self, to: Message, mission_type: int, result: int, channel: Channel) -> None:
+        self._vehicle.send(m.MissionAck(*sender_of(to), result, mission_type), channel)
+
+
+def _item_message(item: AnyItem, seq: int, to: tuple[int, int], as_float: bool) -> AnyItem:
+    scale = 1.0 if item.frame == MavFrame.MISSION else 1e7
+    is_float = isinstance(item, m.MissionItem)
+    if as_float:
+        place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
+        return item_message_float(item_from(item), place, seq, to, item.mission_type, item.current)
+    x, y = (round(item.x * scale), round(item.y * scale)) if is_float else (int(item.x), int(item.y))
+    numbers = (item.param1, item.param2, item.param3, item.param4)
+    head = (*to, seq, item.frame, item.command, item.current, item.autocontinue)
+    return m.MissionItemInt(*head, *numbers, x, y, item.z, item.mission_type)
+
+
+_MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
+
+
+class RecordedVehicle(SimulatedVehicle):
+    """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change what is streamed.
+
+    - Commands: the recorded acknowledgements of the same params, or else of any, with their recorded delay; the last
+      ones repeat. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded
+      message.
+    - Parameters: the recorded ones, renumbered without gaps. A parameter can be set if it was set in the recording;
+      else its value stays. Unknown names are not answered, or by PARAM_ERROR if the vehicle sent that.
+    - Missions: the recorded ones. Uploads and clearing get their recorded result, or UNSUPPORTED.
+    - Files are refused, there are no logs, and rates cannot be changed; TIMESYNC and PING are answered.
+
+    ``system_id`` selects a vehicle of the recording, None the first; ``start_s`` skips the beginning; ``repeat``
+    restarts at the end, where the vehicle is silent otherwise. Faults apply, except those of sensors and parameters.
+
+    Raises InvalidArgument if there is no vehicle in the recording, OSError if it cannot be read.
+    """
+
+    def __init__(
+        self,
+        recording: str | PathLike[str] | BinaryIO,
+        *,
+        system_id: int | None = None,
+        start_s: float = 0.0,
+        repeat: bool = False,
+        seed: int = 0,
+        components: Iterable[AttachableComponent] = (),
+    ) -> None:
+        self.recording: RecordedFlight = RecordedFlight(recording, system_id)
+        super().__init__(
+            system_id=self.recording.system_id,
+            component_id=self.recording.component_id,
+            seed=seed,
+            components=components,
+        )
+        self._start, self._repeat = start_s, repeat
+        self._next = 0
+        self._began_at = 0.0
+        self._answered_counts: dict[int, int] = {}
+        self.parameters: RecordedParameters = RecordedParameters(self)
+        """Current parameters."""
+        self.missions: RecordedMissions = RecordedMissions(self)
+        """Current plans."""
+        commands = dict.fromkeys(self.recording.answers, self._on_command)
+        commands[MavCmd.REQUEST_MESSAGE] = self._on_request_message
+        CommandServer(self, dict(commands))
+        self.on(m.FileTransferProtocol, self._on_ftp)
+        self.on(m.LogRequestList, self._on_log_list)
+        self.on(m.Timesync, self._on_timesync)
+        self.on(m.Ping, self._on_ping)
+
+    @property
+    def position_s(self) -> float:
+        """Current position in the recording, in seconds."""
+        return min(self._start + self.now - self._began_at, self.recording.duration_s)
+
+    @property
+    def has_ended(self) -> bool:
+        """True when everything was played and the vehicle is silent."""
+        return not self._is_on and self._next >= len(self.recording.stream)
+
+    def boot(self) -> None:
+        stream = self.recording.stream
+        self._began_at = self.now
+        self._next = bisect_right([time for time, _ in stream], self._start - 1e-9)
+        self._plan_next()
+
+    def start_channel(self, channel: Channel) -> None:
+        """Do nothing: all ports receive the recording."""
+
+    def build(self, message_id: int) -> Message | None:
+        """Return None: there are no streams of its own."""
+
+    def tick(self, dt: float) -> None:
+        """Do nothing: nothing moves."""
+
+    def _plan_next(self) -> None:
+        stream = self.recording.stream
+        if self._next < len(stream):
+            self.call_at(self._began_at + stream[self._next][0] - self._start, self._play)
+        else:
+            self.call_at(self._began_at + self.recording.duration_s - self._start, self._end)
+
+    def _play(self) -> None:
+        stream = self.recording.stream
+        time = stream[self._next][0]
+        while self._next < len(stream) and stream[self._next][0] <= time:
+            frame = stream[self._next][1]
+            self.send(STANDARD.decode(frame), sender=(frame.system_id, frame.component_id))
+            self._next += 1
+        self._plan_next()
+
+    def _end(self) -> None:
+        if self._repeat and self.recording.duration_s > self._start:
+            self.boot()
+        else:
+            self._is_on = False
+
+    def _on_command(self, command: ReceivedCommand) -> int | None:
+        answer = self._answer_to(command)
+        if answer is None:
+            return MavResult.UNSUPPORTED
+        for delay, ack in answer.acks:
+            again = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
+            self.call_later(delay, lambda again=again: self.send(again, command.channel))  # type: ignore[misc]
+        return None
+
+    def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
+        answers = self.recording.answers.get(command.command, [])
+        params = (command.param1, command.param2, command.param3, command.param4)
+        alike = [answer for answer in answers if repr(answer.params) == repr(params)]
+        if command.command in _MESSAGE_REQUESTS and not alike:
+            alike = answers = [answer for answer in answers if answer.params[:1] == params[:1]]
+        chosen = alike or answers
+        if not chosen:
+            return None
+        number = self._answered_counts.get(id(chosen[0]), 0)
+        self._answered_counts[id(chosen[0])] = number + 1
+        return chosen[min(number, len(chosen) - 1)]
+
+    def _on_request_message(self, command: ReceivedCommand) -> int | None:
+        message = self._latest_message(int(command.param1) if command.param1 == command.param1 else -1)
+        if message is not None:
+            self.send(message, command.channel)
+            return MavResult.ACCEPTED
+        return self._on_command(command)
+
+    def _latest_message(self, message_id: int) -> Message | None:
+        """Return the latest message of this id, or else the first one to come."""
+        stream = self.recording.stream
+        own = (self.system_id, self.component_id)
+        for _, frame in (*reversed(stream[: self._next]), *stream[self._next :]):
+            if frame.message_id == message_id and (frame.system_id, frame.component_id) == own:
+                return STANDARD.decode(frame)
+        return None
+
+    def _on_ftp(self, message: m.FileTransferProtocol, channel: Channel) -> None:
+        if not self.faults.no_ftp:
+            self.send(FtpPacket.parse(message).refuse(MavFtpErr.UNKNOWNCOMMAND).message(), channel)
+
+    def _on_log_list(self, message: m.LogRequestList, channel: Channel) -> None:
+        self.send(m.LogEntry(0, 0, 0, 0, 0), channel)
+
+    def _on_timesync(self, message: m.Timesync, channel: Channel) -> None:
+        if message.tc1 == 0:
+            nanoseconds = int(self.position_s * 1e9)
+            self.send(m.Timesync(nanoseconds, message.ts1), channel)
+
+    def _on_ping(self, message: m.Ping, channel: Channel) -> None:
+        if message.target_system == 0:
+            self.send(m.Ping(message.time_usec, message.seq, *sender_of(message)), channel)

@@ -1,0 +1,201 @@
+"""`RecordedFlight`: streams, answers, parameters and plans of one vehicle in a recording (.tlog)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import BinaryIO
+
+from aerokit.errors import InvalidArgument
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.dialect import STANDARD
+from aerokit.mavlink.enums import MavAutopilot, MavMissionResult, MavType
+from aerokit.mavlink.frame import Frame
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.message import Message
+from aerokit.mavlink.tlog import read_tlog
+
+MAX_GAP_S = 60.0
+"""Longer gaps are cut to this: the recording was paused, or the clock was set."""
+
+_ITEMS = (m.MissionItemInt, m.MissionItem)
+_COMMANDS = (m.CommandLong, m.CommandInt)
+# Answers to a client of the recording; they are not streamed.
+_ANSWERS = frozenset(
+    kind.ID
+    for kind in (
+        m.CommandAck, m.CommandLong, m.CommandInt, m.ParamValue, m.ParamError, m.MissionCount, m.MissionItem,
+        m.MissionItemInt, m.MissionRequest, m.MissionRequestInt, m.MissionAck, m.FileTransferProtocol, m.LogEntry,
+        m.LogData, m.Timesync, m.Ping,
+    )
+)  # fmt: skip
+_REQUESTS = frozenset(
+    kind.ID
+    for kind in (*_COMMANDS, *_ITEMS, m.ParamSet, m.MissionCount, m.MissionClearAll)
+)  # fmt: skip
+
+
+@dataclass
+class RecordedAnswer:
+    """The acknowledgements of one command."""
+
+    params: tuple[float, ...]
+    """Params 1 to 4 of the command; empty if only the acknowledgement was recorded."""
+    asked_at: float
+    acks: list[tuple[float, m.CommandAck]] = field(default_factory=list)
+    """Seconds after the command, and the acknowledgement."""
+
+
+@dataclass(frozen=True)
+class RecordedPlan:
+    """A plan on the vehicle since a point in time."""
+
+    since: float
+    mission_type: int
+    items: tuple[m.MissionItemInt | m.MissionItem, ...]
+
+
+class RecordedFlight:
+    """The content of a recording. Times are seconds since the first message of the vehicle, without long gaps.
+
+    ``system_id`` None selects the first autopilot with a HEARTBEAT. Raises InvalidArgument if there is none, OSError
+    if the file cannot be read.
+    """
+
+    system_id: int
+    component_id: int
+
+    def __init__(self, source: str | PathLike[str] | BinaryIO, system_id: int | None = None) -> None:
+        frames = _frames(source)
+        self.system_id, self.component_id = _autopilot(frames, system_id)
+        self.stream: list[tuple[float, Frame]] = []
+        """Frames sent without a request, in order."""
+        self.answers: dict[int, list[RecordedAnswer]] = {}
+        """MAV_CMD → recorded answers, in order."""
+        self.parameters: list[tuple[float, m.ParamValue]] = []
+        """All parameter values with their times."""
+        self.has_parameter_errors: bool = False
+        """True if the vehicle sent PARAM_ERROR."""
+        self.settable: set[str] = set()
+        """Names of parameters that were set successfully."""
+        self.plans: list[RecordedPlan] = []
+        self.uploads: dict[int, list[int]] = {}
+        """MAV_MISSION_TYPE → MAV_MISSION_RESULTs of uploads."""
+        self.clears: dict[int, list[int]] = {}
+        """MAV_MISSION_TYPE → MAV_MISSION_RESULTs of MISSION_CLEAR_ALL."""
+        self.uses_int: bool = True
+        """True if the vehicle requests items by MISSION_REQUEST_INT, False by MISSION_REQUEST."""
+        self.duration_s: float = 0.0
+        self._sets: dict[str, float] = {}
+        self._incoming: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
+        self._outgoing: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
+        self._clearing: set[int] = set()
+        self._read(frames)
+
+    def _read(self, frames: list[tuple[float, Frame]]) -> None:
+        now, last = 0.0, None
+        for stamp, frame in frames:
+            is_own = frame.system_id == self.system_id
+            if last is None and not is_own:
+                continue
+            now += 0.0 if last is None else min(max(stamp - last, 0.0), MAX_GAP_S)
+            last = stamp
+            if not is_own:
+                if frame.message_id in _REQUESTS:
+                    self._read_request(STANDARD.decode(frame), now)
+            elif frame.message_id in _ANSWERS:
+                self._read_answer(STANDARD.decode(frame), now)
+            else:
+                self.stream.append((now, frame))
+        self.duration_s = now
+        self.answers = {
+            command: acknowledged
+            for command, answers in self.answers.items()
+            if (acknowledged := [answer for answer in answers if answer.acks])
+        }
+
+    def _read_request(self, message: Message, now: float) -> None:
+        if isinstance(message, _COMMANDS):
+            again = isinstance(message, m.CommandLong) and message.confirmation > 0
+            answers = self.answers.setdefault(message.command, [])
+            if not (again and answers):
+                params = (message.param1, message.param2, message.param3, message.param4)
+                answers.append(RecordedAnswer(params, now))
+        elif isinstance(message, m.ParamSet):
+            self._sets[message.param_id] = message.param_value
+        elif isinstance(message, m.MissionCount):
+            self._incoming[message.mission_type] = {}
+        elif isinstance(message, _ITEMS):
+            self._incoming.setdefault(message.mission_type, {})[message.seq] = message
+        elif isinstance(message, m.MissionClearAll):
+            self._clearing.add(message.mission_type)
+
+    def _read_answer(self, message: Message, now: float) -> None:
+        note: dict[type[Message], Callable[..., None]] = {
+            m.CommandAck: self._read_ack,
+            m.ParamValue: self._read_value,
+            m.MissionCount: self._read_count,
+            m.MissionItem: self._read_item,
+            m.MissionItemInt: self._read_item,
+            m.MissionAck: self._read_mission_ack,
+        }
+        if type(message) in note:
+            note[type(message)](message, now)
+        elif isinstance(message, m.ParamError):
+            self.has_parameter_errors = True
+        elif isinstance(message, m.MissionRequest):
+            self.uses_int = False
+
+    def _read_ack(self, ack: m.CommandAck, now: float) -> None:
+        answers = self.answers.setdefault(ack.command, [])
+        if not answers:
+            answers.append(RecordedAnswer((), now))
+        answers[-1].acks.append((now - answers[-1].asked_at, ack))
+
+    def _read_value(self, value: m.ParamValue, now: float) -> None:
+        self.parameters.append((now, value))
+        if self._sets.pop(value.param_id, None) == value.param_value:
+            self.settable.add(value.param_id)
+
+    def _read_count(self, count: m.MissionCount, now: float) -> None:
+        self._outgoing[count.mission_type] = (count.count, {})
+        if count.count == 0:
+            self.plans.append(RecordedPlan(now, count.mission_type, ()))
+
+    def _read_item(self, item: m.MissionItemInt | m.MissionItem, now: float) -> None:
+        count, items = self._outgoing.get(item.mission_type, (0, {}))
+        items[item.seq] = item
+        if count and len(items) == count:
+            del self._outgoing[item.mission_type]
+            self._add_plan(item.mission_type, items, now)
+
+    def _read_mission_ack(self, ack: m.MissionAck, now: float) -> None:
+        if ack.mission_type in self._incoming:
+            items = self._incoming.pop(ack.mission_type)
+            self.uploads.setdefault(ack.mission_type, []).append(ack.type)
+            if ack.type == MavMissionResult.ACCEPTED:
+                self._add_plan(ack.mission_type, items, now)
+        elif ack.mission_type in self._clearing:
+            self._clearing.discard(ack.mission_type)
+            self.clears.setdefault(ack.mission_type, []).append(ack.type)
+
+    def _add_plan(self, mission_type: int, items: dict[int, m.MissionItemInt | m.MissionItem], now: float) -> None:
+        self.plans.append(RecordedPlan(now, mission_type, tuple(items[seq] for seq in sorted(items))))
+
+
+def _frames(source: str | PathLike[str] | BinaryIO) -> list[tuple[float, Frame]]:
+    framer = Framer()
+    return [(stamp, frame) for stamp, raw in read_tlog(source) for frame in framer.receive(raw, stamp)]
+
+
+def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:
+    for _, frame in frames:
+        if frame.message_id != m.Heartbeat.ID or system_id not in (None, frame.system_id):
+            continue
+        heartbeat = STANDARD.decode(frame)
+        assert isinstance(heartbeat, m.Heartbeat)
+        if heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type != MavType.GCS:
+            return frame.system_id, frame.component_id
+    which = "no vehicle" if system_id is None else f"no vehicle with system id {system_id}"
+    raise InvalidArgument(f"the recording has {which} in it: no heartbeat of an autopilot")

@@ -1,0 +1,62 @@
+"""Points of a track, and details of a failed assertion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from aerokit._internal import geo
+from aerokit.position import Position
+
+
+@dataclass(frozen=True)
+class TrackPoint:
+    """True state of a vehicle at one time."""
+
+    time_s: float
+    """Simulated seconds."""
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    """Above home."""
+    armed: bool
+    mode: str
+    """Mode name, as clients have it."""
+    speed_m_s: float = 0.0
+    """Ground speed."""
+    battery_percent: float = 100.0
+
+    @property
+    def position(self) -> Position:
+        """Position with its altitude above home."""
+        return Position(self.latitude_deg, self.longitude_deg, altitude_relative_m=self.altitude_m)
+
+    def __str__(self) -> str:
+        place = f"{self.latitude_deg:.6f}, {self.longitude_deg:.6f}"
+        armed = "armed" if self.armed else "disarmed"
+        return f"at {self.time_s:.1f} s: {place}, {self.altitude_m:.1f} m above home, {armed}, {self.mode}"
+
+
+@dataclass(frozen=True)
+class TrackFailure:
+    """Point and limit of a failed assertion; pictures of the track show them."""
+
+    point: TrackPoint
+    circle: tuple[Position, float] | None = None
+    """Centre, and radius in metres."""
+    polygon: Sequence[Position] | None = None
+    altitude_m: float | None = None
+    """Above home."""
+
+
+def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
+    """Return a function to metres north and east of ``origin``, on a plane that touches the ellipsoid there."""
+    latitude, longitude = origin.latitude_deg, origin.longitude_deg
+    per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
+    per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100
+
+    def place(point: Position | TrackPoint) -> tuple[float, float]:
+        north = (point.latitude_deg - latitude) * per_latitude
+        return north, geo.wrap_longitude(point.longitude_deg - longitude) * per_longitude
+
+    return place

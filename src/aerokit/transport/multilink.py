@@ -1,0 +1,321 @@
+"""``MultiLink``: several links to the same vehicles as one, e.g. a radio and a modem.
+
+It only transports bytes. The connection selects the link for each message and merges received frames
+(:mod:`aerokit.connection.multilink.routes`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Collection, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
+from aerokit.transport.link import Link, OrderRefusalListener, Peer, Receiver, keeps_peers
+from aerokit.transport.reconnecting import Backoff, InterruptionListener
+
+logger: logging.Logger = logging.getLogger("aerokit")
+
+
+class LinkPeer(NamedTuple):
+    """A peer behind one of several links."""
+
+    link: int
+    """Index of the link."""
+    peer: Peer
+    """Peer of that link; None: all of its peers."""
+
+
+@runtime_checkable
+class MemberLinkListener(Receiver, Protocol):
+    """A receiver that is notified of the state of each link."""
+
+    def member_link_changed(self, link: int, is_available: bool) -> None:
+        """Handle that a link was lost or is available again."""
+
+    def member_link_stalled(self, link: int, is_stalled: bool) -> None:
+        """Handle that data written to a link does not leave, or leaves again."""
+
+    def member_link_open_failed(self, link: int, error: LinkOpenError) -> None:
+        """Handle that the first two attempts to open a link failed. It is retried. Called once per link."""
+
+
+class MultiLink(Link):
+    """Several links to the same vehicles. A link that cannot be opened is retried while another one is open.
+
+    Args:
+        factories: make each link; called again for each attempt to open all links.
+        costly: indices of links that are used only when the others fail.
+        survives_loss: True to report an interruption instead of a loss while all links are lost.
+    """
+
+    is_multilink = True
+
+    def __init__(
+        self,
+        factories: Sequence[Callable[[], Link]],
+        *,
+        costly: Collection[int] = (),
+        survives_loss: bool = False,
+    ) -> None:
+        if not factories:
+            raise InvalidArgument("factories = [] is not allowed: at least one link")
+        wrong = [index for index in costly if not 0 <= index < len(factories)]
+        if wrong:
+            raise InvalidArgument(f"costly = {wrong} is not allowed: there are links 0 to {len(factories) - 1}")
+        self.costly: frozenset[int] = frozenset(costly)
+        """Indices of links that are used only when the others fail."""
+        self._factories = tuple(factories)
+        self._links = [make_link() for make_link in factories]
+        self._survives_loss = survives_loss
+        self._receiver: Receiver | None = None
+        self._was_opened = self._is_closed = False
+        self._is_available = [False] * len(self._links)
+        self._kept: list[set[Peer]] = [set() for _ in self._links]
+        self._openings: set[asyncio.Task[None]] = set()
+        self._foreign: set[int] = set()  # opened by another owner, which closes them
+        self._is_opening = False
+        self._last_loss: LinkLost | None = None
+        self._lost_at: float | None = None
+        self._dropped = 0
+
+    @property
+    def address(self) -> str:  # type: ignore[override]
+        """``udpin:0.0.0.0:14550 + serial:///dev/ttyUSB0:57600``."""
+        return " + ".join(self.names)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The address of each link."""
+        return tuple(link.address for link in self._links)
+
+    @property
+    def dropped_writes(self) -> int:  # type: ignore[override]
+        """See `Link.dropped_writes`; of all links."""
+        return self._dropped + sum(link.dropped_writes for link in self._links)
+
+    @property
+    def unsent_bytes(self) -> int:
+        return sum(link.unsent_bytes for link in self._links)
+
+    def discard_unsent(self) -> None:
+        for link in self._links:
+            link.discard_unsent()
+
+    def discard_unsent_of(self, link: int) -> None:
+        """Discard unsent data of one link, so that it does not arrive after commands over another one."""
+        self._links[link].discard_unsent()
+
+    def is_available(self, link: int) -> bool:
+        """Return True if a link is open and not interrupted."""
+        return self._is_available[link]
+
+    async def open(self, receiver: Receiver) -> None:
+        """See `Link.open`. LinkOpenError if no link can be opened, with the reason of each."""
+        if self._is_closed:
+            raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
+        if self._was_opened:
+            raise BusyError(f"{self.address} is open; a link can be opened only once")
+        self._was_opened, self._receiver = True, receiver
+        self._foreign.clear()
+        self._is_opening, self._last_loss = True, None
+        openings = [asyncio.ensure_future(self._open_one(index)) for index in range(len(self._links))]
+        try:
+            results = await asyncio.gather(*openings)
+            if all(results):
+                raise LinkOpenError("no link can be opened: " + "; ".join(map(str, results)))
+        except BaseException:
+            await self._abort_opening(openings)
+            raise
+        finally:
+            self._is_opening = False
+        for index, failure in enumerate(results):
+            if failure is not None and not self._is_closed:
+                logger.warning("one of several links cannot be opened and is retried: %s", failure)
+                self._start_opening(index)
+        self._check_all_lost()
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        """See `Link.write`; None writes to every peer of every link."""
+        if isinstance(peer, LinkPeer):
+            self._write_to(peer.link, data, peer.peer)
+            return
+        for index in range(len(self._links)):
+            self._write_to(index, data, None)
+
+    def keep_peer(self, peer: Peer) -> None:
+        if isinstance(peer, LinkPeer):
+            self._kept[peer.link].add(peer.peer)
+            self._links[peer.link].keep_peer(peer.peer)
+
+    def forget_peer(self, peer: Peer) -> None:
+        if isinstance(peer, LinkPeer):
+            self._kept[peer.link].discard(peer.peer)
+            self._links[peer.link].forget_peer(peer.peer)
+
+    def host_of(self, peer: Peer) -> object:
+        return self._links[peer.link].host_of(peer.peer) if isinstance(peer, LinkPeer) else peer
+
+    def has_peer(self, peer: Peer) -> bool:
+        if not isinstance(peer, LinkPeer):
+            return True
+        return self._is_available[peer.link] and self._links[peer.link].has_peer(peer.peer)
+
+    def close(self) -> None:
+        if not self._is_closed:
+            self._is_closed, self._receiver = True, None
+            for task in self._openings:
+                with contextlib.suppress(RuntimeError):  # the loop is closed
+                    task.cancel()
+            for link in self._own:
+                link.close()
+
+    async def wait_closed(self) -> None:
+        if self._openings:
+            await asyncio.wait(tuple(self._openings))
+        for link in self._own:
+            await link.wait_closed()
+
+    @property
+    def _own(self) -> list[Link]:
+        return [link for index, link in enumerate(self._links) if index not in self._foreign]
+
+    # ------------------------------------------------------------------------------- opening
+
+    async def _open_one(self, index: int) -> LinkOpenError | None:
+        receiver = _MemberReceiver(self, index)
+        try:
+            await self._links[index].open(receiver)
+        except LinkOpenError as error:
+            return error
+        except BusyError:
+            self._foreign.add(index)
+            raise
+        if not receiver.is_lost:
+            self._on_restored(index)
+        return None
+
+    async def _abort_opening(self, openings: Collection[asyncio.Future[LinkOpenError | None]]) -> None:
+        self._receiver = None
+        for opening in openings:
+            opening.cancel()
+        await asyncio.wait(openings)
+        for link in self._own:
+            link.close()
+        for index, make_link in enumerate(self._factories):
+            if index not in self._foreign:
+                self._links[index] = make_link()
+        self._is_available = [False] * len(self._links)
+        self._was_opened = False
+
+    def _start_opening(self, index: int) -> None:
+        task = asyncio.get_running_loop().create_task(self._retry_opening(index), name="aerokit opening")
+        self._openings.add(task)
+        task.add_done_callback(self._openings.discard)
+
+    async def _retry_opening(self, index: int) -> None:
+        backoff, is_reported = Backoff(), False
+        while not self._is_closed:
+            await asyncio.sleep(backoff.next_delay())
+            error = await self._open_one(index)
+            if error is None:
+                return
+            logger.debug("the link still cannot be opened: %s", error)
+            # Not after the first attempt: subscribers of the connection's events are not attached yet.
+            if not is_reported and isinstance(self._receiver, MemberLinkListener):
+                is_reported = True
+                self._receiver.member_link_open_failed(index, error)
+
+    # ------------------------------------------------------------ callbacks of the links
+
+    def _on_bytes(self, index: int, data: bytes, peer: Peer) -> None:
+        if self._receiver is not None:
+            self._receiver.bytes_received(data, LinkPeer(index, peer))
+
+    def _on_lost(self, index: int, error: LinkLost) -> None:
+        self._is_available[index] = False
+        self._notify(index)
+        self._last_loss = error
+        self._check_all_lost()
+
+    def _check_all_lost(self) -> None:
+        receiver, error = self._receiver, self._last_loss
+        if error is None or receiver is None or self._is_opening:
+            return
+        if any(self._is_available) or self._lost_at is not None:
+            return
+        if self._survives_loss and self._may_come_back:
+            self._lost_at = asyncio.get_running_loop().time()
+            if isinstance(receiver, InterruptionListener):
+                receiver.link_interrupted(error)
+            return
+        self._receiver = None
+        lost = LinkLost(f"all links are lost; the last one: {error}")
+        lost.__cause__ = error
+        receiver.link_lost(lost)
+
+    def _on_restored(self, index: int) -> None:
+        self._is_available[index] = True
+        for peer in self._kept[index]:
+            self._links[index].keep_peer(peer)
+        self._notify(index)
+        if self._lost_at is not None:
+            away_s, self._lost_at = asyncio.get_running_loop().time() - self._lost_at, None
+            if isinstance(self._receiver, InterruptionListener):
+                self._receiver.link_restored(away_s)
+
+    def _on_stalled(self, index: int, is_stalled: bool) -> None:
+        if isinstance(self._receiver, MemberLinkListener):
+            self._receiver.member_link_stalled(index, is_stalled)
+
+    def _notify(self, index: int) -> None:
+        if isinstance(self._receiver, MemberLinkListener):
+            self._receiver.member_link_changed(index, self._is_available[index])
+
+    @property
+    def _may_come_back(self) -> bool:
+        from aerokit.transport.reconnecting import ReconnectingLink
+
+        return bool(self._openings) or any(isinstance(link, ReconnectingLink) for link in self._links)
+
+    def _write_to(self, index: int, data: bytes, peer: Peer) -> None:
+        if self._is_available[index]:
+            self._links[index].write(data, peer)
+        elif self._receiver is not None:
+            self._dropped += 1
+
+
+class _MemberReceiver:
+    """Receiver of one of the links."""
+
+    def __init__(self, owner: MultiLink, index: int) -> None:
+        self._owner, self._index = owner, index
+        self.keeps_peers = owner._receiver is not None and keeps_peers(owner._receiver)
+        self.is_lost = False
+
+    def bytes_received(self, data: bytes, peer: Peer) -> None:
+        self._owner._on_bytes(self._index, data, peer)
+
+    def link_stalled(self, unsent_bytes: int) -> None:
+        self._owner._on_stalled(self._index, True)
+
+    def link_drained(self, stalled_s: float) -> None:
+        self._owner._on_stalled(self._index, False)
+
+    def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
+        if isinstance(self._owner._receiver, OrderRefusalListener):
+            self._owner._receiver.order_refused(message, reason, lease_holder, answers)
+
+    def link_interrupted(self, error: LinkLost) -> None:
+        self.is_lost = True
+        self._owner._on_lost(self._index, error)
+
+    def link_restored(self, away_s: float) -> None:
+        self.is_lost = False
+        self._owner._on_restored(self._index)
+
+    def link_lost(self, error: LinkLost) -> None:
+        self.is_lost = True
+        self._owner._on_lost(self._index, error)

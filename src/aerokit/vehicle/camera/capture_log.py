@@ -1,0 +1,283 @@
+"""``CaptureLog``: the captures that one camera has reported; it requests those whose message was lost."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import anyio
+
+from aerokit.errors import CommandRejected
+from aerokit.events import ImageCaptured
+from aerokit.mavlink import messages as m
+from aerokit.vehicle.camera.capture import (
+    FEEDBACK_INDEX_RANGE,
+    SECONDS_IN_1990,
+    Capture,
+    from_feedback,
+    from_image,
+    from_trigger,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from aerokit.connection.cells import StateCell
+    from aerokit.mavlink.message import Message
+    from aerokit.vehicle.camera.link import CameraLink
+
+MAX_CAPTURES = 20_000
+FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
+# PX4 may send CAMERA_IMAGE_CAPTURED, which has the position, up to this long after CAMERA_TRIGGER.
+TRIGGER_GRACE_S = 0.3
+# Messages of two types with the same index within this time report the same picture.
+DUPLICATE_WINDOW_S = 10.0
+# A status that is older than the newest one by less than this arrived out of order; by more, the camera restarted.
+REORDER_WINDOW_MS = 5000
+# The index may exceed the reported count by this much; a camera beyond that counts in another way than the standard.
+MAX_COUNT_LEAD = 100
+# A jump over more indices than this is an outlier until a second picture confirms it.
+MAX_INDEX_GAP = 1000
+# CAMERA_FEEDBACK counts in 16 bits: an index that is lower by more than half the range has restarted.
+HALF_RANGE = FEEDBACK_INDEX_RANGE // 2
+
+
+class _Entry:
+    """One capture with the type and the time stamps of its message."""
+
+    __slots__ = ("boot_us", "capture", "kind", "utc_us")
+
+    def __init__(self, message: Message, capture: Capture) -> None:
+        self.kind, self.capture = type(message), capture
+        if isinstance(message, m.CameraImageCaptured):
+            self.utc_us, self.boot_us = message.time_utc, message.time_boot_ms * 1000
+        else:
+            stamp: int = getattr(message, "time_usec", 0)
+            is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
+            self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
+
+    def is_same(self, other: _Entry) -> bool:
+        if self.kind is not other.kind:  # PX4 reports each picture by two messages in quick succession.
+            return abs(self.capture.received_at - other.capture.received_at) <= DUPLICATE_WINDOW_S
+        if self.utc_us and other.utc_us:
+            return self.utc_us == other.utc_us
+        if self.boot_us and other.boot_us:
+            return self.boot_us == other.boot_us
+        return self.capture.place == other.capture.place
+
+    def is_later(self, other: _Entry) -> bool:
+        if self.utc_us and other.utc_us:
+            return self.utc_us > other.utc_us
+        return bool(self.boot_us and other.boot_us) and self.boot_us > other.boot_us
+
+
+class CaptureLog:
+    """Captures by index. Of the two messages that PX4 sends for a picture, the one with the position wins.
+
+    The log resets itself when the camera counts from 0 again, after a restart or formatting.
+    """
+
+    def __init__(self, link: CameraLink) -> None:
+        self._link = link
+        self._by_index: dict[int, _Entry] = {}
+        self._requested: set[int] = set()
+        self._highest: _Entry | None = None
+        self._outlier: _Entry | None = None
+        self._failed: _Entry | None = None
+        self._count, self._is_count_used = 0, False
+        self._count_boot_ms = 0
+        # Loop time of the last reset: earlier captures belong to another log.
+        self.reset_at: float = -math.inf
+        self._has_images = False
+        self.cell: StateCell[Capture] = link.new_cell(
+            "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
+        )
+        link.on_cleared.append(self._reset)
+        link.listen(m.CameraImageCaptured, self._on_image)
+        link.listen(m.CameraFeedback, self._on_feedback)
+        link.listen(m.CameraTrigger, self._on_trigger)
+        link.listen(m.CameraCaptureStatus, self._on_status)
+
+    def captures(self) -> list[Capture]:
+        return [self._by_index[index].capture for index in sorted(self._by_index)]
+
+    def has(self, index: int) -> bool:
+        return index in self._by_index
+
+    async def fetch(self, index: int) -> Capture | None:
+        """Request a missed capture; None if the camera no longer has it, or does not answer."""
+        if not self.has(index) and self._link.is_trigger:
+            return None
+        self._requested.add(index)
+        try:
+            for _ in range(FETCH_ATTEMPTS):
+                if self.has(index) or await self._request(index):
+                    break
+        finally:
+            self._requested.discard(index)
+        found = self._by_index.get(index)
+        return None if found is None else found.capture
+
+    async def _request(self, index: int) -> bool:
+        """Request it once; True if the camera says that it has no such picture, or has only a newer one."""
+        request = self._link.requests.request
+        try:
+            if not self._link.is_autopilot_attached:
+                await request(
+                    m.CameraImageCaptured,
+                    index,
+                    where=lambda message: message.image_index == index,
+                    timeout=REQUEST_TIMEOUT_S,
+                )
+                return False
+            newest = await request(
+                m.CameraFeedback,
+                where=lambda message: message.cam_idx + 1 == self._link.number,
+                timeout=REQUEST_TIMEOUT_S,
+            )
+        except CommandRejected:
+            return True
+        return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
+
+    def record(self, message: Message) -> None:
+        if isinstance(message, m.CameraImageCaptured):
+            self._on_image(message)
+        elif isinstance(message, m.CameraFeedback):
+            self._on_feedback(message)
+        elif isinstance(message, m.CameraTrigger):
+            self._on_trigger(message)
+
+    def _on_image(self, message: m.CameraImageCaptured) -> None:
+        self._has_images = True
+        self._add(message, from_image(message, self._link.number or 0, self._link.now()))
+
+    def _on_feedback(self, message: m.CameraFeedback) -> None:
+        number = message.cam_idx + 1
+        highest = self._highest
+        has_wrapped = highest is not None and highest.capture.index > HALF_RANGE
+        # ArduPilot sends all zeros before the first picture.
+        if (message.img_idx > 0 or has_wrapped) and number == self._link.number:
+            self._add(message, from_feedback(message, number, self._link.now()))
+
+    def _on_trigger(self, message: m.CameraTrigger) -> None:
+        if self._link.is_autopilot_attached and not self._has_images:
+            capture = from_trigger(message, self._link.number or 0, self._link.now(), self._link.telemetry)
+            self._link.call_later(TRIGGER_GRACE_S, lambda: self._add_unless_reported(message, capture))
+
+    def _add_unless_reported(self, message: m.CameraTrigger, capture: Capture) -> None:
+        if not self._has_images:
+            self._add(message, capture)
+
+    def _on_status(self, message: m.CameraCaptureStatus) -> None:
+        boot_ms, count = message.time_boot_ms, message.image_count
+        if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
+            return
+        self._count_boot_ms = boot_ms
+        if count < self._count:
+            self._reset()
+        self._count = count
+        self._is_count_used = self._is_count_used or count > 0
+
+    def _reset(self) -> None:
+        self._by_index.clear()
+        self._highest = self._outlier = self._failed = None
+        self._count = 0
+        self.reset_at = self._link.now()
+
+    def _shows_reset(self, entry: _Entry, previous: _Entry | None) -> bool:
+        if previous is not None and previous.capture.success is not False:
+            return not entry.is_same(previous)
+        index, highest = entry.capture.index, self._highest
+        if highest is None or index >= highest.capture.index or index in self._requested:
+            return False
+        return highest.capture.index - index > HALF_RANGE or entry.is_later(highest)
+
+    def _add(self, message: Message, capture: Capture) -> None:
+        entry = _Entry(message, capture)
+        if capture.success is False:
+            self._add_failed(message, entry)
+            return
+        previous = self._by_index.get(capture.index)
+        if self._shows_reset(entry, previous):
+            self._reset()
+            previous = None
+        is_new = previous is None or previous.capture.success is False
+        if previous is not None and not is_new and previous.kind in (entry.kind, m.CameraImageCaptured):
+            return  # a repetition, or CAMERA_TRIGGER after the message with the position
+        self._store(entry)
+        self._update_highest(entry)
+        if isinstance(message, m.CameraImageCaptured):
+            self._count_boot_ms = message.time_boot_ms
+        # Only of a camera that counts as the standard says.
+        if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
+            self._count = max(self._count, capture.index)
+        self._publish(message, capture, is_new=is_new)
+
+    def _update_highest(self, entry: _Entry) -> None:
+        # An index far ahead may be corrupt, so it counts only when the next picture confirms it.
+        index, highest, outlier = entry.capture.index, self._highest, self._outlier
+        self._outlier = None
+        if highest is None or 0 <= index - highest.capture.index <= MAX_INDEX_GAP:
+            self._highest = entry
+        elif index > highest.capture.index:
+            is_confirmed = outlier is not None and 0 <= index - outlier.capture.index <= MAX_INDEX_GAP
+            self._highest, self._outlier = (entry, None) if is_confirmed else (highest, entry)
+
+    def _add_failed(self, message: Message, entry: _Entry) -> None:
+        # A later picture that succeeds may have the same index.
+        index, failed = entry.capture.index, self._failed
+        if failed is not None and failed.capture.index == index and failed.is_same(entry):
+            return
+        self._failed = entry
+        previous = self._by_index.get(index)
+        if previous is None or previous.capture.success is False:
+            self._store(entry)
+        self._publish(message, entry.capture, is_new=True)
+
+    def _store(self, entry: _Entry) -> None:
+        self._by_index.pop(entry.capture.index, None)
+        self._by_index[entry.capture.index] = entry
+        if len(self._by_index) > MAX_CAPTURES:
+            del self._by_index[next(iter(self._by_index))]
+
+    def _publish(self, message: Message, capture: Capture, *, is_new: bool) -> None:
+        self._link.set_cell(self.cell, capture, message)
+        if is_new:
+            self._link.publish(
+                ImageCaptured, capture.camera, capture.index, capture.success, capture.place, capture.file_url
+            )
+
+
+class CaptureQueue:
+    """Queue of the captures that arrive during a ``with`` block."""
+
+    def __init__(self, cell: StateCell[Capture]) -> None:
+        self._cell = cell
+        self._queue: deque[Capture] = deque(maxlen=MAX_CAPTURES)
+        self._event = anyio.Event()
+        self._detach: Callable[[], None] | None = None
+
+    def __enter__(self) -> CaptureQueue:
+        self._detach = self._cell.observe(self._add, every_arrival=True)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        if self._detach is not None:
+            self._detach()
+
+    def take(self) -> Capture | None:
+        return self._queue.popleft() if self._queue else None
+
+    async def wait(self, seconds: float) -> bool:
+        """Wait for a capture; False if none arrives in time."""
+        with anyio.move_on_after(seconds):
+            while not self._queue:
+                self._cell._raise_if_closed()
+                self._event = anyio.Event()
+                await self._event.wait()
+        return bool(self._queue)
+
+    def _add(self, _: Capture | None, capture: Capture) -> None:
+        self._queue.append(capture)
+        self._event.set()

@@ -1,0 +1,150 @@
+"""``aerokit fly`` in trouble: slow links, silence, other stations, failing output."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import io
+import sys
+from pathlib import Path
+
+import anyio
+import pytest
+from cli_harness import HOME, MISSION, ctrl_c, run_on, wait_until
+
+import aerokit
+from aerokit.apps.cli import fly
+from aerokit.apps.cli import fly as flown_plan
+from aerokit.apps.cli.output import emit
+from aerokit.mavlink.enums import CopterMode
+from aerokit.missions import read_waypoint_file
+from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
+from aerokit.testing import run_virtual
+from aerokit.transport.link import memory_link_pair
+
+
+@pytest.fixture(autouse=True)
+def _plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("m.waypoints").write_text(MISSION)
+    monkeypatch.setattr(fly, "is_interactive", lambda: True)
+
+
+@pytest.fixture
+def copter() -> SimulatedCopter:
+    return SimulatedCopter(boot_time_s=0.0, home=HOME)
+
+
+FLIGHTS = pytest.mark.parametrize("command", [("fly", "m.waypoints", "--yes"), ("demo",)], ids=lambda each: each[0])
+
+
+@FLIGHTS
+def test_interrupted_arm_command_arriving_late_is_disarmed(
+    command: tuple[str, ...], copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def scenario() -> int:
+        async with simulated_link(copter, latency_s=0.8) as link:
+            flight = asyncio.create_task(run_on(link, *command))
+            out = ""
+            while "arming" not in out:
+                out += capsys.readouterr().out
+                await anyio.sleep(0.05)
+            assert not copter.is_armed
+            ctrl_c()
+            await wait_until(lambda: copter.is_armed)  # the command was in flight
+            return await flight
+
+    assert run_virtual(scenario()) == 130
+    assert not copter.is_armed
+    assert "the arm command may still take effect" in capsys.readouterr().out
+
+
+def test_fly_ctrl_c_during_takeoff_returns_to_launch(
+    copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The last received landed state is "on ground", but the vehicle refuses to disarm."""
+
+    async def scenario() -> int:
+        async with simulated_link(copter) as link:
+            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            while copter.is_landed:  # noqa: ASYNC110 - there is nothing to await
+                await anyio.sleep(0.02)
+            ctrl_c()
+            return await flight
+
+    assert run_virtual(scenario()) == 130
+    printed = capsys.readouterr().out
+    assert "disarming failed" in printed
+    assert "returning to launch" in printed
+    assert (copter.mode.number, copter.is_armed) == (CopterMode.RTL, False)
+
+
+def test_fly_vehicle_silent_after_confirmation_is_not_started(
+    copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def confirm(_: str) -> bool:
+        copter.faults.silent = True
+        await anyio.sleep(5)
+        return True
+
+    async def scenario() -> int:
+        async with simulated_link(copter) as link:
+            code = await run_on(link, "fly", "m.waypoints")
+            copter.faults.silent = False
+            await anyio.sleep(5)
+            return code
+
+    monkeypatch.setattr(flown_plan, "confirm", confirm)
+    assert run_virtual(scenario()) == 3
+    assert "nothing was started" in capsys.readouterr().err
+    assert not copter.is_armed
+
+
+def test_fly_mission_changed_during_question_is_not_flown(
+    copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ours, theirs = memory_link_pair(), memory_link_pair()
+    Path("other.waypoints").write_text(MISSION.replace("\t15\t1", "\t99\t1"))
+
+    async def confirm(_: str) -> bool:
+        async with aerokit.connect(theirs[0], source_system=254) as other:
+            await other.mission.upload(read_waypoint_file("other.waypoints"))
+        return True
+
+    async def scenario() -> int:
+        async with SimulatorServer([copter], [ours[1], theirs[1]]):
+            return await run_on(ours[0], "fly", "m.waypoints")
+
+    monkeypatch.setattr(flown_plan, "confirm", confirm)
+    assert run_virtual(scenario()) == 5
+    assert "mission on the vehicle changed after the question was asked; nothing was started" in capsys.readouterr().err
+    assert (copter.is_armed, copter.is_landed) == (False, True)
+
+
+class FullDisk(io.StringIO):
+    def write(self, text: str) -> int:
+        raise OSError(28, "No space left on device")
+
+
+def test_fly_ctrl_c_with_full_disk_returns_to_launch(copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario() -> int:
+        async with simulated_link(copter) as link:
+            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            await wait_until(lambda: copter.is_armed and not copter.is_landed)
+            await anyio.sleep(8)
+            monkeypatch.setattr(sys, "stdout", FullDisk())
+            ctrl_c()
+            return await flight
+
+    assert run_virtual(scenario()) == 130
+    sys.stdout.close()
+    assert (copter.mode.number, copter.is_armed) == (CopterMode.RTL, False)
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_emit_on_ascii_terminal_replaces_characters(as_json: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    options = argparse.Namespace(json=as_json)
+    emit(options, "text", {"text": "Grüße"}, "Grüße")
+    assert written.getvalue().decode() == ('{"type": "text", "text": "Gr\\u00fc\\u00dfe"}\n' if as_json else "Gr??e\n")

@@ -1,0 +1,42 @@
+"""An error in a publisher must not end the connection to a flying vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import pytest
+
+import aerokit
+from aerokit.apps.network import Publisher, publishing
+from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.testing import run_virtual
+
+
+class Broken(Publisher):
+    """A client of some network that has gone."""
+
+    def __init__(self) -> None:
+        self.puts = 0
+
+    def put(self, name: str, data: bytes) -> None:
+        self.puts += 1
+        raise ConnectionError("the broker has gone")
+
+
+def test_publisher_error_does_not_end_connection(caplog: pytest.LogCaptureFixture) -> None:
+    async def run() -> None:
+        broken = Broken()
+        async with (
+            simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+            aerokit.connect(link) as vehicle,
+            publishing(vehicle, broken) as under_way,
+        ):
+            await asyncio.sleep(3)
+            vehicle.connection.raise_if_ended()
+            assert broken.puts > 10
+            assert under_way.published == 0
+
+    with caplog.at_level(logging.ERROR, "aerokit"):
+        run_virtual(run())
+    assert len([each for each in caplog.records if "publisher" in each.getMessage()]) == 1

@@ -1,0 +1,172 @@
+"""Cancellation, exceptions and lost links: nothing hangs, no tasks remain, flying members hold."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import anyio
+import pytest
+from fleet_stage import open_stage
+from flight_harness import attached_sinks, now, waiting_on_cells
+
+from aerokit.errors import OperationRejected
+from aerokit.fleets.formation import Formation
+from aerokit.fleets.members import Member, MemberState
+from aerokit.sim import SimulatedCopter
+
+pytestmark = pytest.mark.anyio
+
+
+def north(by_m: float) -> Any:
+    return lambda member: member.vehicle.position.value.offset(north_m=by_m)
+
+
+async def test_fleet_exit_during_action_makes_members_hold() -> None:
+    flying: asyncio.Task[Any] | None = None
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        flying = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(3)
+        copters = stage.copters
+        assert not flying.done()
+    result = await asyncio.wait_for(flying, 5)
+    assert len(result.failed) == 3
+    assert {each.mode.name for each in copters.values()} == {"BRAKE"}
+
+
+async def test_exception_in_block_propagates_and_members_hold_concurrently() -> None:
+    began = 0.0
+    copters: list[SimulatedCopter] = []
+    flying: list[asyncio.Task[Any]] = []
+    with pytest.raises(KeyError, match="mine"):
+        async with open_stage(4) as stage:
+            await stage.take_off()
+            copters += stage.copters.values()
+            flying.append(asyncio.create_task(stage.fleet.go_to(north(300))))
+            await anyio.sleep(3)
+            began = now()
+            raise KeyError("mine")
+    assert now() - began < 2.5  # concurrently, not one by one
+    await asyncio.wait(flying, timeout=1)
+    assert [each.mode.name for each in copters] == ["BRAKE"] * 4
+
+
+async def test_lost_link_loses_its_members_and_others_hold() -> None:
+    async with open_stage(2, networks=("north", "south")) as stage:
+        await stage.take_off()
+
+        async def pull() -> None:
+            await anyio.sleep(3)
+            stage.wires["south"].lose()
+
+        pulling = asyncio.create_task(pull())
+        result = await stage.fleet.go_to(north(300))
+        await pulling
+        assert set(result.failed) == {"south/1", "south/2"}
+        assert set(result.stopped) == {"north/1", "north/2"}
+        assert stage.modes["north/1"] == stage.modes["north/2"] == "BRAKE"
+        assert stage.fleet.members["south/2"].state is MemberState.LOST
+        assert stage.fleet.members["south/1"].reason
+        (await stage.fleet.land()).raise_for_errors()
+
+
+async def test_cancellation_during_policy_lets_landings_continue() -> None:
+    async with open_stage(3, on_error="land_others") as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.silent = True
+        with anyio.move_on_after(8) as scope:
+            await stage.fleet.go_to(north(300))
+        assert scope.cancelled_caught
+        await anyio.sleep(2)
+        assert stage.mode_of("north/2") == stage.mode_of("north/3") == "LAND"  # a landing continues
+        await anyio.sleep(30)
+        assert stage.copters["north/2"].motion.is_on_ground
+
+
+@pytest.mark.parametrize("after_s", [0.001, 0.3, 4.0])
+async def test_cancelled_action_leaves_no_tasks_or_subscriptions(after_s: float) -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        vehicles = list(stage.fleet.vehicles.values())
+        connection = vehicles[0].connection
+        for vehicle in vehicles:
+            _ = vehicle.mission, vehicle.guided, vehicle.parameters, vehicle.gimbal
+        await stage.fleet.hold()
+        await anyio.sleep(3)
+        line = Formation.line(["north/2", "north/3"], 8.0, frame="north")
+
+        async def follow() -> None:
+            async with stage.fleet.following(line, leader="north/1"):
+                await anyio.sleep(20)
+
+        async def wait(member: Member) -> bool:
+            await anyio.sleep(20)
+            return True
+
+        for action in (
+            lambda: stage.fleet.go_to(north(100)),
+            lambda: stage.fleet.set_mode("LOITER"),
+            lambda: stage.fleet.barrier(lambda _: False),
+            lambda: stage.fleet.do(wait, stagger_s=1.0),
+            follow,
+        ):
+            before = attached_sinks(connection), [waiting_on_cells(each) for each in vehicles]
+            tasks = len(asyncio.all_tasks())
+            started = now()
+            with anyio.move_on_after(after_s):
+                await action()
+            assert now() - started <= after_s + 2.0
+            await anyio.sleep(20)
+            assert (attached_sinks(connection), [waiting_on_cells(each) for each in vehicles]) == before
+            assert len(asyncio.all_tasks()) == tasks
+            assert not stage.fleet._context.actions
+        assert all(each.is_available for each in stage.fleet)
+
+
+async def test_exception_in_function_propagates_and_others_hold() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+
+        async def wrong(member: Member) -> None:
+            if member.name == "north/2":
+                await anyio.sleep(2)
+                raise ZeroDivisionError
+            await member.vehicle.go_to(member.vehicle.position.value.offset(north_m=300))
+
+        with pytest.raises(ZeroDivisionError):
+            await stage.fleet.do(wrong)
+        await anyio.sleep(2)
+        assert stage.mode_of("north/1") == "BRAKE"
+
+
+async def test_concurrent_actions_newest_order_wins() -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
+        await stage.take_off()
+        first = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(3)
+        second = await stage.fleet["north/1"].hold()
+        assert second.is_complete
+        await anyio.sleep(1)
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "GUIDED"}
+        first.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await first
+        await anyio.sleep(2)
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "BRAKE"}
+        assert stage.fleet.members["north/1"].is_available
+
+
+async def test_following_entered_twice_raises() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        following = stage.fleet.following(Formation.line(["north/2"], 8.0, frame="north"), leader="north/1")
+        async with following:
+            pass
+        with pytest.raises(Exception, match="entered only once"):
+            async with following:
+                raise AssertionError
+        stage.pilot_takes("north/1")
+        await anyio.sleep(2)
+        with pytest.raises(OperationRejected, match="the leader north/1 is taken over"):
+            stage.fleet.following(Formation.line(["north/2"], 8.0), leader="north/1")

@@ -1,0 +1,244 @@
+"""Shows: files, trajectories, deviations; a hundred simulated copters on one clock."""
+
+from __future__ import annotations
+
+import math
+import os
+from contextlib import AsyncExitStack
+from itertools import pairwise
+from pathlib import Path as FilePath
+
+import pytest
+from fleet_stage import HOME, open_stage
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerokit import messages as m
+from aerokit.errors import FileFormatError, FleetError, InvalidArgument, OperationRejected
+from aerokit.fleets.opening import fleet
+from aerokit.fleets.paths import LocalPoint, Path, PathPoint
+from aerokit.fleets.show import Show, state_at
+from aerokit.fleets.show_flight import max_relative_error, track_deviation
+from aerokit.position import Position
+from aerokit.sim import SimulatedCopter, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+ORIGIN = Position(*HOME[:2])
+FEW_STREAMS = {
+    m.GlobalPositionInt: 4.0,
+    m.ExtendedSysState: 1.0,
+    m.SysStatus: 1.0,
+    m.EkfStatusReport: 1.0,
+}
+
+
+def circle(
+    north_m: float, east_m: float, seconds: int, radius_m: float = 3.0
+) -> list[tuple[float, float, float, float]]:
+    """A rising circle at about 1.5 m/s."""
+    return [
+        (
+            number / 2,
+            north_m + radius_m * math.sin(number / 4),
+            east_m + radius_m * (1 - math.cos(number / 4)),
+            8 + number / 20,
+        )
+        for number in range(2 * seconds + 1)
+    ]
+
+
+async def test_show_report_measures_deviation() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off(8)
+        show = Show.from_points({name: circle(0, 10.0 * number, 12) for number, name in enumerate(stage.copters)})
+        report = await stage.fleet.fly_show(show, ORIGIN)
+        assert report.result.is_complete
+        for name in stage.copters:
+            error = report.tracks[name]
+            assert error.samples > 40
+            assert error.rms_m < error.max_m < 1.5
+            assert error.lag_s is not None
+            assert abs(error.lag_s) < 0.3
+            assert report.clocks[name].answers == 8
+        assert report.lag_spread_s is not None
+        assert report.lag_spread_s < 0.05
+        assert report.max_relative_error_m is not None
+        assert report.max_relative_error_m < 0.3
+        assert set(stage.modes.values()) == {"BRAKE"}
+
+
+async def test_show_report_measures_lag() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off(8)
+        show = Show.from_points(
+            {
+                "north/1": circle(0, 0, 10),
+                "north/2": [(t + 1.0, n, e + 10, u) for t, n, e, u in circle(0, 0, 10)],
+            }
+        )
+        report = await stage.fleet.fly_show(show, ORIGIN, lead_s=None)
+        planned = Show.from_points({"north/1": circle(0, 0, 10), "north/2": circle(0, 10, 10)})
+        assert report.tracks["north/1"].lag_s is not None
+        assert planned.duration_s == 10
+        assert 0.1 < report.tracks["north/1"].lag_s < 0.6
+
+
+async def test_show_failure_applies_policy() -> None:
+    async with open_stage(3, on_error="land_others") as stage:
+        await stage.take_off(8)
+        show = Show.from_points({name: circle(0, 10.0 * number, 20) for number, name in enumerate(stage.copters)})
+
+        async def take() -> None:
+            import anyio
+
+            await anyio.sleep(15)
+            stage.pilot_takes("north/2")
+
+        import asyncio
+
+        taking = asyncio.create_task(take())
+        report = await stage.fleet.fly_show(show, ORIGIN)
+        await taking
+        assert list(report.result.failed) == ["north/2"]
+        assert stage.mode_of("north/2") == "LOITER"
+        assert stage.copters["north/1"].motion.is_on_ground
+
+
+async def test_invalid_show_is_rejected() -> None:
+    async with open_stage(2, min_distance_m=5.0) as stage:
+        await stage.take_off(8)
+        stage.forget()
+        near = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 3, 5)})
+        with pytest.raises(OperationRejected, match=r"within 2\.\d m"):
+            await stage.fleet.fly_show(near, ORIGIN)
+        with pytest.raises(InvalidArgument, match="'x' is not one of"):
+            await stage.fleet.fly_show(Show.from_points({"x": circle(0, 0, 5)}), ORIGIN)
+        stage.copters["north/2"].faults.silent = True
+        far = Show.from_points({"north/1": circle(0, 0, 5), "north/2": circle(0, 30, 5)})
+        with pytest.raises(FleetError, match="TIMESYNC was not answered"):
+            await stage.fleet.fly_show(far, ORIGIN)
+        assert not stage.modes_ordered("north/2")
+
+
+async def fly_many(networks: int, of_each: int, seconds: int) -> None:
+    """Fly ``networks * of_each`` copters; several networks keep the traffic of each small."""
+    metre = 1 / 111_319.5
+    places: dict[str, tuple[float, float]] = {}
+    async with AsyncExitStack() as stack:
+        links = {}
+        for row in range(networks):
+            name = f"row{row}"
+            places |= {f"{name}/{number + 1}": (12.0 * row, 12.0 * number) for number in range(of_each)}
+            copters = [
+                SimulatedCopter(
+                    system_id=number + 1,
+                    boot_time_s=0.0,
+                    seed=100 * row + number,
+                    home=(
+                        HOME[0] + 12 * row * metre,
+                        HOME[1] + 12 * number * metre / math.cos(math.radians(HOME[0])),
+                        HOME[2],
+                    ),
+                )
+                for number in range(of_each)
+            ]
+            links[name] = await stack.enter_async_context(simulated_link(copters))
+        async with fleet(links, count=networks * of_each, rates=FEW_STREAMS, min_distance_m=4.0) as many:
+            (await many.wait_ready()).raise_for_errors()
+            (await many.arm()).raise_for_errors()
+            (await many.take_off(8)).raise_for_errors()
+            show = Show.from_points({name: circle(*place, seconds) for name, place in places.items()})
+            report = await many.fly_show(show, ORIGIN, rate_hz=4, start_in_s=1)
+            report.result.raise_for_errors()
+            assert max(each.max_m for each in report.tracks.values()) < 1.5
+            assert max(each.rms_m for each in report.tracks.values()) < 0.6
+            assert report.lag_spread_s is not None
+            assert report.lag_spread_s < 0.1
+            assert report.max_relative_error_m is not None
+            assert report.max_relative_error_m < 0.5
+
+
+@pytest.mark.exhaustive
+async def test_show_with_a_hundred_copters() -> None:
+    await fly_many(10, 10, int(os.environ.get("AEROKIT_SHOW_SECONDS", "6")))
+
+
+# ----------------------------------------------------------------------------------- values and files
+
+
+def test_show_file_round_trip(tmp_path: FilePath) -> None:
+    show = Show.from_points({"a": [(0, 1, 2, 3), (1.5, 2, 2, 3)], 'b,"c': [(0, 5, 5, 5)]})
+    for name in ("show.csv", "show.json"):
+        show.save(tmp_path / name)
+        assert Show.read(tmp_path / name) == show
+    assert show.duration_s == 1.5
+    assert show.top_speed_m_s("a") == pytest.approx(2 / 3)
+    assert list(show.renamed({"a": "north/1", 'b,"c': "north/2"}).tracks) == ["north/1", "north/2"]
+    with pytest.raises(InvalidArgument, match="names"):
+        show.renamed({"a": "x", 'b,"c': "x"})
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "line 1 is not name,t_s"),
+        ("name,t_s,north_m,east_m,up_m\na,0,1,2\n", "line 2"),
+        ("name,t_s,north_m,east_m,up_m\na,0,1,2,3\na,1,x,2,3\n", "line 3"),
+        ("name,t_s,north_m,east_m,up_m\na,1,1,2,3\na,0,1,2,3\n", "decrease at 0 s"),
+        ("name,t_s,north_m,east_m,up_m\na,0,nan,2,3\n", "finite"),
+        ("name,t_s,north_m,east_m,up_m\na,1,1,2,3\na,1,5,2,3\n", "two positions"),
+        ("name,t_s,north_m,east_m,up_m\n", "a show needs at least one"),
+        ("{", "not JSON"),
+        ('{"format": "other"}', "not 'aerokit show'"),
+        ('{"format": "aerokit show", "version": 1, "tracks": {"a": [[0, 1]]}}', "track 'a'"),
+        ('{"format": "aerokit show", "version": 1, "tracks": {"a": 5}}', "track 'a'"),
+    ],
+)
+def test_show_damaged_file_error_has_location(text: str, match: str, tmp_path: FilePath) -> None:
+    path = tmp_path / "show"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=match):
+        Show.read(path)
+
+
+track = Path("a", [PathPoint(0, 0, 0, 10), PathPoint(10, 40, 0, 10), PathPoint(20, 40, 40, 20)])
+
+
+@given(st.floats(-5, 25))
+def test_state_at_velocity_matches_position_change(at_s: float) -> None:
+    (before, speed), (after, _) = state_at(track, at_s), state_at(track, at_s + 1e-3)
+    if not any(abs(at_s - each.t_s) < 2e-3 for each in track.points):
+        moved = [(b - a) / 1e-3 for a, b in zip(before, after, strict=True)]
+        assert moved == pytest.approx(list(speed), abs=1e-6)
+
+
+@given(st.floats(-1, 1), st.tuples(*[st.floats(-0.2, 0.2)] * 3))
+def test_track_deviation_distinguishes_lag_from_offset(lag_s: float, offset: LocalPoint) -> None:
+    samples = [
+        (
+            number / 5,
+            tuple(p + q for p, q in zip(state_at(track, number / 5 - lag_s)[0], offset, strict=True)),
+        )
+        for number in range(10, 90)
+    ]
+    error = track_deviation(track, samples)  # type: ignore[arg-type]
+    assert error.lag_s == pytest.approx(lag_s, abs=0.12)
+    assert error.samples == 80
+    assert error.rms_m <= error.max_m + 1e-9
+    standing = track_deviation(Path("a", [PathPoint(0, 0, 0, 0)]), [(1.0, (3.0, 4.0, 0.0))])
+    assert (standing.max_m, standing.rms_m, standing.lag_s) == (5.0, 5.0, None)
+
+
+def test_max_relative_error_compares_vectors_between_vehicles() -> None:
+    other = track.replace(name="b")
+    times = [each / 2 for each in range(41)]
+
+    def shifted(by: float) -> list[tuple[float, LocalPoint]]:
+        return [(at, (state_at(track, at)[0][0] + by, *state_at(track, at)[0][1:])) for at in times]
+
+    paths = {"a": track, "b": other}
+    assert max_relative_error(paths, {"a": shifted(1), "b": shifted(1)}, 20) == pytest.approx(0, abs=1e-9)
+    assert max_relative_error(paths, {"a": shifted(1), "b": shifted(-0.5)}, 20) == pytest.approx(1.5)
+    assert max_relative_error(paths, {"a": shifted(1)}, 20) is None
+    assert all(one < after for one, after in pairwise(times))

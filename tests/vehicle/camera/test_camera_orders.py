@@ -1,0 +1,324 @@
+"""Orders to a camera: the newest one per subject wins, blocks end with the vehicle's, corrupt indices are ignored."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import anyio
+import pytest
+from camera_stage import commands_to, on_board
+from flight_harness import open_flight, open_px4
+
+import aerokit
+from aerokit import messages as m
+from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
+from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4, simulated_link
+
+pytestmark = pytest.mark.anyio
+
+FAR = 300_000
+START, STOP = int(MavCmd.IMAGE_START_CAPTURE), int(MavCmd.IMAGE_STOP_CAPTURE)
+START_VIDEO, STOP_VIDEO = int(MavCmd.VIDEO_START_CAPTURE), int(MavCmd.VIDEO_STOP_CAPTURE)
+ZOOM, FOCUS = int(MavCmd.SET_CAMERA_ZOOM), int(MavCmd.SET_CAMERA_FOCUS)
+
+
+def picture(index: int) -> m.CameraImageCaptured:
+    return m.CameraImageCaptured(0, 0, 1, 0, 0, 0, 0, (1, 0, 0, 0), index, 1, "")
+
+
+# ------------------------------------------------------------------------------ corrupt indices
+
+
+async def test_corrupt_index_does_not_block_the_series() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        given: list[int] = []
+        with anyio.fail_after(30):
+            async with vehicle.camera.photo_interval(1.0) as captures:
+                async for capture in captures:
+                    given.append(capture.index)
+                    if len(given) == 3:
+                        camera.send(picture(FAR))
+                    if len(given) == 10:
+                        break
+        assert given == list(range(10))
+        assert captures.missed == 0
+
+
+@pytest.mark.parametrize("when", [0, 2])
+async def test_corrupt_index_does_not_block_the_event_loop(when: int) -> None:
+    """PX4's trigger cannot resend captures, so gaps are skipped in one step."""
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    simulated.parameters["TRIG_MODE"] = 1.0
+    async with open_px4(simulated) as flight:
+        await flight.vehicle.wait_ready()
+        camera = flight.vehicle.camera_at(1)
+        given: list[int] = []
+
+        def lie() -> None:
+            flight.wire.deliver(FrameEncoder(1, 1).encode(picture(FAR)))
+
+        with anyio.fail_after(60):
+            async with camera.photo_interval(1.0) as captures:
+                if when == 0:
+                    lie()
+                async for capture in captures:
+                    given.append(capture.index)
+                    if len(given) == when:
+                        lie()
+                    if len(given) == 6:
+                        break
+        assert captures.missed == 0
+        true = [each for each in given if each != FAR]
+        assert len(true) >= 5
+        assert true == list(range(true[0], true[0] + len(true)))
+
+
+async def test_corrupt_low_index_does_not_rewind_the_series() -> None:
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    simulated.parameters["TRIG_MODE"] = 1.0
+    async with open_px4(simulated) as flight:
+        await flight.vehicle.wait_ready()
+        given: list[int] = []
+        with anyio.fail_after(60):
+            async with flight.vehicle.camera_at(1).photo_interval(0.5) as captures:
+                async for capture in captures:
+                    given.append(capture.index)
+                    if len(given) == 25:
+                        flight.wire.deliver(FrameEncoder(1, 1).encode(picture(given[0])))
+                    if len(given) == 30:
+                        break
+        assert given == list(range(given[0], given[0] + 30))
+
+
+async def test_unavailable_gap_is_skipped_at_once() -> None:
+    """After three captures that the camera does not send, the rest of the gap is skipped."""
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        async with vehicle.camera.photo_interval(100.0) as captures:
+            first = await anext(captures)
+            camera.faults.ignore(MavCmd.REQUEST_MESSAGE, times=None)
+            camera.send(picture(first.index + 9))
+            began = anyio.current_time()
+            assert (await anext(captures)).index == first.index + 9
+            assert anyio.current_time() - began < 60
+            assert captures.missed == 8
+
+
+# --------------------------------------------------------------------------- newest order wins
+
+
+async def test_lost_video_start_does_not_undo_later_stop() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        commands = commands_to(camera, START_VIDEO, STOP_VIDEO)
+        camera.faults.ignore(START_VIDEO, times=1)
+        async with anyio.create_task_group() as tasks:
+
+            async def start() -> None:
+                with pytest.raises(CommandTimeout, match="not sent again: another order was given"):
+                    await vehicle.camera.start_video()
+
+            tasks.start_soon(start)
+            await anyio.sleep(0.5)
+            await vehicle.camera.stop_video()
+        await anyio.sleep(5)
+        assert [each[0] for each in commands] == [START_VIDEO, STOP_VIDEO]
+
+
+async def test_series_end_does_not_stop_the_next_series() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        camera.faults.lose_ack(STOP, times=1)
+        with pytest.raises(KeyError):
+            async with vehicle.camera.photo_interval(1.0) as captures:
+                await anext(captures)
+                raise KeyError
+        commands = commands_to(camera, START, STOP)
+        async with vehicle.camera.photo_interval(1.0, count=8) as captures:
+            assert len([each async for each in captures]) == 8
+        assert [each[0] for each in commands] == [STOP, START]
+
+
+async def test_video_block_end_does_not_stop_newer_recording() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        camera.faults.lose_ack(STOP_VIDEO, times=1)
+        with pytest.raises(KeyError):
+            async with vehicle.camera.video():
+                raise KeyError
+        await vehicle.camera.start_video()
+        commands = commands_to(camera, STOP_VIDEO)
+        await anyio.sleep(6)
+        status = await vehicle.camera._shutter.status()
+        assert status is not None
+        assert status.is_recording
+        assert commands == []
+
+
+async def test_older_zoom_and_its_stop_are_not_resent() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        commands = commands_to(camera, ZOOM)
+        camera.faults.ignore(ZOOM, times=1)
+
+        async def older() -> None:
+            with pytest.raises(CommandTimeout, match="another order was given"):
+                await vehicle.camera.zoom_to(10)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(older)
+            await anyio.sleep(0.3)
+            async with vehicle.camera.zooming():
+                await vehicle.camera.zoom_to(70)
+        await anyio.sleep(5)
+        reported: list[Any] = [each[1:3] for each in commands]
+        assert reported[0] == (2, 10)
+        assert reported[-1] == (2, 70)
+        assert reported.count((2, 10)) == 1
+        assert (1, 0) not in reported
+
+
+async def test_refused_newer_order_leaves_stop_to_older_one() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        commands = commands_to(camera, STOP_VIDEO)
+        async with vehicle.camera.video():
+            camera.faults.refuse(START_VIDEO, MavResult.TEMPORARILY_REJECTED)
+            with pytest.raises(CommandRejected):
+                await vehicle.camera.start_video()
+            with pytest.raises(CommandRejected):
+                async with vehicle.camera.video():
+                    pass
+            assert commands == []
+        assert len(commands) == 1
+
+
+async def test_two_objects_of_a_camera_share_orders() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        assert vehicle.camera_at(100)._link.topic("zoom") == vehicle.camera._link.topic("zoom")
+
+
+# ----------------------------------------------------------------------------- ends of blocks
+
+
+@pytest.mark.parametrize("kind", ["photo_interval", "video", "zooming", "focusing"])
+async def test_vehicle_block_end_stops_camera_operations(kind: str) -> None:
+    camera = SimulatedCamera()
+    stops = {"photo_interval": STOP, "video": STOP_VIDEO, "zooming": ZOOM, "focusing": FOCUS}
+    copter = SimulatedCopter(boot_time_s=0.0, components=(camera,))
+    async with simulated_link(copter) as link, anyio.create_task_group() as tasks:
+        async with aerokit.connect(link) as vehicle:
+            await anyio.sleep(1.5)
+            if kind == "video":
+                await vehicle.camera.set_mode("video")
+            block = vehicle.camera.photo_interval(1.0) if kind == "photo_interval" else None
+
+            async def stay() -> None:
+                with suppress(AerokitError):
+                    async with block or getattr(vehicle.camera, kind)():
+                        await anyio.sleep(20)
+
+            tasks.start_soon(stay)
+            await anyio.sleep(3)
+            commands = commands_to(camera, stops[kind])
+        await anyio.sleep(1)
+        assert [each[0] for each in commands] == [stops[kind]]
+        assert 0 in commands[0][2:3] or kind in ("photo_interval", "video")
+        taken = camera.image_count
+        await anyio.sleep(30)
+        assert camera.image_count == taken
+        assert len(commands) == 1
+
+
+async def test_finished_block_leaves_no_finish_callback() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        async with vehicle.camera.photo_interval(1.0, count=2) as captures:
+            assert len([each async for each in captures]) == 2
+        async with vehicle.camera.zooming():
+            pass
+        assert vehicle.camera._link.on_finish == []
+
+
+async def test_unsent_operation_is_not_stopped() -> None:
+    camera = SimulatedCamera(capabilities=CameraCapFlags.CAPTURE_IMAGE)
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        commands = commands_to(camera)
+        for block in (vehicle.camera.video, vehicle.camera.zooming, vehicle.camera.focusing):
+            with pytest.raises(NotSupported, match="nothing was sent"):
+                async with block():
+                    pass
+        await anyio.sleep(5)
+        assert commands == []
+
+
+async def test_refused_block_does_not_stop_earlier_operation() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        await vehicle.camera.start_video()
+        commands = commands_to(camera, STOP_VIDEO)
+        camera.faults.refuse(START_VIDEO, MavResult.TEMPORARILY_REJECTED)
+        with pytest.raises(CommandRejected):
+            async with vehicle.camera.video():
+                pass
+        await anyio.sleep(5)
+        assert commands == []
+
+
+async def test_unacknowledged_operation_is_stopped() -> None:
+    """Unacknowledged, and cancelled after sending."""
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        commands = commands_to(camera, ZOOM)
+        camera.faults.lose_ack(ZOOM, times=4)
+        with pytest.raises(CommandTimeout):
+            async with vehicle.camera.zooming():
+                pass
+        await anyio.sleep(5)
+        assert commands[-1][1:3] == (1, 0)
+        commands.clear()
+        camera.faults.lose_ack(ZOOM, times=1)
+        with anyio.move_on_after(0.3):
+            async with vehicle.camera.zooming():
+                pass
+        await anyio.sleep(5)
+        assert [each[1:3] for each in commands] == [(1, 1), (1, 0)]
+
+
+# ------------------------------------------------------------------------------------ silent cameras
+
+
+async def test_order_is_not_resent_to_silent_camera() -> None:
+    """The autopilot's HEARTBEAT does not count for a camera with a component id of its own."""
+    camera = SimulatedCamera()
+    async with open_flight(SimulatedCopter(boot_time_s=0.0, components=(camera,))) as flight:
+        await anyio.sleep(2)
+        await flight.vehicle.camera.wait_found()
+
+        def sent() -> int:
+            orders = [each for _, each in flight.wire.sent if isinstance(each, m.CommandLong)]
+            return len([each for each in orders if each.command == ZOOM])
+
+        camera.faults.silent = True
+        await anyio.sleep(10)
+        with pytest.raises(CommandTimeout, match="no HEARTBEAT received since"):
+            await flight.vehicle.camera.zoom_to(50)
+        assert sent() == 1
+        camera.faults.silent = False
+        camera.faults.ignore(ZOOM, times=1)
+        await anyio.sleep(3)
+        await flight.vehicle.camera.zoom_to(60)
+        assert sent() == 3

@@ -1,0 +1,189 @@
+"""Warnings when a program leaves the block of a flying vehicle unintentionally."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+import anyio
+import pytest
+from flight_harness import Wire, attached_sinks, in_the_air, open_flight
+
+import aerokit
+from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.messages import Heartbeat, SetMode
+from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+from aerokit.vehicle.connect import vehicles_on
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with anyio.move_on_after(30) as scope:
+        async with in_the_air() as flight:
+            scope.deadline = anyio.current_time() + 2
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+    assert scope.cancelled_caught
+    (record,) = [each for each in caplog.records if "was left: " in each.message]
+    assert (record.name, record.levelname) == ("aerokit", "WARNING")
+    assert record.message.startswith("the block of vehicle 1 was left: holding in BRAKE, still armed, ")
+
+
+async def test_block_left_by_exception_in_flight_warns(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with in_the_air():
+            raise ZeroDivisionError
+    assert "vehicle 1 was left: in GUIDED, still armed, 10." in caplog.text
+
+
+async def test_block_left_on_ground_or_deliberately_is_silent(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with open_flight() as flight:
+            await flight.vehicle.wait_ready()
+            raise ZeroDivisionError
+    async with in_the_air():
+        pass
+    assert "was left: " not in caplog.text
+
+
+async def test_block_left_warns_only_with_active_order(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:  # another program, as it were
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+
+        async def left_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
+            caplog.clear()
+            with pytest.raises(ZeroDivisionError):
+                async with aerokit.connect(connection) as vehicle:
+                    for each in orders:
+                        await each(vehicle)
+                    raise ZeroDivisionError
+            return caplog.text
+
+        async def pilot_takes(_: object) -> None:
+            copter.rc[2] = 1500
+            copter.set_mode(CopterMode.ALT_HOLD)
+            await anyio.sleep(3)
+
+        async def send_mode(vehicle: aerokit.Vehicle) -> None:
+            vehicle.send(SetMode(1, 1, CopterMode.GUIDED))
+            await anyio.sleep(3)
+            assert vehicle.mode_name == "GUIDED"
+            assert vehicle.taken_over == ""
+
+        assert "was left: " not in await left_after(lambda vehicle: vehicle.why_not_armable())
+        async with vehicles_on(connection) as vehicles:  # as `aerokit status` does it
+            await anyio.sleep(2)
+            assert list(vehicles) == [1]
+        assert "was left: " not in caplog.text
+        assert "was left: in LOITER" in await left_after(lambda vehicle: vehicle.set_mode("LOITER"))
+        assert "was left: " not in await left_after(lambda vehicle: vehicle.set_mode("GUIDED"), pilot_takes)
+        assert "was left: in GUIDED" in await left_after(send_mode)
+        assert "was left: " not in await left_after(lambda vehicle: vehicle.set_speed(5.0))
+        assert "was left: " not in await left_after(send_mode, pilot_takes)
+
+
+async def test_block_left_warns_program_that_armed(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with in_the_air() as flight:
+            flight.pilot_takes_over()
+            await anyio.sleep(3)
+            assert flight.vehicle.taken_over
+            raise ZeroDivisionError
+    assert "vehicle 1 was left: in LOITER, still armed, " in caplog.text
+
+
+async def test_orders_before_disarming_do_not_count(caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with open_flight() as flight:
+            await flight.vehicle.wait_ready()
+            await flight.vehicle.arm()
+            await flight.vehicle.disarm()
+            flight.copter.set_mode(CopterMode.STABILIZE)
+            assert flight.copter.arming.arm(force=True)
+            await flight.vehicle.armed.wait_until(bool)
+            raise ZeroDivisionError
+    assert "was left: " not in caplog.text
+
+
+async def test_vehicle_block_leaves_nothing_on_connection() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
+        wire = Wire(link)
+        async with aerokit.open_connection(wire) as connection:
+            await anyio.sleep(2.0)
+            before = attached_sinks(connection)
+            async with aerokit.connect(connection) as vehicle:
+                await vehicle.wait_ready()
+                await vehicle.parameters.get("RTL_ALT")
+                await vehicle.mission.download()
+                await vehicle.fence.download()
+                await vehicle.logs.list()
+                assert vehicle.gimbal.attitude.latest is None
+                assert vehicle.mission.count.value == 0
+                assert attached_sinks(connection) > before
+                assert connection.boot_clocks
+            await anyio.sleep(2.0)
+            wire.forget()
+            assert attached_sinks(connection) == before
+            assert not connection.boot_clocks
+            await anyio.sleep(5.0)
+            assert {type(message) for _, message in wire.sent} == {Heartbeat}
+
+
+async def test_block_left_with_stream_in_other_task_holds() -> None:
+    """The stream ends with a reason, and the vehicle holds; its task gets the error."""
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link:
+        async with aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            stream = await vehicle.guided.velocity().__aenter__()
+        with pytest.raises(SetpointStreamStopped, match="the block of its vehicle was left"):
+            stream.set(VelocitySetpoint())
+        with pytest.raises(ConnectionClosed, match="the block of this vehicle was left; nothing was sent"):
+            vehicle.send(Heartbeat(6, 8, 0, 0, 4))
+        await anyio.sleep(1.0)
+        assert copter.mode.number == CopterMode.BRAKE
+
+
+async def test_block_left_with_flight_in_other_task_holds(caplog: pytest.LogCaptureFixture) -> None:
+    """The flight's task is gone: the vehicle is told to hold before the connection ends."""
+    ended: list[Exception] = []
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, anyio.create_task_group() as tasks:
+        async with aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+
+            async def go() -> None:
+                try:
+                    await vehicle.go_to(vehicle.position.value.offset(north_m=300))
+                except AerokitError as error:
+                    ended.append(error)
+
+            tasks.start_soon(go)
+            await anyio.sleep(3.0)
+        assert copter.mode.name == "BRAKE"
+    assert isinstance(ended[0], (ConnectionClosed, OperationRejected))
+    assert "vehicle 1 was left: holding in BRAKE" in caplog.text
+
+
+async def test_block_exit_waits_briefly_for_unanswered_hold() -> None:
+    async with in_the_air() as flight:
+        with anyio.move_on_after(1.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+        flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
+        with anyio.move_on_after(1.0):
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+        left_at = anyio.current_time()
+    assert 1.0 < anyio.current_time() - left_at < 3.0

@@ -1,0 +1,86 @@
+"""Interpretation of the vehicle's answers: outcomes of writes, errors without a name, other spellings, late echoes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from flight_harness import Flight
+
+from aerokit.errors import ParameterRejected
+from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamSet, ParamValue
+from aerokit.parameters import Parameter, ParameterType
+from aerokit.vehicle.parameters.writing import outcome_of
+
+pytestmark = pytest.mark.anyio
+
+INT, REAL = ParameterType.INT32, ParameterType.REAL32
+
+
+@pytest.mark.parametrize(
+    ("type_", "before", "wanted", "answer", "outcome"),
+    [
+        (INT, 1, 7, 7, "set"),
+        (INT, 7, 7, 7, "unchanged"),
+        (INT, None, 7, 7, "set"),
+        (INT, 1, 7, 8, "clamped"),
+        (INT, 1, 100, 50, "clamped"),
+        (INT, 1, -7, 7, "clamped"),
+        (REAL, 1.0, 100.0, 100.1, "rounded"),
+        (REAL, 1.0, -100.0, -100.05, "rounded"),
+        (REAL, 1.0, 100.0, 100.2, "clamped"),
+        (REAL, 1.0, 0.0, 0.001, "clamped"),
+    ],
+)
+def test_write_outcomes(type_: ParameterType, before: float | None, wanted: float, answer: float, outcome: str) -> None:
+    known = None if before is None else Parameter("P", before, type_)
+    assert outcome_of(Parameter("P", wanted, type_), known, Parameter("P", answer, type_)) == outcome
+
+
+def test_unchanged_value_is_a_refusal() -> None:
+    error = outcome_of(Parameter("P", 7, INT), Parameter("P", 1, INT), Parameter("P", 1, INT))
+    assert isinstance(error, ParameterRejected)
+    assert str(error).startswith("P = 7 was refused: the vehicle keeps 1")
+
+
+async def test_param_error_without_name_is_ignored(grounded: Flight) -> None:
+    """PX4 leaves arbitrary values in unused fields of PARAM_ERROR."""
+    copter = grounded.copter
+    on_read = copter.handlers[ParamRequestRead.ID]
+
+    def doubtful(message: ParamRequestRead, channel: Any) -> None:
+        copter.send(ParamError(255, 190, "", 7, 1))
+        on_read(message, channel)
+
+    copter.handlers[ParamRequestRead.ID] = doubtful
+    assert await grounded.vehicle.parameters.get("LAND_SPEED", timeout=5) == 50
+    assert (await grounded.vehicle.parameters.set("LAND_SPEED", 60, timeout=5)).outcome == "set"
+
+
+async def test_ardupilot_names_are_sent_in_upper_case(grounded: Flight) -> None:
+    parameters = grounded.vehicle.parameters
+    assert (await parameters.set("land_speed", 60)).value == 60
+    assert await parameters.get("Land_Speed") == 60
+    assert "land_speed" not in parameters.table
+    assert {each.param_id for each in grounded.wire.all(ParamSet)} == {"LAND_SPEED"}
+
+
+async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None:
+    """Write 1, 0, 1: the last PARAM_SET is lost, and a late echo of the first one arrives."""
+    copter, parameters = grounded.copter, grounded.vehicle.parameters
+    await parameters.set("LAND_SPEED", 61)
+    await parameters.set("LAND_SPEED", 60)
+    on_set = copter.handlers[ParamSet.ID]
+    lost: list[ParamSet] = []
+
+    def lose_first(message: ParamSet, channel: Any) -> None:
+        if lost:
+            on_set(message, channel)
+        else:
+            lost.append(message)
+            copter.send(ParamValue("LAND_SPEED", 61, message.param_type, len(copter.parameters), 65535))
+
+    copter.handlers[ParamSet.ID] = lose_first
+    assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
+    assert lost
+    assert copter.parameters["LAND_SPEED"] == 61
