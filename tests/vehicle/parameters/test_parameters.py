@@ -25,7 +25,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr
-from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterType
+from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterTable, ParameterType
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
@@ -33,7 +33,7 @@ from aerokit.vehicle.connect import connect
 from aerokit.vehicle.files.files import Files
 from aerokit.vehicle.parameters.access import MAX_READ_BACK, MIN_PACK_SIZE
 from aerokit.vehicle.parameters.parameters import Parameters
-from aerokit.vehicle.parameters.store import default_directory
+from aerokit.vehicle.parameters.store import ParameterCache, default_directory
 from aerokit.vehicle.parameters.writing import ResolvedParameter, resolve_known
 
 pytestmark = pytest.mark.anyio
@@ -738,3 +738,12 @@ def test_signalling_nan_bits_are_kept() -> None:
     assert bits & 0x7F800000 == 0x7F800000
     assert bits & 0x007FFFFF
     assert not bits & 0x00400000
+
+
+def test_cache_that_cannot_be_written_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    ParameterCache(tmp_path).save("vehicle", 1, ParameterTable([]))
+    assert list(tmp_path.iterdir()) == []

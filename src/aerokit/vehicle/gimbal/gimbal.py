@@ -110,7 +110,7 @@ class RoiMixin(GimbalMixin):
         aim = AngleTarget(
             lambda: direction_to(self._context, target),
             tolerance_deg,
-            "the vehicle does not report its position",
+            "the vehicle does not report its position, or not the height difference to the target",
         )
         with attitude_stream(orders), self._session.streaming("position"):
             since = self._now()

@@ -34,14 +34,14 @@ Angles = tuple[float | None, float | None, float | None, float | None]
 
 
 class AngleTarget:
-    """Angles to reach within a tolerance; ``where`` returns them on each call, None while they are unknown."""
+    """Angles to reach within a tolerance; ``wanted`` returns them on each call, None while they are unknown."""
 
-    def __init__(self, where: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
-        self._position, self._tolerance_deg, self._unknown = where, tolerance_deg, unknown
+    def __init__(self, wanted: Callable[[], Angles | None], tolerance_deg: float, unknown: str = "") -> None:
+        self._wanted, self._tolerance_deg, self._unknown = wanted, tolerance_deg, unknown
 
     def is_reached(self, device: GimbalDevice) -> bool:
         attitude = device.attitude.value
-        wanted = self._position()
+        wanted = self._wanted()
         actual = (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
         return wanted is not None and all(
             want is None or (have is not None and abs(math.remainder(have - want, 360)) <= self._tolerance_deg)
@@ -49,7 +49,7 @@ class AngleTarget:
         )
 
     def describe(self) -> str:
-        wanted = self._position()
+        wanted = self._wanted()
         return f"expected {_angles(wanted)}" if wanted is not None else self._unknown
 
 

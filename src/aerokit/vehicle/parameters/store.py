@@ -181,8 +181,11 @@ class ParameterCache:
         temporary = path.with_suffix(f".{os.getpid()}.tmp")
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps(content), encoding="utf-8")
-            temporary.replace(path)
+            try:
+                temporary.write_text(json.dumps(content), encoding="utf-8")
+                temporary.replace(path)
+            finally:
+                temporary.unlink(missing_ok=True)
 
     def _path(self, vehicle: str) -> Path:
         return self.directory / f"{vehicle}.json"
