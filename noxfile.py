@@ -97,9 +97,11 @@ def types(session: nox.Session) -> None:
 @nox.session
 def docs(session: nox.Session) -> None:
     """Build the documentation into `site/`, with warnings as errors. `-- serve` shows it while you write."""
-    session.install("-e", ".[docs]")
+    session.install("-e", ".[docs,test]")
     quiet = {"NO_MKDOCS_2_WARNING": "1"}
     session.run("mkdocs", *(session.posargs or ("build", "--strict")), env=quiet)
+    if not session.posargs:
+        session.run("pytest", "-q", "-n0", "-m", "", "tests/test_site.py", env={"AEROKIT_SITE": "site"})
 
 
 @nox.session
@@ -237,7 +239,7 @@ def clients(session: nox.Session) -> None:
 @nox.session
 def browser(session: nox.Session) -> None:
     """Fly with the page of `aerokit serve`, and open a report, in headless Chromium (or AEROKIT_CHROMIUM)."""
-    session.install("-e", ".[test]", "playwright>=1.45")
+    session.install("-e", ".[test]", "playwright>=1.45", "axe-playwright-python>=0.1.4")
     session.run("pytest", "-q", "-n", "0", "tests/browser", "tests/logs/report/test_report.py", *session.posargs)
 
 

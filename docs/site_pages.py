@@ -11,8 +11,8 @@ from pathlib import Path
 from posixpath import dirname, join, normpath, relpath
 from typing import TYPE_CHECKING, Any
 
+import site_reference
 from mkdocs.structure.files import File, Files
-from site_reference import GENERATED_PAGES, REFERENCE_PAGES, SOURCE_PAGES, reference_pages
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -33,8 +33,7 @@ NAVIGATION: dict[str, list[str]] = {
     ],
     "Concepts": ["concepts.md", "glossary.md"],
     "Tools": ["command-line.md", "hub.md", "monitor.md", "report.md", "serve.md", "network.md", "convert.md"],
-    "Reference": ["reference/index.md", *(f"reference/{page.name}.md" for page in REFERENCE_PAGES),
-                  *(f"reference/{name}.md" for name in GENERATED_PAGES)],
+    "Reference": ["reference/*.md"],
     "Troubleshooting": ["troubleshooting.md"],
     "Gallery": ["gallery.md", "examples/*.md"],
     "About": [
@@ -62,6 +61,7 @@ INSTALL = """
     another project.
 """
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
+RAISED = re.compile(r"(<li class=\"doc-section-item field-body\">\s*<code>)(\w+)(</code>)")
 ROLE = re.compile(r":(?:class|func|meth|mod|attr|data|exc):(?=<code>)")
 
 
@@ -74,21 +74,21 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Convert links to files of the repository, and add the install instructions to every page."""
+    """Convert links to files of the repository, and add the install instructions to pages of the guide."""
     sources = {page_path: source for source, page_path in ROOT_PAGES.items()}
     source = sources.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     text = outside_code(
         markdown, lambda part: LINK.sub(lambda link: converted_link(link, source, page.file.src_uri), part)
     )
-    if page.file.src_uri == "index.md":
+    if page.file.src_uri == "index.md" or page.file.src_uri.startswith("reference/"):
         return text  # the home page has its own install instructions
     title, _, rest = text.partition("\n")
     return f"{title}\n{INSTALL}{rest}"
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Remove Sphinx roles of docstrings (``:class:`…```), which MkDocs shows as text."""
-    return ROLE.sub("", html)
+    """Remove Sphinx roles of docstrings (``:class:`…```), which MkDocs shows as text, and link exceptions."""
+    return RAISED.sub(r'\1<autoref identifier="aerokit.errors.\2" optional>\2</autoref>\3', ROLE.sub("", html))
 
 
 # ------------------------------------------------------------------------------------ generated pages
@@ -104,7 +104,7 @@ def generated_pages() -> Iterator[tuple[str, str]]:
             example_page(name.as_posix()),
             f"# {name}\n\n```python\n{path.read_text(encoding='utf-8')}```\n",
         )
-    yield from reference_pages()
+    yield from site_reference.reference_pages()
 
 
 def example_files() -> list[Path]:
@@ -128,7 +128,9 @@ def navigation(pages: list[str]) -> list[Any]:
             matching = [page for page in left if re.fullmatch(pattern.replace("*", "[^/]*"), page)]
             found += matching
             left = [page for page in left if page not in matching]
-        if found:
+        if title == "Reference":
+            tabs.append({title: site_reference.navigation()})
+        elif found:
             tabs.append({title: found[0] if wanted == found and len(found) == 1 else found})
     return tabs
 
@@ -166,4 +168,4 @@ def site_page(path: str) -> str | None:
         return example_page(path)
     if path in ("examples", "examples/dronekit", "examples/testing_a_mission"):
         return "gallery.md" if (ROOT / "docs" / "gallery.md").exists() else None
-    return SOURCE_PAGES.get(path)
+    return site_reference.SOURCE_PAGES.get(path)

@@ -5,153 +5,336 @@ from __future__ import annotations
 import enum as enum_kinds
 import importlib
 import inspect
+import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from types import ModuleType
+from pathlib import Path
+from typing import Any
 
-VEHICLE = "aerokit.vehicle"
+ROLE = re.compile(r":(?:class|func|meth|mod|attr|data|exc):(?=`)")
 
 
 @dataclass(frozen=True)
 class Page:
-    """One page of the reference, with the public names of its modules."""
+    """One page of the reference."""
 
     name: str
     title: str
     about: str
-    modules: tuple[str, ...]
+    imports: tuple[str, ...] = ()
+    """Modules that users import: the page has every exported name."""
+    holders: tuple[str, ...] = ()
+    """Other modules: the page has their value classes, and the classes that the public API returns or accepts."""
+    names: tuple[str, ...] = ()
+    """Full names of functions of these modules that users import."""
+    search_boost: float = 1.0
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        return self.imports + self.holders
 
 
-REFERENCE_PAGES = (
-    Page("aerokit", "aerokit", "Connecting, and the most common names", ("aerokit",)),
-    Page("vehicle", "aerokit.vehicle: Vehicle", "State, actions, and access to its parts",
-         (f"{VEHICLE}.vehicle", f"{VEHICLE}.connect")),
-    Page("fleets", "aerokit.fleets: Fleet", "Many vehicles together",
-         tuple(f"aerokit.fleets.{name}" for name in (
-             "fleet", "members", "policy", "events", "formation", "separation", "paths", "show", "show_flight"))),
-    Page("cells", "Cells and subscriptions", "Values with their age; streams of messages and events",
-         ("aerokit.connection.cells", "aerokit.connection.bus")),
-    Page("state", "Values of the state", "The types of state cells",
-         (f"{VEHICLE}.state.movement", f"{VEHICLE}.state.condition", f"{VEHICLE}.state.equipment",
-          f"{VEHICLE}.state.status_text")),
-    Page("guided", "Set-point streams, posted orders", "`vehicle.guided`, `vehicle.posted`",
-         (f"{VEHICLE}.commanding.guided", f"{VEHICLE}.commanding.setpoints", f"{VEHICLE}.commanding.posted")),
-    Page("missions", "Missions, fences, rally points", "`vehicle.mission`, `.fence`, `.rally`, and `aerokit.missions`",
-         (f"{VEHICLE}.missions.mission", f"{VEHICLE}.missions.plans", "aerokit.missions")),
-    Page("parameters", "Parameters", "`vehicle.parameters`, and `aerokit.parameters`",
-         (f"{VEHICLE}.parameters.parameters", f"{VEHICLE}.parameters.writing", f"{VEHICLE}.parameters.transaction",
-          "aerokit.parameters")),
-    Page("files", "Files and logs", "`vehicle.files`, `vehicle.logs`",
-         (f"{VEHICLE}.files.files", f"{VEHICLE}.files.logs")),
-    Page("camera", "Cameras", "`vehicle.camera`, `vehicle.camera_at`",
-         (f"{VEHICLE}.camera.cameras", f"{VEHICLE}.camera.values", f"{VEHICLE}.camera.capture", "aerokit.video")),
-    Page("gimbal", "Gimbals", "`vehicle.gimbal`, `vehicle.gimbals`",
-         (f"{VEHICLE}.gimbal.gimbal", f"{VEHICLE}.gimbal.control", f"{VEHICLE}.gimbal.rates",
-          f"{VEHICLE}.gimbal.device")),
-    Page("components", "Components", "`vehicle.component(id)`",
-         (f"{VEHICLE}.components.component", f"{VEHICLE}.components.settings")),
-    Page("errors", "aerokit.errors", "All exceptions", ("aerokit.errors",)),
-    Page("events", "aerokit.events", "All events", ("aerokit.events",)),
-    Page("sync", "aerokit.sync", "The blocking API", ("aerokit.sync",)),
-    Page("dronekit", "aerokit.dronekit", "The classic API", ("aerokit.dronekit",)),
-    Page("sim", "aerokit.sim", "Simulated vehicles", ("aerokit.sim", "aerokit.sim.kinds", "aerokit.testing.picture")),
-    Page("testing", "aerokit.testing", "Tests of your program", ("aerokit.testing",)),
-    Page("transport", "aerokit.transport", "Links", ("aerokit.transport",)),
-    Page("hub", "aerokit.hub", "Links joined into one network", ("aerokit.hub",)),
-    Page("mavlink", "aerokit.mavlink", "Frames, messages, signing", ("aerokit.mavlink", "aerokit.mavlink.pymavlink")),
-    Page("protocols", "aerokit.protocols", "MAVLink's services without I/O",
-         tuple(f"aerokit.protocols.{name}" for name in (
-             "exchange", "command", "parameter_list", "parameter_requests", "extended_parameters", "missions",
-             "mission_download", "mission_upload", "ftp", "ftp_transfer", "logs"))),
-    Page("autopilots", "aerokit.autopilots", "What differs between firmwares", ("aerokit.autopilots",)),
-    Page("convert", "aerokit.logs.convert", "Logs in other formats", ("aerokit.logs.convert",)),
-    Page("flights", "aerokit.logs.flights", "Flights read from logs", ("aerokit.logs.flights",)),
-    Page("report", "aerokit.logs.report", "A flight as one HTML file", ("aerokit.logs.report",)),
-    Page("foxglove", "aerokit.apps.foxglove", "Vehicles live in Foxglove", ("aerokit.apps.foxglove",)),
-    Page("network", "aerokit.apps.network", "State for other computers and languages", ("aerokit.apps.network",)),
-    Page("serve", "aerokit.apps.serve", "Web page and HTTP API", ("aerokit.apps.serve",)),
-    Page("monitor", "aerokit.apps.monitor", "Vehicles in the terminal", ("aerokit.apps.monitor.app",)),
-)  # fmt: skip
+GROUPS: dict[str, tuple[Page, ...]] = {
+    "import aerokit": (
+        Page("aerokit", "aerokit", "Connecting, and the most common names", ("aerokit",), search_boost=2.5),
+        Page("vehicle", "Vehicle", "Actions, state, and access to everything on board",
+             holders=("aerokit.vehicle.vehicle",), search_boost=3),
+        Page("cells", "StateCell and Subscription", "Values with their age; streams of messages and events",
+             holders=("aerokit.connection.cells", "aerokit.connection.bus"), search_boost=2.5),
+        Page("state", "Values of the state", "What `vehicle.attitude.value`, `vehicle.batteries.value` … return",
+             holders=("aerokit.vehicle.state.movement", "aerokit.vehicle.state.condition",
+                      "aerokit.vehicle.state.equipment"), search_boost=1.5),
+        Page("guided", "vehicle.guided and vehicle.posted", "Set-point streams, and orders without waiting",
+             holders=("aerokit.vehicle.commanding.guided", "aerokit.vehicle.commanding.setpoints",
+                      "aerokit.vehicle.commanding.posted"), search_boost=2),
+        Page("plans", "vehicle.mission, .fence and .rally", "Missions, fences and rally points on board",
+             holders=("aerokit.vehicle.missions.mission", "aerokit.vehicle.missions.plans"), search_boost=2),
+        Page("vehicle-parameters", "vehicle.parameters", "Parameters on board",
+             holders=("aerokit.vehicle.parameters.parameters", "aerokit.vehicle.parameters.writing",
+                      "aerokit.vehicle.parameters.transaction"), search_boost=2),
+        Page("files", "vehicle.files and vehicle.logs", "Files and flight logs on board",
+             holders=("aerokit.vehicle.files.files", "aerokit.vehicle.files.logs", "aerokit.vehicle.files.logs"),
+             search_boost=2),
+        Page("camera", "vehicle.camera", "Photos, video, zoom, settings",
+             holders=("aerokit.vehicle.camera.cameras", "aerokit.vehicle.camera.values",
+                      "aerokit.vehicle.camera.capture"),
+             names=("aerokit.vehicle.camera.capture.captures_csv", "aerokit.vehicle.camera.capture.geotag_file",
+                    "aerokit.vehicle.camera.capture.geotagged", "aerokit.vehicle.camera.capture.write_captures"),
+             search_boost=1.75),
+        Page("gimbal", "vehicle.gimbal", "Gimbals and control over them",
+             holders=("aerokit.vehicle.gimbal.gimbal", "aerokit.vehicle.gimbal.control",
+                      "aerokit.vehicle.gimbal.rates", "aerokit.vehicle.gimbal.device"), search_boost=1.75),
+        Page("components", "vehicle.component()", "Any component on board",
+             holders=("aerokit.vehicle.components.component", "aerokit.vehicle.components.settings"),
+             search_boost=1.5),
+        Page("fleets", "Fleet", "Many vehicles together",
+             holders=("aerokit.fleets.fleet", "aerokit.fleets.members", "aerokit.fleets.policy",
+                      "aerokit.fleets.events", "aerokit.fleets.formation", "aerokit.fleets.formation",
+                      "aerokit.fleets.separation", "aerokit.fleets.paths", "aerokit.fleets.show",
+                      "aerokit.fleets.show_flight"), search_boost=1.25),
+    ),
+    "Modules": (
+        Page("sync", "aerokit.sync", "The blocking API", ("aerokit.sync",), search_boost=0.7),
+        Page("dronekit", "aerokit.dronekit", "The classic DroneKit API", ("aerokit.dronekit",)),
+        Page("missions", "aerokit.missions", "Mission items, fences, rally points; `.plan` and `QGC WPL` files",
+             ("aerokit.missions",), search_boost=1.75),
+        Page("parameters", "aerokit.parameters", "Parameter tables, files, metadata, settings of components",
+             ("aerokit.parameters",)),
+        Page("errors", "aerokit.errors", "All exceptions", ("aerokit.errors",)),
+        Page("events", "aerokit.events", "All events", ("aerokit.events",)),
+        Page("video", "aerokit.video", "Frames of video streams", ("aerokit.video",)),
+        Page("hub", "aerokit.hub", "Links joined into one network", ("aerokit.hub",), search_boost=1.5),
+    ),
+    "Tests": (
+        Page("testing", "aerokit.testing", "Tests of your program", ("aerokit.testing",)),
+        Page("sim", "aerokit.sim", "Simulated vehicles", ("aerokit.sim",)),
+    ),
+    "Applications": (
+        Page("convert", "aerokit.logs.convert", "Logs in other formats", ("aerokit.logs.convert",)),
+        Page("flights", "aerokit.logs.flights", "Flights read from logs", ("aerokit.logs.flights",)),
+        Page("report", "aerokit.logs.report", "A flight as one HTML file", ("aerokit.logs.report",)),
+        Page("foxglove", "aerokit.apps.foxglove", "Vehicles live in Foxglove", ("aerokit.apps.foxglove",)),
+        Page("network", "aerokit.apps.network", "State for other computers and languages",
+             ("aerokit.apps.network",)),
+        Page("serve", "aerokit.apps.serve", "Web page and HTTP API", ("aerokit.apps.serve",)),
+        Page("monitor", "aerokit.apps.monitor", "Vehicles in the terminal", ("aerokit.apps.monitor.app",)),
+    ),
+    "Lower layers": (
+        Page("transport", "aerokit.transport", "Links", ("aerokit.transport",)),
+        Page("mavlink", "aerokit.mavlink", "Frames, dialects, signing",
+             ("aerokit.mavlink", "aerokit.mavlink.pymavlink"),
+             names=("aerokit.mavlink.message_factory.MessageFactory",)),
+        Page("protocols", "aerokit.protocols", "MAVLink's services without I/O", (
+            "aerokit.protocols.exchange", "aerokit.protocols.command", "aerokit.protocols.parameter_list",
+            "aerokit.protocols.parameter_requests", "aerokit.protocols.extended_parameters",
+            "aerokit.protocols.missions", "aerokit.protocols.mission_download", "aerokit.protocols.mission_upload",
+            "aerokit.protocols.ftp", "aerokit.protocols.ftp_transfer", "aerokit.protocols.logs",
+        ), search_boost=0),
+        Page("autopilots", "aerokit.autopilots", "What differs between firmwares", ("aerokit.autopilots",),
+             search_boost=0),
+    ),
+}  # fmt: skip
+"""Section of the reference: its pages. Pages with a `search_boost` of 0 are not in the search index."""
 GENERATED_PAGES = {
-    "messages": "Every message of the standard dialect",
-    "enums": "Every enum of the standard dialect",
-    "cli": "Every option of the command line",
+    "messages": ("Modules", "aerokit.messages", "Every message of the standard dialect"),
+    "enums": ("Modules", "aerokit.enums", "Every enum of the standard dialect"),
+    "cli": ("Applications", "aerokit on the command line", "Every command and option"),
 }
-TITLES = {
-    "messages": "aerokit.messages",
-    "enums": "aerokit.enums",
-    "cli": "aerokit.apps.cli: the command line",
-}
+"""Page that is generated without mkdocstrings: its section, title and description."""
+REFERENCE_PAGES = tuple(page for pages in GROUPS.values() for page in pages)
+EXAMPLES = Path(__file__).parent / "reference-examples.md"
+EXAMPLE = re.compile(r"^## (?P<name>\S+)\n\n```python[^\n]*\n(?P<code>.*?)^```$", re.DOTALL | re.MULTILINE)
+WORD = re.compile(r"[A-Za-z_]\w*")
+ASSIGNED = re.compile(r"^ +self\.[a-z]\w*(?:: (.+))? = ([A-Z]\w+)?", re.MULTILINE)
+"""A public attribute that a method sets: its annotation, and the class that it creates."""
+
+
+def example_names() -> list[str]:
+    """Return the entries that have an example: ``connect``, ``Vehicle.arm``, ``missions.waypoint``."""
+    return [example["name"] for example in EXAMPLE.finditer(EXAMPLES.read_text(encoding="utf-8"))]
+
+
+def navigation() -> list[Any]:
+    """Return the pages of the tab, in their sections."""
+    sections = {group: [f"reference/{page.name}.md" for page in pages] for group, pages in GROUPS.items()}
+    for name, (group, _, _) in GENERATED_PAGES.items():
+        sections[group].append(f"reference/{name}.md")
+    return ["reference/index.md", *({group: pages} for group, pages in sections.items())]
 
 
 def reference_pages() -> Iterator[tuple[str, str]]:
     """Yield path on the site and text of each page."""
     yield "reference/index.md", _index()
-    pages = _pages_of_names()
+    listing = Listing()
     for page in REFERENCE_PAGES:
-        yield f"reference/{page.name}.md", _page(page, pages)
+        yield f"reference/{page.name}.md", _page(page, listing)
     yield "reference/messages.md", _messages()
     yield "reference/enums.md", _enums()
     yield "reference/cli.md", _command_line()
 
 
-def _pages_of_names() -> dict[str, Page]:
-    """Map each object to its page: the first page with its module, and the page of `aerokit` last."""
-    pages: dict[str, Page] = {}
-    for page in (*REFERENCE_PAGES[1:], REFERENCE_PAGES[0]):
-        for module_name in page.modules:
-            for full_name in _full_names(importlib.import_module(module_name)):
-                pages.setdefault(full_name, page)
-    return pages
+# ------------------------------------------------------------------------------------ public names
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One public object."""
+
+    path: str
+    """Where users import it from, e.g. ``aerokit.Vehicle``; else where it is defined."""
+    item: Any
+    page: Page
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition(".")[2]
+
+    @property
+    def is_imported(self) -> bool:
+        """False for what only the library creates: classes that users do not import, except values."""
+        module = self.path.rpartition(".")[0]
+        return module not in self.page.holders or bool(getattr(self.item, "__match_args__", ()))
+
+
+class Listing:
+    """Every public object, and its page."""
+
+    def __init__(self) -> None:
+        self.exports = {module: dict(_exports(module)) for page in REFERENCE_PAGES for module in page.imports}
+        self._held = [
+            (page, module, name, item)
+            for page in REFERENCE_PAGES
+            for module in page.holders
+            for name, item in _exports(module)
+            if inspect.isclass(item) and item.__module__ == module
+        ]
+        self._pages_of_modules = {module: page for page in REFERENCE_PAGES for module in page.modules}
+        self.entries: dict[str, Entry] = {}
+        for page in REFERENCE_PAGES:
+            for module in page.imports:
+                for name, item in self.exports[module].items():
+                    home = self._home(name, item) or page
+                    self.entries.setdefault(_key(module, name, item), Entry(f"{module}.{name}", item, home))
+            for path in page.names:
+                module, _, name = path.rpartition(".")
+                item = getattr(importlib.import_module(module), name)
+                self.entries[_key(module, name, item)] = Entry(path, item, page)
+        self._add_held_classes()
+        with_example = dict.fromkeys(self.find(name)[0].path for name in example_names())
+        self._ranks = {path: rank for rank, path in enumerate(with_example)}
+
+    def _home(self, name: str, item: Any) -> Page | None:
+        """Return the page of the module that defines an object, or of the package around it that exports it, too."""
+        module = str(getattr(item, "__module__", ""))
+        while module.count("."):
+            page = self._pages_of_modules.get(module)
+            if page and (module in page.holders or name in self.exports[module]):
+                return page
+            module = module.rpartition(".")[0]
+        return None
+
+    def _add_held_classes(self) -> None:
+        """Add values, and the classes that annotations of listed objects name, until there are no more."""
+        words = {name for _, _, name, item in self._held if getattr(item, "__match_args__", ())}
+        words |= {word for entry in self.entries.values() for word in _annotated(entry.item)}
+        while found := [row for row in self._held if row[2] in words and _key(*row[1:]) not in self.entries]:
+            for page, module, name, item in found:
+                self.entries[_key(module, name, item)] = Entry(f"{module}.{name}", item, page)
+                words |= _annotated(item)
+
+    def find(self, name: str) -> tuple[Entry, str]:
+        """Return the entry of ``connect``, ``Vehicle.arm``, ``StateCell.age`` or ``missions.waypoint``, and the member.
+
+        Raises:
+            KeyError: there is no such entry.
+        """
+        paths = {entry.path.removeprefix("aerokit."): entry for entry in self.entries.values()}
+        names = {entry.name: entry for entry in self.entries.values() if entry.page.holders}
+        if name in paths:
+            return paths[name], ""
+        owner, _, member = name.rpartition(".")
+        return paths.get(owner) or names[owner], member
+
+    def of_page(self, page: Page) -> list[Entry]:
+        """Return the entries of a page: those with examples first, then by module, in the order of its ``__all__``."""
+        here = {key: entry for key, entry in self.entries.items() if entry.page is page}
+        exported = [_key(module, *export) for module in page.modules for export in _exports(module)]
+        ordered = dict.fromkeys(key for key in (*exported, *here) if key in here)
+        return sorted((here[key] for key in ordered), key=lambda entry: self._ranks.get(entry.path, math.inf))
+
+    def elsewhere(self, page: Page) -> list[Entry]:
+        """Return the entries that the modules of a page export, and that are on other pages."""
+        exported = {_key(module, *export) for module in page.imports for export in self.exports[module].items()}
+        entries = [self.entries[key] for key in exported if self.entries[key].page is not page]
+        return sorted(entries, key=lambda entry: entry.name)
+
+    def classes(self) -> set[str]:
+        """Return where the listed classes are defined."""
+        items = [entry.item for entry in self.entries.values() if inspect.isclass(entry.item)]
+        return {f"{item.__module__}.{item.__qualname__}" for item in items}
+
+    def inherited(self, entry: Entry) -> list[str]:
+        """Return the public inherited members that no other listed class describes."""
+        listed = {id(other.item) for other in self.entries.values()}
+        bases = entry.item.__mro__[1:-1]
+        described = {base for other in bases if id(other) in listed for base in other.__mro__}
+        names = {base: {name for name in vars(base) if name[:1] != "_"} for base in bases}
+        hidden = set().union(*(names[base] for base in bases if base not in described))
+        return sorted(hidden.difference(*(names[base] for base in bases if base in described)))
+
+
+def _key(module: str, name: str, item: Any) -> str:
+    """Return where an object is defined, or where it is exported if it does not say."""
+    if inspect.isclass(item) or inspect.isroutine(item):
+        return f"{item.__module__}.{item.__qualname__}"
+    return f"{module}.{name}"
+
+
+def _exports(module_name: str) -> Iterator[tuple[str, Any]]:
+    """Yield the exported objects of a module, without modules and without names of other libraries."""
+    module = importlib.import_module(module_name)
+    for name in getattr(module, "__all__", ()):
+        item = getattr(module, name)
+        is_ours = str(getattr(item, "__module__", "aerokit")).partition(".")[0] == "aerokit"
+        if not inspect.ismodule(item) and (is_ours or getattr(item, "__name__", "") != name):
+            yield name, item
+
+
+def _annotated(item: Any) -> set[str]:
+    """Return the words of the annotations of a function, or of a class and its members."""
+    members = [item]
+    if inspect.isclass(item):
+        members += [member for base in item.__mro__ for name, member in vars(base).items() if name[:1] != "_"]
+    annotations: list[Any] = []
+    for member in members:
+        if isinstance(member, (classmethod, staticmethod)):
+            member = member.__func__
+        member = getattr(member, "fget", None) or getattr(member, "func", None) or member
+        own = getattr(inspect.unwrap(member) if callable(member) else member, "__annotations__", None)
+        annotations += own.values() if isinstance(own, dict) else ()
+    if inspect.isclass(item):
+        with suppress(OSError):  # classes that are made at run time have no source
+            annotations += [" ".join(found) for found in ASSIGNED.findall(inspect.getsource(item))]
+    return {word for annotation in annotations for word in WORD.findall(str(annotation))}
+
+
+# ------------------------------------------------------------------------------------ pages of mkdocstrings
 
 
 def _index() -> str:
-    rows = [(page.name, page.title, page.about) for page in REFERENCE_PAGES]
-    rows += [(name, TITLES[name], about) for name, about in GENERATED_PAGES.items()]
-    table = "".join(f"| [{title}]({name}.md) | {about} |\n" for name, title, about in rows)
-    text = (
-        "Every public name, with inherited members. Modules that are on none of these pages are internal and may"
-        " change with any version."
-    )
-    return f"# Reference\n\n{text}\n\n| | |\n|---|---|\n{table}"
+    parts = [
+        "# Reference\n",
+        "Every public name, with inherited members. Other modules are internal and may change with any version.\n",
+    ]
+    for group, pages in GROUPS.items():
+        rows = [(page.name, page.title, page.about) for page in pages]
+        rows += [(name, title, about) for name, (section, title, about) in GENERATED_PAGES.items() if section == group]
+        table = "".join(f"| [{title}]({name}.md) | {about} |\n" for name, title, about in rows)
+        parts.append(f"## {group}\n\n| | |\n|---|---|\n{table}")
+    return "\n".join(parts)
 
 
-def _page(page: Page, pages: dict[str, Page]) -> str:
-    """Return a page: its objects, and links to exported objects on other pages."""
-    text = [f"# {page.title}\n"]
-    for name in page.modules:
-        module = importlib.import_module(name)
-        names = list(dict.fromkeys(_full_names(module)))
-        if len(page.modules) > 1:
-            text.append(f"## {name}\n")
-        if hasattr(module, "__path__"):  # packages have a description
-            text.append(f"{inspect.getdoc(module)}\n")
-        elsewhere = [f"[`{name.rpartition('.')[2]}`][{name}]" for name in names if pages[name] is not page]
-        if elsewhere:
-            text.append(f"On other pages: {', '.join(elsewhere)}.\n")
-        level = 3 if len(page.modules) > 1 else 2
-        here = [name for name in names if pages[name] is page and name not in _listed(text)]
-        text += [f"::: {name}\n    options:\n      heading_level: {level}\n" for name in here]
-    return "\n".join(text)
+def _page(page: Page, listing: Listing) -> str:
+    """Return a page: exported objects of other pages as a table, then the objects of this one."""
+    search = f"  boost: {page.search_boost}" if page.search_boost else "  exclude: true"
+    parts = [f"---\nsearch:\n{search}\n---\n", f"# {page.title}\n", f"{page.about}.\n"]
+    for name in page.imports:
+        if hasattr(importlib.import_module(name), "__path__"):  # packages have a description
+            parts.append(f"{inspect.getdoc(importlib.import_module(name))}\n")
+    elsewhere = listing.elsewhere(page)
+    if elsewhere:
+        rows = "".join(f"| [`{entry.name}`][{entry.path}] | {_first_sentence(entry.item)} |\n" for entry in elsewhere)
+        parts.append(f"These names have their own pages:\n\n| | |\n|---|---|\n{rows}")
+    parts += [f"::: {entry.path}\n    options:\n      heading_level: 2\n" for entry in listing.of_page(page)]
+    return "\n".join(parts)
 
 
-def _listed(text: list[str]) -> set[str]:
-    return {line[4:].partition("\n")[0] for line in text if line.startswith("::: ")}
-
-
-def _full_names(module: ModuleType) -> Iterator[str]:
-    """Yield the full name of each public object: where it is defined, or where it is exported if it has no module."""
-    for name in getattr(module, "__all__", ()):
-        item = getattr(module, name)
-        if inspect.ismodule(item):
-            continue
-        home, own_name = str(getattr(item, "__module__", "")), getattr(item, "__name__", "")
-        is_ours = home.partition(".")[0] == "aerokit"
-        if is_ours and getattr(importlib.import_module(home), own_name or name, None) is item:
-            yield f"{home}.{own_name or name}"
-        elif is_ours or own_name != name:  # skip names of other libraries
-            yield f"{module.__name__}.{name}"
+def _first_sentence(item: Any) -> str:
+    text = " ".join((inspect.getdoc(item) or "").split())
+    sentence = re.split(r"(?<!e\.g)(?<!i\.e)[.:] ", text)[0].rstrip(".:")
+    return ROLE.sub("", sentence).replace("|", "\\|")
 
 
 # ------------------------------------------------------------------------------------ generated code
@@ -162,6 +345,7 @@ def _messages() -> str:
     from aerokit.mavlink.message import Message
 
     parts = [
+        "---\nsearch:\n  boost: 0.3\n---\n",
         "# aerokit.messages\n",
         "`from aerokit import messages`; `help(messages.Attitude)` has fields with types and units.\n",
     ]
@@ -169,7 +353,7 @@ def _messages() -> str:
         message = getattr(messages, name)
         if inspect.isclass(message) and issubclass(message, Message):
             fields = ", ".join(f"`{field.name}`" for field in message.FIELDS)
-            parts.append(f"{_item(name, message)} {fields}\n")
+            parts.append(_item(name, message, fields))
     return "\n".join(parts)
 
 
@@ -177,6 +361,7 @@ def _enums() -> str:
     from aerokit import enums
 
     parts = [
+        "---\nsearch:\n  boost: 0.3\n---\n",
         "# aerokit.enums\n",
         "`from aerokit import enums`; `help(enums.MavCmd)` describes each member.\n",
     ]
@@ -184,16 +369,18 @@ def _enums() -> str:
         enum: type[enum_kinds.IntEnum] = getattr(enums, name)
         if inspect.isclass(enum):
             members = ", ".join(f"`{member}` {int(value)}" for member, value in enum.__members__.items())
-            parts.append(f"{_item(name, enum)} {members}\n")
+            parts.append(_item(name, enum, members))
     return "\n".join(parts)
 
 
-def _item(name: str, item: type) -> str:
-    """Return a paragraph with an anchor and the first sentence of the standard's description."""
+def _item(name: str, item: type, details: str) -> str:
+    """Return a section with the standard's name and the first sentence of its description."""
     text = " ".join((inspect.getdoc(item) or "").split())
-    sentence = re.split(r"(?<!e\.g)(?<!i\.e)\. ", text)[0].rstrip(".")
+    standard_name, _, description = text.partition(": ")
+    sentence = re.split(r"(?<!e\.g)(?<!i\.e)\. ", description)[0].rstrip(".")
     sentence = re.sub(r"([<>*_\[\]`])", r"\\\1", sentence)
-    return f'<a id="{name}"></a>**{name}** · {sentence}.<br>'
+    heading = f"## {name} <small>{standard_name}</small> {{ #{name} }}"
+    return f"{heading}\n\n{sentence}.\n\n{details}\n{{ data-search-exclude }}\n"
 
 
 def _command_line() -> str:
@@ -201,7 +388,7 @@ def _command_line() -> str:
 
     from aerokit.apps.cli.main import make_parser
 
-    text = ["# aerokit.apps.cli: the command line\n"]
+    text = [f"# {GENERATED_PAGES['cli'][1]}\n"]
 
     def append_help(parser: argparse.ArgumentParser, level: int) -> None:
         text.append(f"{'#' * level} {parser.prog}\n\n```text\n{parser.format_help().rstrip()}\n```\n")
@@ -221,6 +408,7 @@ SOURCE_PAGES = {
         for name in page.modules
         for end in (".py", "/__init__.py")
     },
+    "src/aerokit": "reference/index.md",
     "src/aerokit/testing/clock.py": "reference/testing.md",
     "src/aerokit/vehicle/state/states.py": "reference/vehicle.md",
 }

@@ -21,12 +21,22 @@ from anyio.from_thread import start_blocking_portal
 from served_copter import served
 
 import aerokit
-from aerokit.missions import Mission, return_to_launch, take_off, waypoint
+from aerokit.missions import (
+    Fence,
+    FencePolygon,
+    Mission,
+    Plan,
+    format_plan,
+    return_to_launch,
+    take_off,
+    waypoint,
+)
 from aerokit.sim import SimulatedCopter
 from aerokit.sim.motion import GlobalPoint, LocalFrame
 from aerokit.testing.track import true_point
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is installed by `nox -s browser`")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is installed by `nox -s browser`")
 CHROMIUM = os.environ.get("AEROKIT_CHROMIUM") or shutil.which("chromium")
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium"),
@@ -94,10 +104,10 @@ async def upload(address: str) -> None:
 
 
 @contextlib.contextmanager
-def opened(browser: Any, url: str, wide: int = 1360, high: int = 820) -> Iterator[Any]:
+def opened(browser: Any, url: str, wide: int = 1360, high: int = 820, scheme: str = "dark") -> Iterator[Any]:
     """A page, which at the end must have had no mistake, no foreign request and nothing refused by its policy."""
     mistakes: list[str] = []
-    context = browser.new_context(viewport={"width": wide, "height": high})
+    context = browser.new_context(viewport={"width": wide, "height": high}, color_scheme=scheme)
     page = context.new_page()
     page.set_default_timeout(10_000)
     page.on("pageerror", lambda error: mistakes.append(str(error)))
@@ -133,8 +143,10 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         assert server["token"] not in page.url  # it was taken out of the address
         page.get_by_role("tab", name="Mission").click()
         page.locator("#panel tr").nth(5).wait_for()
-        assert page.locator("#tiles-of-state dd").first.inner_text() == "STABILIZE"
+        assert page.locator("#tiles-of-state dd > span").first.inner_text() == "STABILIZE"
 
+        take_off = page.locator("button[data-order='take_off']")
+        assert (take_off.is_disabled(), take_off.locator("small").inner_text()) == (True, "Arm first")
         page.click("button[data-order='arm']")
         assert "Vehicle 1" in page.locator("dialog .target").inner_text()
         picture(page, "dialog")
@@ -154,9 +166,12 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         fly_to_a_click(page, first)
         order(page, "land")
         wait_done(page, "land")
-        page.get_by_role("tab", name="OrderRunner").click()
+        page.get_by_role("tab", name="Orders").click()
         page.locator("#panel .text", has_text="go to: latitude -35.").wait_for()  # it is drawn with the next frame
         picture(page, "orders")
+        with page.expect_response("**/api/vehicles/1/track") as track:
+            page.reload()
+        assert len(track.value.json()["points"]) > 20
 
 
 def values_have_units(page: Any) -> None:
@@ -175,7 +190,7 @@ def values_have_units(page: Any) -> None:
     assert rows["mode"] == "GUIDED"
     picture(page, "state")
     page.set_viewport_size({"width": 1300, "height": 820})
-    page.evaluate("document.querySelectorAll('#tiles-of-state dd')[7].textContent = '10 · RTK fixed (12 s)'")
+    page.evaluate("document.querySelectorAll('#tiles-of-state dd > span')[7].textContent = '10 · RTK fixed (12 s)'")
     assert page.locator("#tiles-of-state dd").evaluate_all("all => all.every(e => e.scrollWidth <= e.clientWidth)")
     picture(page, "narrow")
     page.set_viewport_size({"width": 1360, "height": 820})
@@ -210,7 +225,7 @@ def test_page_sets_parameter_after_confirmation(browser: Any, copters: tuple[lis
         picture(page, "parameters")
 
 
-def test_page_escapes_texts_and_marks_old_values(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+def test_page_escapes_texts(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
     (_, second), address = copters
     with serving(address) as server, opened(browser, server["page"]) as page:
         page.get_by_role("tab", name="Messages").click()
@@ -218,15 +233,158 @@ def test_page_escapes_texts_and_marks_old_values(browser: Any, copters: tuple[li
         page.locator(".vehicle", has_text="2 ArduCopter").click()
         page.get_by_text(HOSTILE).wait_for()
         assert page.locator("#panel img").count() == 0
-        page.get_by_role("tab", name="State").click()
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_page_shows_silence_with_readable_values(
+    browser: Any, copters: tuple[list[SimulatedCopter], str], scheme: str
+) -> None:
+    (_, second), address = copters
+    with serving(address) as server, opened(browser, server["page"], scheme=scheme) as page:
+        page.locator("#server.good", has_text="live").wait_for()
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
         second.faults.silent = True
-        page.locator("#tiles-of-state dd.old").first.wait_for()
-        page.locator(".vehicle .dot.silent").wait_for()
-        order(page, "arm")
-        page.locator(".toast.failed", has_text="is silent").wait_for()
-        assert not second.is_armed
-        picture(page, "silent")
-        second.faults.silent = False
+        try:
+            page.locator("#tiles-of-state dd.old small", has_text="old").first.wait_for()
+            banner = page.locator(".silence", has_text=re.compile(r"Vehicle 2 is silent since \d+:\d\d:\d\d"))
+            banner.wait_for()
+            assert re.search(
+                r"Last position, \d+ s old: -35\.363\d+, 149\.165\d+, -?0\.0 m above home",
+                banner.inner_text(),
+            )
+            assert "it continues: the failsafe is off (FS_GCS_ENABLE = 0)" in banner.inner_text()
+            page.locator("#server.bad", has_text="1 of 2 silent").wait_for()
+            page.locator(".vehicle .dot.silent").wait_for()
+            page.locator("#readiness.bad", has_text="No contact for").wait_for()
+            styles = page.locator("#tiles-of-state dd, #panel td.value").evaluate_all(
+                "all => [...new Set(all.map(e => { const s = getComputedStyle(e);"
+                " return `${s.textDecorationLine} ${s.fontStyle} ${s.opacity}`; }))]"
+            )
+            assert styles == ["none normal 1"]
+            arm = page.locator("button[data-order='arm']")
+            assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "Silent")
+            assert page.locator("button[data-order='land']").is_enabled(), "safe orders are tried all the same"
+            check_contrast(page)
+            picture(page, f"silent-{scheme}")
+        finally:
+            second.faults.silent = False
+        page.locator(".silence").wait_for(state="detached")
+
+
+def check_contrast(page: Any) -> None:
+    found = axe.Axe().run(page).response["violations"]
+    severe = [each for each in found if each["impact"] in ("serious", "critical")]
+    assert [(each["id"], [node["html"][:120] for node in each["nodes"]]) for each in severe] == []
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_page_has_accessible_contrast(browser: Any, copters: tuple[list[SimulatedCopter], str], scheme: str) -> None:
+    _, address = copters
+    with serving(address) as server, opened(browser, server["page"], scheme=scheme) as page:
+        assert page.evaluate("document.documentElement.dataset.theme") == scheme
+        for tab in ("Mission", "Messages", "Orders", "State", "Parameters"):
+            page.get_by_role("tab", name=tab).click()
+            if tab == "Parameters":
+                page.get_by_text("1349 of 1349 parameters").wait_for()
+                page.fill("input[type=search]", "wpnav")
+            check_contrast(page)
+        page.click("button[data-order='arm']")
+        check_contrast(page)
+
+
+def test_page_keeps_chosen_theme(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    _, address = copters
+    with serving(address) as server, opened(browser, server["page"]) as page:
+        page.click("#theme")
+        page.reload()
+        page.wait_for_selector(".vehicle[aria-pressed=true]")
+        assert page.evaluate("document.documentElement.dataset.theme") == "light"
+        page.click("#theme")
+        assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+
+
+def test_page_shows_why_vehicle_is_not_ready(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    (_, second), address = copters
+    with serving(address) as server, opened(browser, server["page"]) as page:
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
+        page.locator("#readiness.good", has_text="Ready to arm").wait_for()
+        second.faults.prearm_failures = ["Compass not healthy"]
+        try:
+            page.locator("#readiness.warn li", has_text="Compass not healthy").wait_for(timeout=30_000)
+            arm = page.locator("button[data-order='arm']")
+            assert (arm.is_disabled(), arm.locator("small").inner_text()) == (True, "Not ready")
+            picture(page, "not-ready")
+        finally:
+            second.faults.prearm_failures = []
+        page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)
+
+
+def test_page_words_errors_for_people(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    said = {
+        "take_off: the vehicle is not armed: arm() comes first": "The vehicle is not armed: “Arm” comes first",
+        "MAV_CMD_NAV_TAKEOFF was refused: FAILED": "The vehicle refused (failed)",
+        "x.plan: line 3: no JSON": "x.plan: line 3: no JSON",
+    }
+    with serving(copters[1]) as server, opened(browser, server["page"]) as page:
+        words = """async (details) => {
+            const { inWords } = await import("/static/readiness.js");
+            return details.map((detail) => inWords({ detail }));
+        }"""
+        assert page.evaluate(words, [*said]) == [*said.values()]
+
+
+DROP = """([name, text]) => {
+    const data = new DataTransfer();
+    data.items.add(new File([text], name));
+    window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+}"""
+
+
+def test_page_uploads_dropped_plan_after_confirmation(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    (_, second), address = copters
+    place = true_point(second)
+    here = aerokit.Position(place.latitude_deg, place.longitude_deg)
+    corners = [here.offset(north_m=n, east_m=e) for n, e in ((90, -90), (90, 90), (-90, 90), (-90, -90))]
+    leg = waypoint(corners[0].latitude_deg, corners[0].longitude_deg, altitude_relative_m=15)
+    plan = Plan(Mission([take_off(altitude_relative_m=15), leg]), Fence([FencePolygon(corners)]))
+    with serving(address) as server, opened(browser, server["page"]) as page:
+        page.locator(".vehicle", has_text="2 ArduCopter").click()
+        page.evaluate(DROP, ["notes.plan", "no JSON"])
+        page.locator(".toast.failed", has_text="notes.plan is not a .plan file").wait_for()
+        page.evaluate(DROP, ["field.plan", format_plan(plan)])
+        text = page.locator("dialog").inner_text()
+        assert "Vehicle 2" in text
+        assert "get 2 mission items, 1 fence area from field.plan" in text
+        page.click("dialog .yes")
+        wait_done(page, "upload field.plan (2 items)")
+        page.get_by_role("tab", name="Mission").click()
+        page.locator("#panel tr", has_text="waypoint").wait_for()
+        page.evaluate(DROP, ["broken.plan", format_plan(plan).replace('"version": 2', '"version": 7')])
+        page.click("dialog .yes")
+        page.locator(".toast.failed", has_text="broken.plan").wait_for()
+        picture(page, "uploaded")
+
+
+def test_map_labels_do_not_overlap_on_phone(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:
+    _, address = copters
+    with serving(address) as server, opened(browser, server["page"], 390, 844) as page:
+        boxes = page.evaluate("""async () => {
+            const { MapView } = await import("/static/map.js");
+            const map = new MapView(document.getElementById("map"), () => {}), drawn = [];
+            const at = (east) => ({ latitude_deg: -35.36, longitude_deg: 149.165 + east * 1e-6 });
+            const vehicles = [1, 2, 3, 4].map((id) => ({ id, position: at(id), age: 0, heading: 0,
+                labels: [`${id} · STABILIZE · 10.0 m`, `${id} · 10.0 m`, String(id)] }));
+            const fillRect = map.context.fillRect.bind(map.context);
+            map.context.fillRect = (...box) => { drawn.push(box); fillRect(...box); };
+            map.draw(vehicles, 1, { items: [], current: null }, null, { polygons: [], circles: [], rally: [] });
+            return drawn.slice(1); // the first one is the background
+        }""")
+        assert len(boxes) == 4
+        for index, (left, top, wide, high) in enumerate(boxes):
+            assert 0 <= left <= left + wide <= 390
+            for other in boxes[:index]:
+                apart = left > other[0] + other[2] or other[0] > left + wide
+                assert apart or top > other[1] + other[3] or other[1] > top + high
 
 
 def test_page_on_phone_without_token_and_read_only(browser: Any, copters: tuple[list[SimulatedCopter], str]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+from typing import Any
 
 import anyio
 import pytest
@@ -11,8 +13,12 @@ from serve_stage import HOST, TOKEN, open_stage
 
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.orders import ORDERS
+from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.messages import FileTransferProtocol, MissionCount
+from aerokit.missions import Fence, FencePolygon, Mission, Plan, format_plan, take_off, waypoint
+from aerokit.position import Position
 
 pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -275,3 +281,66 @@ async def test_invalid_token_raises(token: str) -> None:
     async with open_flight() as flight:
         with pytest.raises(InvalidArgument, match="token"):
             make_app(flight.vehicle, token=token)
+
+
+def plan_of(items: int, *, fence: bool = False) -> dict[str, Any]:
+    here = Position(-35.363261, 149.165230)
+    corners = [here.offset(north_m=n, east_m=e) for n, e in ((90, -90), (90, 90), (-90, 0))]
+    legs = [waypoint(at.latitude_deg, at.longitude_deg, altitude_relative_m=15) for at in corners]
+    mission = Mission([take_off(altitude_relative_m=15), *legs * items][:items])
+    plan = Plan(mission, Fence([FencePolygon(corners)] if fence else []))
+    return dict(json.loads(format_plan(plan)))
+
+
+async def test_upload_replaces_mission_and_keeps_fence_that_plan_lacks() -> None:
+    async with open_stage() as stage:
+        first = await stage.submit("mission/upload", {"name": "a.plan", "plan": plan_of(4, fence=True)})
+        assert (first.status_code, first.json()["state"]) == (200, "done")
+        shown = first.json()["arguments"]
+        assert (shown["name"], shown["mission_items"], shown["fence_items"]) == ("a.plan", 4, 3)
+        assert "plan" not in shown
+        mission = await stage.client.get("/api/vehicles/1/mission", headers=BEARER)
+        assert len(mission.json()["items"]) == 4
+        await stage.submit("mission/upload", {"plan": plan_of(3)})
+        mission = await stage.client.get("/api/vehicles/1/mission", headers=BEARER)
+        assert len(mission.json()["items"]) == 3
+        assert len((await stage.flight.vehicle.fence.download()).polygons) == 1
+
+
+async def test_upload_with_repeated_key_is_sent_once() -> None:
+    async with open_stage() as stage:
+        key = {"Idempotency_Key": "upload-1"}
+        plan = plan_of(2)
+        assert (await stage.submit("mission/upload", {"plan": plan}, **key)).status_code == 200
+        stage.flight.wire.forget()
+        again = await stage.submit("mission/upload", {"plan": plan}, **key)
+        other = await stage.submit("mission/upload", {"plan": plan_of(3)}, **key)
+        assert (again.status_code, again.json()["state"], other.status_code) == (200, "done", 409)
+        assert stage.flight.wire.all(MissionCount) + stage.flight.wire.all(FileTransferProtocol) == []
+
+
+@pytest.mark.parametrize(
+    ("plan", "text"),
+    [
+        ({}, "fileType"),
+        ({"fileType": "Plan", "version": 9}, "version"),
+        (plan_of(0), "no mission items, fence or rally points"),
+        ("text", "plan"),
+    ],
+)
+async def test_invalid_plan_sends_nothing(plan: object, text: str) -> None:
+    async with open_stage() as stage:
+        stage.flight.wire.forget()
+        answer = await stage.submit("mission/upload", {"name": "x.plan", "plan": plan})
+        assert answer.status_code == 400
+        assert text in answer.json()["detail"]
+        assert stage.flight.wire.all(MissionCount) + stage.flight.wire.all(FileTransferProtocol) == []
+
+
+async def test_large_plan_is_taken_and_too_large_one_refused() -> None:
+    async with open_stage() as stage:
+        plan = plan_of(90)
+        answer = await stage.submit("mission/upload", {"plan": plan})
+        assert len(json.dumps(plan)) > MAX_BODY_SIZE
+        assert answer.status_code == 200
+        assert (await stage.submit("mission/upload", {"plan": {"x": "y" * MAX_PLAN_SIZE}})).status_code == 413

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -16,10 +17,20 @@ from starlette.routing import Mount, Route, WebSocketRoute
 import aerokit
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
+from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.errors import InvalidArgument
-from aerokit.missions import Mission, return_to_launch, take_off
-from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.missions import (
+    Fence,
+    FenceCircle,
+    Mission,
+    RallyPoints,
+    rally_point,
+    return_to_launch,
+    take_off,
+)
+from aerokit.parameters import load_metadata
+from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, simulated_link
 
 pytestmark = pytest.mark.anyio
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -74,7 +85,7 @@ async def test_reading_needs_token_unless_open(is_open: bool) -> None:
             route.path for route in stage.app.routes if isinstance(route, Route) and "GET" in (route.methods or ())
         ]
         vehicles = [path for path in paths if path.startswith("/api/") and not path.endswith("openapi.json")]
-        assert len(vehicles) == 9
+        assert len(vehicles) == 12
         for path in vehicles:
             asked = path.format(system_id=1, name="RTL_ALT", key="12345678")
             answer = await stage.client.get(asked)
@@ -250,3 +261,102 @@ async def test_client_that_sends_is_disconnected() -> None:
         await socket.next("state")
         socket.incoming.put_nowait({"type": "websocket.receive", "text": '{"order": "arm"}'})
         assert (await socket.next("websocket.close"))["code"] == 1008
+
+
+# ------------------------------------------------------------------------------------------- for the page
+
+
+async def test_track_covers_flight_within_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit.apps.serve.served_vehicles.MAX_TRACK_POINTS", 20)
+    async with open_stage() as stage:
+        vehicle = stage.flight.vehicle
+        start = vehicle.position.value
+        await vehicle.arm()
+        await vehicle.take_off(10)
+        await vehicle.go_to(vehicle.position.value.offset(north_m=80), speed_m_s=5)
+        points = (await stage.client.get("/api/vehicles/1/track", headers=BEARER)).json()["points"]
+        assert 10 <= len(points) <= 20
+        assert not any(is_after_gap for *_, is_after_gap in points[1:])
+        assert points[0][:2] == pytest.approx((start.latitude_deg, start.longitude_deg), abs=1e-6)
+        end = vehicle.position.value
+        assert points[-1][:2] == pytest.approx((end.latitude_deg, end.longitude_deg), abs=2e-5)
+
+
+async def test_track_marks_gap_after_silence() -> None:
+    async with open_stage() as stage:
+        vehicle = stage.flight.vehicle
+        await vehicle.arm()
+        await vehicle.take_off(10)
+        await vehicle.go_to(vehicle.position.value.offset(north_m=80))
+        await vehicle.set_mode("RTL")
+        await anyio.sleep(4)
+        stage.flight.copter.faults.silent = True
+        await anyio.sleep(6)
+        stage.flight.copter.faults.silent = False
+        await anyio.sleep(4)
+        points = (await stage.client.get("/api/vehicles/1/track", headers=BEARER)).json()["points"]
+        assert [is_after_gap for *_, is_after_gap in points[1:]].count(True) == 1
+
+
+async def test_fence_and_rally_points_are_read() -> None:
+    async with open_stage() as stage:
+        vehicle = stage.flight.vehicle
+        here = vehicle.position.value
+        await vehicle.fence.upload(Fence(circles=[FenceCircle(here, 80.0)]))
+        await vehicle.rally.upload(RallyPoints([rally_point(here, altitude_relative_m=30)]))
+        fence = (await stage.client.get("/api/vehicles/1/fence", headers=BEARER)).json()
+        rally = (await stage.client.get("/api/vehicles/1/rally", headers=BEARER)).json()
+        assert [(each["radius_m"], each["inclusion"]) for each in fence["circles"]] == [(80.0, True)]
+        assert [each["position"]["latitude_deg"] for each in rally["items"]] == [pytest.approx(here.latitude_deg)]
+
+
+async def test_state_has_reasons_against_flight_and_failsafe() -> None:
+    async with open_stage() as stage, Socket(stage.app, query="rate_hz=2") as socket:
+        before = (await socket.next("state"))["vehicles"][0]
+        assert before["missing_for_flight"] == []
+        assert before["failsafe"] == {"action": None, "because": None, "unread": ["FS_GCS_ENABLE"]}
+        await stage.client.get("/api/vehicles/1/parameters/FS_GCS_ENABLE", headers=BEARER)
+        stage.flight.copter.faults.prearm_failures = ["Compass not healthy"]
+        await anyio.sleep(40)
+        socket.sent.clear()
+        after = (await socket.next("state"))["vehicles"][0]
+        assert after["missing_for_flight"][0] == "Compass not healthy"
+        assert after["failsafe"]["because"] == "FS_GCS_ENABLE = 0"
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "action"),
+    [
+        (SimulatedCopter, {"FS_GCS_ENABLE": 5}, "lands"),
+        (SimulatedPlane, {"FS_GCS_ENABL": 0}, "continues: the failsafe is off"),
+        (SimulatedPlane, {"FS_GCS_ENABL": 1, "FS_LONG_ACTN": 1}, "returns to launch"),
+        (SimulatedRover, {"FS_GCS_ENABLE": 1, "FS_ACTION": 2}, "holds"),
+        (SimulatedPx4, {"NAV_DLL_ACT": 2}, "returns to launch"),
+    ],
+)
+async def test_failsafe_is_named_from_parameters(
+    kind: type[SimulatedCopter], values: dict[str, float], action: str
+) -> None:
+    async with simulated_link([kind(boot_time_s=0.0)]) as link, aerokit.connect(link) as vehicle:
+        assert ground_station_failsafe(vehicle)["action"] is None
+        for name, value in values.items():
+            await vehicle.parameters.set(name, value)
+        assert ground_station_failsafe(vehicle)["action"] == action
+
+
+async def test_parameters_have_metadata(tmp_path: Path) -> None:
+    path = tmp_path / "apm.pdef.json"
+    fields = {
+        "DisplayName": "RTL altitude",
+        "Description": "<b>How high</b>",
+        "Units": "cm",
+        "Range": {"low": "200", "high": "8000"},
+    }
+    path.write_text(json.dumps({"": {"RTL_ALT": fields}}))
+    async with open_stage(metadata=load_metadata(path)) as stage:
+        answer = await stage.client.get("/api/vehicles/1/parameters", headers=BEARER)
+        rows = {each["name"]: each for each in answer.json()["parameters"]}
+        found = rows["RTL_ALT"]
+        assert (found["unit"], found["minimum"], found["maximum"]) == ("cm", 200, 8000)
+        assert (found["short_description"], found["description"]) == ("RTL altitude", "<b>How high</b>")
+        assert "unit" not in rows["RTL_SPEED"]

@@ -24,6 +24,7 @@ from aerokit.apps.serve.requests import (
     system_id_of,
 )
 from aerokit.errors import ParameterRejected
+from aerokit.mavlink.enums import EkfStatusFlags, EstimatorStatusFlags, MavPowerStatus, MavSysStatusSensor
 from aerokit.vehicle.vehicle import overview
 
 if TYPE_CHECKING:
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
     from aerokit.apps.serve.guard import AccessControl
     from aerokit.apps.serve.orders import OrderArgument
     from aerokit.apps.serve.served_vehicles import ServedVehicles
-    from aerokit.missions import Mission
+    from aerokit.missions import Fence, Mission, MissionItem, RallyPoints
+    from aerokit.parameters import Metadata, Parameter
     from aerokit.vehicle.vehicle import Vehicle
 
 _ABOUT = """State, missions, parameters and orders of MAVLink vehicles (docs/serve.md of aerokit).
@@ -101,6 +103,17 @@ _ORDER: dict[str, Any] = {
         "result": {},
         "problem": {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]},
     },
+}
+_METADATA = ("short_description", "description", "unit", "minimum", "maximum", "reboot_required", "read_only")
+# Names of the bits in states, for the page.
+_BITS = {
+    state: {str(int(bit)): str(bit.name) for bit in flags}
+    for state, flags in {
+        "sensors": MavSysStatusSensor,
+        "power": MavPowerStatus,
+        "EKF_STATUS_REPORT": EkfStatusFlags,
+        "ESTIMATOR_STATUS": EstimatorStatusFlags,
+    }.items()
 }
 # With wait=false, wait this long, so that an order that is refused locally is answered with the reason.
 _REFUSAL_TIMEOUT_S = 0.2
@@ -233,11 +246,18 @@ class Operation:
 
 class HttpApi:
     def __init__(
-        self, served: ServedVehicles, orders: OrderRunner, access: AccessControl, settings: dict[str, Any]
+        self,
+        served: ServedVehicles,
+        orders: OrderRunner,
+        access: AccessControl,
+        settings: dict[str, Any],
+        metadata: Metadata | None = None,
     ) -> None:
         self._served, self._orders, self._access, self._settings = served, orders, access, settings
+        self._metadata = metadata
         self._locks: dict[Vehicle, asyncio.Lock] = {}
-        self._missions: dict[Vehicle, tuple[Mission, float]] = {}
+        self._plans: dict[tuple[Vehicle, str], tuple[Mission | Fence | RallyPoints, float]] = {}
+        served.listen(self._on_message)
 
     def operations(self) -> tuple[Operation, ...]:
         one, named = "/api/vehicles/{system_id}", "/api/vehicles/{system_id}/parameters/{name}"
@@ -248,7 +268,10 @@ class HttpApi:
             get("/api/vehicles", "vehicles", "All vehicles", self._list),
             get(one, "vehicle", "The state of a vehicle, with ages", self._vehicle),
             get(f"{one}/texts", "texts", "Its status texts, the newest last", self._texts),
+            get(f"{one}/track", "track", "Where it was, the newest last; bounded", self._track),
             get(f"{one}/mission", "mission", "Its mission", self._mission, query=("refresh",)),
+            get(f"{one}/fence", "fence", "Its fence", self._fence, query=("refresh",)),
+            get(f"{one}/rally", "rally", "Its rally points", self._rally, query=("refresh",)),
             get(f"{one}/parameters", "parameters", "All its parameters", self._parameters, query=("refresh",)),
             get(named, "parameter", "One parameter, read from the vehicle", self._parameter),
             get("/api/events", "events", "Recent events, the newest last", self._events),
@@ -284,7 +307,7 @@ class HttpApi:
         return Operation(method, path, name, kind.summary, partial(self._run_order, kind), kind, ("wait",))
 
     async def _about(self, request: Request) -> Response:
-        return json_response({"aerokit": __version__, **self._settings})
+        return json_response({"aerokit": __version__, "bits": _BITS, **self._settings})
 
     async def _openapi(self, request: Request) -> Response:
         return json_response(document(self.operations(), request.scope.get("root_path", "")))
@@ -301,30 +324,46 @@ class HttpApi:
     async def _texts(self, request: Request) -> Response:
         return json_response({"texts": self._served.texts(self._vehicle_of(request).system_id)})
 
+    async def _track(self, request: Request) -> Response:
+        return json_response({"points": self._served.track(self._vehicle_of(request).system_id)})
+
     async def _mission(self, request: Request) -> Response:
+        mission, age_s = await self._plan(request, "mission")
+        current = self._vehicle_of(request).mission.current.latest
+        return json_response({"items": _items(mission), "current": current, "age_s": age_s})
+
+    async def _fence(self, request: Request) -> Response:
+        fence, age_s = await self._plan(request, "fence")
+        return json_response({**to_jsonable(fence), "age_s": age_s})
+
+    async def _rally(self, request: Request) -> Response:
+        rally, age_s = await self._plan(request, "rally")
+        return json_response({"items": _items(rally), "age_s": age_s})
+
+    async def _plan(self, request: Request, kind: str) -> tuple[Any, float]:
         vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
-            if is_new or not self._has_mission(vehicle):
-                self._missions[vehicle] = (await vehicle.mission.download(), vehicle.connection.now())
-            mission, read_at = self._missions[vehicle]
-        items = [
-            {"index": index, "name": item.name, "position": to_jsonable(item.position), **to_jsonable(item)}
-            for index, item in enumerate(mission)
-        ]
-        age_s = to_jsonable(vehicle.connection.now() - read_at)
-        return json_response({"items": items, "current": vehicle.mission.current.latest, "age_s": age_s})
+            known = self._plans.get((vehicle, kind))
+            # The vehicle reports how many items its mission has; MAVLink does not report other changes.
+            count = vehicle.mission.count.latest if kind == "mission" else None
+            if known is None or is_new or count not in (None, len(known[0].to_items())):
+                read = await getattr(vehicle, kind).download()
+                known = self._plans[vehicle, kind] = read, vehicle.connection.now()
+        return known[0], to_jsonable(vehicle.connection.now() - known[1])
 
-    def _has_mission(self, vehicle: Vehicle) -> bool:
-        # Detects a changed number of items only; MAVLink does not report other changes.
-        mission, _ = self._missions.get(vehicle, (None, 0.0))
-        count = vehicle.mission.count.latest
-        return mission is not None and count in (None, len(mission))
+    def _on_message(self, message: dict[str, Any]) -> None:
+        # An upload changes the plans, even if it failed half-way.
+        if message["type"] == "order" and message["order"] == "mission/upload":
+            for vehicle, kind in tuple(self._plans):
+                if vehicle.system_id == message["system_id"]:
+                    del self._plans[vehicle, kind]
 
     async def _parameters(self, request: Request) -> Response:
         vehicle, is_new = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
             table = await vehicle.parameters.download(refresh=is_new)
-        return json_response({"parameters": [to_jsonable(table[name]) for name in sorted(table)]})
+        metadata = vehicle.parameters.metadata or self._metadata
+        return json_response({"parameters": [_parameter(table[name], metadata) for name in sorted(table)]})
 
     async def _parameter(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
@@ -344,7 +383,8 @@ class HttpApi:
 
     async def _run_order(self, kind: OrderType, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
-        waits, arguments = query_flag(request, "wait", default=True), await read_body(request)
+        waits = query_flag(request, "wait", default=True)
+        arguments = await read_body(request, kind.max_body_size)
         kind.check(arguments)
         if kind is SET_PARAMETER:
             arguments["name"] = request.path_params["name"]
@@ -372,6 +412,23 @@ class HttpApi:
     def _lock(self, vehicle: Vehicle) -> asyncio.Lock:
         # One transfer at a time; concurrent requests share its result.
         return self._locks.setdefault(vehicle, asyncio.Lock())
+
+
+def _items(items: Iterable[MissionItem]) -> list[dict[str, Any]]:
+    return [
+        {"index": index, "name": item.name, "position": to_jsonable(item.position), **to_jsonable(item)}
+        for index, item in enumerate(items)
+    ]
+
+
+def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any]:
+    known = None if metadata is None else metadata.get(parameter.name)
+    if known is None:
+        return dict(to_jsonable(parameter))
+    default = known.default if parameter.default is None else parameter.default
+    about = {name: to_jsonable(getattr(known, name)) for name in _METADATA}
+    about |= {"default": to_jsonable(default), "meaning": known.describe(parameter.value)}
+    return {**to_jsonable(parameter), **about}
 
 
 async def _wait_ended(record: OrderRecord, timeout_s: float | None) -> None:

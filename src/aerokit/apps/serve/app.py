@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.connection.connection import Connection
+    from aerokit.parameters import Metadata
     from aerokit.vehicle.vehicle import Vehicle
 
 STATIC = Path(__file__).parent / "static"
@@ -43,12 +44,13 @@ class ServeApp:
         token: str,
         settings: dict[str, Any],
         hosts: Collection[str],
+        metadata: Metadata | None = None,
     ) -> None:
         self.token = token
         """Token that orders need; also reading, unless ``open_reading``."""
         self._access = access
         self._served, self._orders = served, OrderRunner(served)
-        api = HttpApi(served, self._orders, access, settings)
+        api = HttpApi(served, self._orders, access, settings, metadata)
         stream = StateStream(served, self._orders, access)
         operations = api.operations()
         app = Starlette(
@@ -96,6 +98,7 @@ def make_app(
     hosts: Collection[str] = (),
     tiles: str | None = None,
     attribution: str = "",
+    metadata: Metadata | None = None,
 ) -> ServeApp:
     """Make an ASGI application that serves vehicles, to be mounted or run with uvicorn in the running loop.
 
@@ -108,6 +111,8 @@ def make_app(
         hosts: host names that browsers may use, besides ``localhost`` and IP addresses.
         tiles: URL template of a tile server, ``https://tiles.example/{z}/{x}/{y}.png``; None: no tiles.
         attribution: attribution of the tiles, shown on the map.
+        metadata: units, ranges and descriptions of parameters (:func:`aerokit.parameters.load_metadata`), for vehicles
+            that have no own ones.
 
     Raises:
         InvalidArgument: an argument is invalid.
@@ -122,7 +127,7 @@ def make_app(
         "tiles": tiles,
         "attribution": attribution,
     }
-    return ServeApp(ServedVehicles(source), access, token, settings, hosts)
+    return ServeApp(ServedVehicles(source), access, token, settings, hosts, metadata)
 
 
 def _static_routes() -> list[Route]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 import logging
 import re
 from collections import OrderedDict
@@ -10,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import to_jsonable
-from aerokit.apps.serve.requests import HttpProblem, problem_of
+from aerokit.apps.serve.requests import MAX_BODY_SIZE, MAX_PLAN_SIZE, HttpProblem, problem_of
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import BusyError, HeartbeatTimeout, InvalidArgument
 from aerokit.events import LinkState
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from aerokit.apps.serve.served_vehicles import ServedVehicles
+    from aerokit.missions import Plan
     from aerokit.vehicle.vehicle import Vehicle
 
 logger: logging.Logger = logging.getLogger("aerokit")
@@ -48,7 +51,8 @@ class OrderArgument:
 class OrderType:
     """One type of order: its arguments, and the function that runs it.
 
-    ``is_safe``: it brings the vehicle to rest, and is therefore tried on a silent vehicle too.
+    ``is_safe``: it brings the vehicle to rest, and is therefore tried on a silent vehicle too. ``parse`` converts the
+    arguments to those that are recorded, and those that ``run`` gets.
     """
 
     name: str
@@ -56,6 +60,8 @@ class OrderType:
     run: Callable[[Vehicle, dict[str, Any]], Awaitable[object]]
     arguments: Mapping[str, OrderArgument] = field(default_factory=dict)
     is_safe: bool = False
+    parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = lambda a: (dict(a), dict(a))
+    max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
         """Check the names of arguments; raise InvalidArgument. The library checks the values."""
@@ -79,6 +85,35 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any]) -> object:
     return await vehicle.parameters.set(values["name"], values["value"])
 
 
+async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
+    plan: Plan = values["plan"]
+    plan.fence.check()
+    plan.rally.check()
+    if plan.mission.items:
+        await vehicle.mission.upload(plan.mission)
+    if plan.fence.to_items():
+        await vehicle.fence.upload(plan.fence)
+    if len(plan.rally):
+        await vehicle.rally.upload(plan.rally)
+
+
+def _read_plan(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    from aerokit.missions import parse_plan
+
+    text = json.dumps(values["plan"])
+    name = values.get("name")
+    name = name[:100] if isinstance(name, str) else "plan"
+    plan = parse_plan(text, name)
+    counts = {
+        "mission_items": len(plan.mission),
+        "fence_items": len(plan.fence.to_items()),
+        "rally_points": len(plan.rally),
+    }
+    if not any(counts.values()):
+        raise InvalidArgument(f"{name} has no mission items, fence or rally points; nothing was sent")
+    return {"name": name, **counts, "sha256": hashlib.sha256(text.encode()).hexdigest()}, {"plan": plan}
+
+
 _POSITION = {
     "latitude_deg": OrderArgument("number", "degrees, WGS 84", True),
     "longitude_deg": OrderArgument("number", "degrees, WGS 84", True),
@@ -94,6 +129,10 @@ _ALTITUDE = {"altitude_m": OrderArgument("number", "metres above home, above 0, 
 _MODE = {"mode": OrderArgument(("string", "integer"), "the autopilot's name or number of the mode", True)}
 _ITEM = {"item": OrderArgument("integer", "first item, counted from 0 (0)")}
 _VALUE = {"value": OrderArgument("number", "finite", True)}
+_PLAN = {
+    "plan": OrderArgument("object", "content of a QGroundControl .plan file", True),
+    "name": OrderArgument("string", "name of the file, for the list of orders"),
+}
 
 ORDERS = (
     OrderType("arm", "Arm the motors: propellers may start to turn", lambda v, a: v.arm()),
@@ -104,6 +143,14 @@ ORDERS = (
     OrderType("land", "Land at the current position", lambda v, a: v.land(), is_safe=True),
     OrderType("return_to_launch", "Return to the launch position", lambda v, a: v.return_to_launch(), is_safe=True),
     OrderType("mode", "Change the flight mode", lambda v, a: v.set_mode(a["mode"]), _MODE),
+    OrderType(
+        "mission/upload",
+        "Replace the mission; the fence and rally points too, if the plan has them",
+        _upload,
+        _PLAN,
+        parse=_read_plan,
+        max_body_size=MAX_PLAN_SIZE,
+    ),
     OrderType("mission/start", "Fly the mission", lambda v, a: v.mission.start(**a), _ITEM),
     OrderType("mission/pause", "Pause the mission", lambda v, a: v.mission.pause(), is_safe=True),
     OrderType("mission/resume", "Resume the mission", lambda v, a: v.mission.resume()),
@@ -151,6 +198,7 @@ class OrderRunner:
 
         Raises:
             HttpProblem: the key is missing, or was used for another order; the client has seen an old state.
+            FileFormatError, InvalidArgument: the arguments cannot be parsed.
             BusyError: too many orders are running.
             HeartbeatTimeout: the vehicle is silent.
             ConnectionClosed, LinkLost: the connection has ended.
@@ -161,15 +209,16 @@ class OrderRunner:
                 "KeyMissing",
                 "an order needs a unique Idempotency-Key header: 8 to 64 characters of A-Z a-z 0-9 . _ ~ -",
             )
+        shown, arguments = kind.parse(arguments)
         before = self._records.get(key)
-        if before is not None and before.is_same(vehicle.system_id, kind.name, arguments):
+        if before is not None and before.is_same(vehicle.system_id, kind.name, shown):
             return before
         if before is not None or key in self._used_keys:
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
         self._check(vehicle, kind, seen_at_s)
-        record = OrderRecord(key, vehicle.system_id, kind.name, arguments, vehicle.connection.unix_time())
+        record = OrderRecord(key, vehicle.system_id, kind.name, shown, vehicle.connection.unix_time())
         self._store(record)
-        self._background.start(lambda: self._run(vehicle, kind, record), f"aerokit serve {kind.name}")
+        self._background.start(lambda: self._run(vehicle, kind, record, arguments), f"aerokit serve {kind.name}")
         self._publish(record)
         return record
 
@@ -220,9 +269,9 @@ class OrderRunner:
         while len(self._used_keys) > MAX_USED_KEYS:
             self._used_keys.popitem(last=False)
 
-    async def _run(self, vehicle: Vehicle, kind: OrderType, record: OrderRecord) -> None:
+    async def _run(self, vehicle: Vehicle, kind: OrderType, record: OrderRecord, arguments: dict[str, Any]) -> None:
         try:
-            record.result = to_jsonable(await kind.run(vehicle, dict(record.arguments)))
+            record.result = to_jsonable(await kind.run(vehicle, arguments))
             record.state = "done"
         except asyncio.CancelledError:
             record.state = "failed"

@@ -13,6 +13,7 @@ from aerokit.errors import (
     AerokitError,
     BusyError,
     ConnectionClosed,
+    FileFormatError,
     HeartbeatTimeout,
     InvalidArgument,
     LinkError,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 # Error class to HTTP status; the first match counts.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (InvalidArgument, 400),
+    (FileFormatError, 400),
     (HeartbeatTimeout, 503),
     (LinkError, 503),
     (ConnectionClosed, 503),
@@ -38,6 +40,8 @@ _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (RemoteProtocolError, 502),
 )
 MAX_BODY_SIZE = 16_384
+MAX_PLAN_SIZE = 1_000_000
+"""Limit for a body with a mission."""
 BODY_TIMEOUT_S = 10.0
 
 
@@ -90,14 +94,14 @@ def json_response(
     return Response(text, status, {"Cache-Control": "no-store", **(headers or {})}, media_type)
 
 
-async def read_body(request: Request) -> dict[str, Any]:
+async def read_body(request: Request, max_size: int = MAX_BODY_SIZE) -> dict[str, Any]:
     """Read the JSON object in the body; an empty body is an empty object.
 
     Raises:
         HttpProblem: 400 not a JSON object, 408 timed out, 413 too large, 415 not declared as JSON.
     """
     try:
-        data = await asyncio.wait_for(_read(request), BODY_TIMEOUT_S)
+        data = await asyncio.wait_for(_read(request, max_size), BODY_TIMEOUT_S)
     except asyncio.TimeoutError:
         raise HttpProblem(
             408, "BodyTimeout", f"the body was not received within {BODY_TIMEOUT_S:g} s; nothing was sent"
@@ -117,12 +121,12 @@ async def read_body(request: Request) -> dict[str, Any]:
     return found
 
 
-async def _read(request: Request) -> bytes:
+async def _read(request: Request, max_size: int) -> bytes:
     data = bytearray()
     async for part in request.stream():
         data += part
-        if len(data) > MAX_BODY_SIZE:
-            raise HttpProblem(413, "TooLarge", f"the body is larger than {MAX_BODY_SIZE} bytes; nothing was sent")
+        if len(data) > max_size:
+            raise HttpProblem(413, "TooLarge", f"the body is larger than {max_size} bytes; nothing was sent")
     return bytes(data)
 
 

@@ -8,17 +8,21 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
+import anyio
+
 from aerokit._internal.formatting import to_jsonable
+from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.requests import HttpProblem
 from aerokit.connection.connection import Connection
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import InvalidArgument
-from aerokit.events import Event, LinkReport, StatusTextReceived
+from aerokit.events import Event, LinkReport, LinkState, StatusTextReceived
 from aerokit.vehicle.connect import vehicles_on
 from aerokit.vehicle.vehicle import Vehicle, overview
 
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
+    from aerokit.position import Position
 
 Listener = Callable[[dict[str, Any]], object]
 
@@ -27,10 +31,17 @@ MAX_TEXTS = 200
 """For each vehicle."""
 SNAPSHOT_MAX_AGE_S = 0.05
 """Requests within this time share one snapshot."""
+MAX_TRACK_POINTS = 2000
+"""For each vehicle. A full track loses every second point, so that it still covers the whole flight."""
+TRACK_INTERVAL_S = 0.2
+MIN_TRACK_STEP_M = 0.5
+TRACK_GAP_S = 3.0
+PREARM_TEXT_MAX_AGE_S = 35.0
+"""ArduPilot repeats every 30 s why it does not arm."""
 
 
 class ServedVehicles:
-    """Follows the vehicles of a source, and keeps their recent events and texts. Requests nothing from a vehicle.
+    """Follows the vehicles of a source, and keeps their recent events, texts and tracks. Requests nothing from them.
 
     ``source``: a connection, whose vehicles are added as they appear; one vehicle; or a mapping from system id
     to vehicle, which may grow.
@@ -39,6 +50,7 @@ class ServedVehicles:
     def __init__(self, source: Connection | Vehicle | Mapping[int, Vehicle]) -> None:
         self.events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)
         self._texts: dict[int, deque[dict[str, Any]]] = {}
+        self._tracks: dict[int, list[tuple[Position, bool]]] = {}
         self._listeners: list[Listener] = []
         self._attached: dict[Connection, list[Detach]] = {}
         self._count = 0
@@ -57,6 +69,7 @@ class ServedVehicles:
         else:
             raise InvalidArgument(f"source = {source!r} is not a connection, a vehicle or a mapping of vehicles")
         self._attach_new()
+        self._background.start(self._record_tracks, "aerokit serve tracks")
 
     @property
     def vehicles(self) -> Mapping[int, Vehicle]:
@@ -76,11 +89,16 @@ class ServedVehicles:
     def texts(self, system_id: int) -> list[dict[str, Any]]:
         return list(self._texts.get(system_id, ()))
 
+    def track(self, system_id: int) -> list[tuple[float, float, bool]]:
+        """Return where the vehicle was, the oldest first: latitude, longitude, True for the first one after a gap."""
+        points = self._tracks.get(system_id, ())
+        return [(at.latitude_deg, at.longitude_deg, is_after_gap) for at, is_after_gap in points]
+
     def snapshot(self) -> str:
         """Return the current state of all vehicles, as a JSON ``state`` message of the stream."""
         now = asyncio.get_running_loop().time()
         if self._snapshot is None or now - self._snapshot[0] > SNAPSHOT_MAX_AGE_S:
-            vehicles = [_state_of(vehicle) for vehicle in self.vehicles.values()]
+            vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]
             message = {"type": "state", "at_s": now, "vehicles": vehicles}
             self._snapshot = now, json.dumps(message, ensure_ascii=False, allow_nan=False)
         return self._snapshot[1]
@@ -130,15 +148,39 @@ class ServedVehicles:
             texts.append({"time_unix_s": unix_s, "severity": event.severity, "text": event.text})
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
+    async def _record_tracks(self) -> None:
+        silent: set[int] = set()
+        while True:
+            for system_id, vehicle in tuple(self._vehicles.items()):
+                position, track = vehicle.position.latest, self._tracks.setdefault(system_id, [])
+                if position is None or vehicle.position.age > TRACK_GAP_S:
+                    silent.add(system_id)
+                elif not track or track[-1][0].distance_to(position) >= MIN_TRACK_STEP_M:
+                    if len(track) >= MAX_TRACK_POINTS:
+                        del track[1::2]
+                    track.append((position, system_id in silent))
+                    silent.discard(system_id)
+            await anyio.sleep(TRACK_INTERVAL_S)
 
-def _state_of(vehicle: Vehicle) -> dict[str, Any]:
-    """Return the overview of a vehicle, with mission items numbered like the mission.
+    def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
+        """Return the overview of a vehicle, with what it lacks for flight and mission items numbered like the mission.
 
-    The state ``mission_current`` is numbered as on the wire, where ArduPilot counts home as item 0.
-    """
-    mission = vehicle.mission
-    return {
-        **overview(vehicle),
-        "mission_item": mission.current.latest,
-        "mission_items": mission.count.latest,
-    }
+        The state ``mission_current`` is numbered as on the wire, where ArduPilot counts home as item 0.
+        """
+        mission = vehicle.mission
+        return {
+            **overview(vehicle),
+            "missing_for_flight": self._missing_for_flight(vehicle),
+            "failsafe": ground_station_failsafe(vehicle),
+            "mission_item": mission.current.latest,
+            "mission_items": mission.count.latest,
+        }
+
+    def _missing_for_flight(self, vehicle: Vehicle) -> list[str]:
+        missing = vehicle.missing_for_flight()
+        if not missing or vehicle.link_state.latest is not LinkState.CONNECTED:
+            return missing
+        since = vehicle.connection.unix_time() - PREARM_TEXT_MAX_AGE_S
+        recent = [each["text"] for each in self.texts(vehicle.system_id) if each["time_unix_s"] >= since]
+        said = (vehicle.autopilot.arming_reason(text) for text in recent)
+        return list(dict.fromkeys([*filter(None, said), *missing]))

@@ -13,9 +13,10 @@ export function drawAttitude(canvas, attitude, isOld) {
   pen.arc(0, 0, radius, 0, 7);
   pen.clip();
   if (!attitude || typeof attitude.roll_deg !== "number" || typeof attitude.pitch_deg !== "number") {
-    pen.fillStyle = "#1c2635";
+    const style = getComputedStyle(canvas);
+    pen.fillStyle = style.getPropertyValue("--no-attitude");
     pen.fillRect(-radius, -radius, 2 * radius, 2 * radius);
-    pen.fillStyle = "#8fa0b5";
+    pen.fillStyle = style.getPropertyValue("--dim");
     pen.font = "22px system-ui, sans-serif";
     pen.textAlign = "center";
     pen.fillText("—", 0, 7);

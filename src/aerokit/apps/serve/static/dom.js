@@ -14,6 +14,7 @@ export function element(tag, properties = {}, ...children) {
 
 export const byId = (id) => document.getElementById(id);
 export const UNKNOWN = "—";
+export const SEVERITIES = ["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"]; // MAV_SEVERITY
 
 export function number(value, digits = 1, unit = "") {
   if (typeof value !== "number" || !Number.isFinite(value)) return UNKNOWN;
@@ -45,8 +46,11 @@ export function age(seconds) {
 // Class of a value that is normally updated at least once a second, by its age.
 export function staleness(seconds) {
   if (seconds === undefined || seconds === null) return "unknown";
-  return seconds > 10 ? "very-old" : seconds > 3 ? "old" : "";
+  return seconds > 3 ? "old" : "";
 }
+
+// A name of an enumeration in lower case: "ON_GROUND" becomes "on ground".
+export const spelled = (name) => ({ MC: "multicopter", FW: "fixed wing" })[name] ?? name.toLowerCase().replaceAll("_", " ");
 
 export function clock(unixSeconds) {
   return new Date(unixSeconds * 1000).toLocaleTimeString([], { hour12: false });

@@ -5,8 +5,9 @@ import { age, byId, element, number, show } from "./dom.js";
 import { colourOf, MapView } from "./map.js";
 import { Orders } from "./orders.js";
 import { currentItem, MissionPanel, OrderPanel, orderText, ParameterPanel, TextPanel } from "./panels.js";
+import { inWords, isConnected, showReadiness, showSilences } from "./readiness.js";
 import { ask, hasToken, openStream, useToken } from "./server.js";
-import { ageOf, BigValues, StateTable } from "./state.js";
+import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
 
 const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSeconds: null, isOpen: false, isReadOnly: false, modesOf: undefined };
 const selected = () => page.vehicles.get(page.selected);
@@ -14,7 +15,7 @@ const selected = () => page.vehicles.get(page.selected);
 const map = new MapView(byId("map"), (place) => { pick(false); orders.goTo(place, heightNow()); });
 const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();
-const missions = new MissionPanel(draw);
+const missions = new MissionPanel(draw, (file) => orders.upload(file));
 const texts = new TextPanel();
 const orderList = new OrderPanel();
 const orders = new Orders(byId("orders"), {
@@ -61,7 +62,7 @@ function showVehicles() {
   if (box.dataset.ids !== ids.join()) {
     box.dataset.ids = ids.join();
     box.replaceChildren(...ids.map((id) => {
-      const button = element("button", { type: "button", class: "vehicle", onclick: () => choose(id) }, element("span", { class: "dot" }), element("span", {}));
+      const button = element("button", { type: "button", class: "vehicle", onclick: () => choose(id) }, element("span", { class: "dot" }), element("span", {}), element("small", {}));
       button.dataset.id = id;
       return button;
     }));
@@ -70,9 +71,45 @@ function showVehicles() {
     const vehicle = page.vehicles.get(Number(button.dataset.id));
     const state = page.isOpen ? vehicle.link.state : "lost";
     show(button.children[1], `${vehicle.system_id} ${vehicle.firmware}`);
+    show(button.children[2], summary(vehicle, state));
     if (button.children[0].className !== `dot ${state}`) button.children[0].className = `dot ${state}`;
     button.title = `link ${state}`;
     button.setAttribute("aria-pressed", String(vehicle.system_id === page.selected));
+  }
+}
+
+// The values by which several vehicles are compared.
+function summary(vehicle, state) {
+  if (state !== "connected") return state;
+  const { mode, armed, position, batteries } = vehicle.states;
+  const charge = batteries?.value?.[0]?.remaining_percent;
+  return [
+    mode?.value?.name, armed?.value ? number(position?.value?.altitude_relative_m, 0, "m") : "disarmed",
+    typeof charge === "number" ? `${charge} %` : null,
+  ].filter(Boolean).join(" · ");
+}
+
+const silent = new Set();
+
+function addToTrack(id, entry) {
+  if (!entry || entry.age_s > 3) silent.add(id);
+  else map.addPoint(id, entry.value, silent.delete(id));
+}
+
+async function loadTrack(id) {
+  try {
+    map.loadTrack(id, (await ask("GET", `api/vehicles/${id}/track`)).points);
+  } catch { /* the track begins now */ }
+}
+
+// Reads the parameters that say what the failsafe does, before the link is lost.
+const asked = new Set();
+
+function loadFailsafe(vehicle) {
+  for (const name of isConnected(vehicle) ? vehicle.failsafe.unread : []) {
+    const key = `${vehicle.system_id} ${name}`;
+    if (!asked.has(key)) ask("GET", `api/vehicles/${vehicle.system_id}/parameters/${name}`).catch(() => {});
+    asked.add(key);
   }
 }
 
@@ -95,12 +132,27 @@ function onMap(vehicle) {
   const { position, heading_deg, home, mode } = vehicle.states;
   const height = position && number(position.value.altitude_relative_m, 1, "m");
   const old = ageOf(position, page.receivedAt);
-  const label = [vehicle.system_id, mode && mode.value && mode.value.name, height, old > 3 ? `${age(old)} old` : null];
+  const last = old > 3 ? `${age(old)} old` : height;
+  const label = [vehicle.system_id, mode && mode.value && mode.value.name, height, old > 3 ? last : null];
   return {
     id: vehicle.system_id, position: position && position.value, heading: heading_deg && heading_deg.value,
-    age: old, home: home && home.value, label: label.filter(Boolean).join(" · "),
+    age: old, home: home && home.value, labels: [label, [vehicle.system_id, last], [vehicle.system_id]].map((parts) => parts.filter(Boolean).join(" · ")),
   };
 }
+
+// A .plan file dropped anywhere is uploaded to the selected vehicle, after confirmation.
+window.addEventListener("dragover", (event) => {
+  event.preventDefault();
+  byId("drop").hidden = !selected() || page.isReadOnly;
+  show(byId("drop"), `Drop a .plan file to upload it to vehicle ${page.selected}`);
+});
+window.addEventListener("dragleave", (event) => { if (!event.relatedTarget) byId("drop").hidden = true; });
+window.addEventListener("drop", (event) => {
+  event.preventDefault();
+  byId("drop").hidden = true;
+  const file = event.dataTransfer.files[0];
+  if (file && !page.isReadOnly) orders.upload(file);
+});
 
 byId("zoom-in").onclick = () => map.zoom(1.5);
 byId("zoom-out").onclick = () => map.zoom(1 / 1.5);
@@ -121,15 +173,18 @@ function draw() {
 function drawNow() {
   const vehicle = selected();
   showVehicles();
+  showSilences(byId("silences"), page);
+  showReadiness(byId("readiness"), vehicle, page);
   big.show(vehicle, page.receivedAt);
   tab.show(vehicle, page.receivedAt);
   const attitude = vehicle && vehicle.states.attitude;
   drawAttitude(byId("attitude"), attitude && attitude.value, ageOf(attitude, page.receivedAt) > 3);
   const going = orderList.running(page.selected, "go_to");
   const plan = { items: missions.items(page.selected), current: vehicle ? currentItem(vehicle) : null };
-  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, going && going.arguments);
+  map.draw([...page.vehicles.values()].map(onMap), page.selected, plan, going && going.arguments, missions.fence(page.selected));
   byId("follow").setAttribute("aria-pressed", String(map.follows !== null));
-  orders.enable(page.isOpen && !page.isReadOnly && Boolean(vehicle));
+  orders.enable(vehicle, page);
+  showServer();
 }
 
 function toast(text, kind) {
@@ -144,12 +199,13 @@ function record(order, isNew = true) {
   const before = orderList.records.get(order.key);
   if (before && before.state !== "running") return;
   orderList.record(order);
+  if (isNew && order.state !== "running" && order.order === "mission/upload") missions.reload(order.system_id);
   if (order.state !== "running" && order.order === "set_parameter" && order.result) {
     parameters.changed(order.system_id, order.arguments.name, order.result.value);
   }
   if (isNew && !announced.has(order.key + order.state)) {
     announced.add(order.key + order.state);
-    const why = order.problem ? `: ${order.problem.detail}` : "";
+    const why = order.problem ? `: ${inWords(order.problem)}` : "";
     toast(`Vehicle ${order.system_id}: ${orderText(order)}: ${order.state === "running" ? "ordered" : order.state}${why}`, order.state);
   }
   draw();
@@ -161,8 +217,10 @@ function onMessage(message) {
   if (message.type === "state") {
     page.receivedAt = performance.now();
     page.atSeconds = message.at_s;
+    for (const { system_id } of message.vehicles) if (!page.vehicles.has(system_id)) loadTrack(system_id);
     page.vehicles = new Map(message.vehicles.map((each) => [each.system_id, each]));
-    for (const each of message.vehicles) if (each.states.position) map.addPoint(each.system_id, each.states.position.value);
+    message.vehicles.forEach(loadFailsafe);
+    for (const { system_id, states } of message.vehicles) addToTrack(system_id, states.position);
     if (page.selected === undefined && page.vehicles.size) choose(Math.min(...page.vehicles.keys()));
     else if (selected() && page.modesOf !== page.selected) loadModes(page.selected);
   } else if (message.type === "event") {
@@ -200,16 +258,20 @@ function askToken(banner) {
 
 function showServer() {
   const isFresh = page.isOpen && performance.now() - page.receivedAt < 3000;
-  const text = !page.isOpen ? "no connection" : !isFresh ? "no data" : page.isReadOnly ? "read-only" : "live";
-  show(byId("server"), text, `pill ${isFresh ? "good" : "bad"}`);
+  const silent = [...page.vehicles.values()].filter((each) => !isConnected(each));
+  const loss = page.vehicles.size === 1 ? "vehicle silent" : `${silent.length} of ${page.vehicles.size} silent`;
+  const text = !page.isOpen ? "no connection" : !isFresh ? "no data" : silent.length ? loss : page.vehicles.size ? "live" : "no vehicle";
+  const isRestricted = isFresh && page.isReadOnly;
+  show(byId("server"), isRestricted ? `read-only · ${text}` : text, `pill ${text === "live" ? "good" : text === "no vehicle" ? "" : "bad"}`);
 }
 
 ask("GET", "api").then((about) => {
   map.tiles = about.tiles;
+  Object.assign(bitNames, about.bits);
   show(byId("attribution"), about.tiles ? about.attribution : "");
   byId("server").title = `aerokit ${about.aerokit}`;
 }).catch(() => {});
 open(table);
 openStream({ message: onMessage, opened, closed });
-setInterval(() => { showServer(); draw(); }, 500);
+setInterval(draw, 500);
 window.addEventListener("resize", draw);

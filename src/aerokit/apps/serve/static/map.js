@@ -1,7 +1,9 @@
 // The map: a plane in metres around the first known position, drawn on a canvas; tiles only if a server is configured.
 
-export const COLOURS = ["#4cc2ff", "#ffb84d", "#8ee07f", "#ff7eb6", "#c79bff", "#ffe066", "#5ee6d0", "#ff9e80"];
-export const colourOf = (id) => COLOURS[(id - 1) % COLOURS.length];
+// Colours are those of page.css, which has them for light and dark.
+let style = getComputedStyle(document.documentElement);
+const colour = (name) => style.getPropertyValue(`--${name}`).trim();
+export const colourOf = (id) => colour(`vehicle-${(id - 1) % 8}`);
 const METRES_PER_DEGREE = 111195;
 const MAX_POINTS = 5000;
 const MAX_AGE_S = 3;
@@ -50,13 +52,19 @@ export class MapView {
 
   place(position) { return this.toScreen(this.toPlane(position.latitude_deg, position.longitude_deg)); }
 
-  addPoint(id, position) {
+  // gap: where the vehicle was before this point is unknown
+  addPoint(id, position, gap) {
     const track = this.tracks.get(id) || [];
     this.tracks.set(id, track);
     const point = this.toPlane(position.latitude_deg, position.longitude_deg);
     const last = track[track.length - 1];
-    if (!last || Math.hypot(point.x - last.x, point.y - last.y) > 0.3) track.push(point);
+    if (!last || Math.hypot(point.x - last.x, point.y - last.y) > 0.3) track.push({ ...point, gap });
     if (track.length > MAX_POINTS) track.splice(0, MAX_POINTS / 5);
+  }
+
+  // points: [latitude, longitude, gap] from the server, before those that have been added here
+  loadTrack(id, points) {
+    this.tracks.set(id, [...points.map(([latitude, longitude, gap]) => ({ ...this.toPlane(latitude, longitude), gap })), ...(this.tracks.get(id) || [])]);
   }
 
   zoom(factor, x = this.width / 2, y = this.height / 2) {
@@ -124,8 +132,10 @@ export class MapView {
     }, { passive: false });
   }
 
-  // vehicles: [{id, position, heading, age, label, home}], plan: {items, current}, target: {position}
-  draw(vehicles, selected, plan, target) {
+  // vehicles: [{id, position, heading, age, labels, home}], plan: {items, current}, target: {position},
+  // fence: {polygons, circles, rally}
+  draw(vehicles, selected, plan, target, fence) {
+    style = getComputedStyle(document.documentElement);
     const box = this.canvas.getBoundingClientRect();
     const ratio = window.devicePixelRatio || 1;
     [this.width, this.height] = [box.width, box.height];
@@ -133,10 +143,13 @@ export class MapView {
     if (this.canvas.width !== wide || this.canvas.height !== tall) [this.canvas.width, this.canvas.height] = [wide, tall];
     const pen = this.context;
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.fillStyle = "#0f1620";
+    pen.fillStyle = colour("map");
     pen.fillRect(0, 0, this.width, this.height);
     const items = plan.items.filter((item) => item.position);
-    const places = [...vehicles.flatMap((each) => [each.position, each.home]), ...items.map((item) => item.position)].filter(Boolean);
+    const places = [...vehicles.flatMap((each) => [each.position, each.home]), ...items.map((item) => item.position),
+      ...fence.polygons.flatMap((each) => each.vertices), ...fence.rally].filter(Boolean);
+    // What labels must not cover, as [left, top, right, bottom]: the buttons and the scale, then what is drawn.
+    this.taken = [[this.width - 52, 0, this.width, 170], [0, this.height - 40, 40 + this.step() * this.scale, this.height]];
     if (!places.length) return this.drawNothing();
     const followed = vehicles.find((each) => each.id === this.follows && each.position);
     if (followed) this.centre = this.toPlane(followed.position.latitude_deg, followed.position.longitude_deg);
@@ -144,17 +157,20 @@ export class MapView {
     if (this.tiles) this.drawTiles();
     this.drawGrid();
     for (const [id, track] of this.tracks) this.drawTrack(track, colourOf(id), id === selected);
+    this.drawFence(fence);
     this.drawPlan(items, plan.current, colourOf(selected || 1));
     for (const each of vehicles) if (each.home) this.drawHome(each.home, colourOf(each.id));
     const chosen = vehicles.find((each) => each.id === selected);
     if (target) this.drawTarget(target, chosen);
-    for (const each of vehicles) if (each.position) this.drawVehicle(each, each.id === selected);
+    const drawn = vehicles.filter((each) => each.position).sort((a, b) => (a.id === selected) - (b.id === selected));
+    for (const each of drawn) this.drawVehicle(each, each.id === selected);
+    for (const each of drawn.reverse()) this.label(each);
     this.drawScale();
     return undefined;
   }
 
   drawNothing() {
-    this.context.fillStyle = "#8fa0b5";
+    this.context.fillStyle = colour("dim");
     this.context.font = "14px system-ui, sans-serif";
     this.context.textAlign = "center";
     this.context.fillText("no position known", this.width / 2, this.height / 2);
@@ -171,42 +187,77 @@ export class MapView {
     pen.lineWidth = 1;
     for (let x = Math.ceil(first.x / step); x * step <= last.x; x++) {
       const at = this.toScreen({ x: x * step, y: 0 }).x;
-      this.line([{ x: at, y: 0 }, { x: at, y: this.height }], this.tiles ? "#ffffff22" : x % 5 ? "#1a2431" : "#263446");
+      this.line([{ x: at, y: 0 }, { x: at, y: this.height }], colour(this.tiles ? "grid-on-tiles" : x % 5 ? "grid" : "grid-5"));
     }
     for (let y = Math.ceil(first.y / step); y * step <= last.y; y++) {
       const at = this.toScreen({ x: 0, y: y * step }).y;
-      this.line([{ x: 0, y: at }, { x: this.width, y: at }], this.tiles ? "#ffffff22" : y % 5 ? "#1a2431" : "#263446");
+      this.line([{ x: 0, y: at }, { x: this.width, y: at }], colour(this.tiles ? "grid-on-tiles" : y % 5 ? "grid" : "grid-5"));
     }
   }
 
-  line(points, colour, dash = []) {
+  line(points, stroke, dash = []) {
     const pen = this.context;
     pen.beginPath();
-    points.forEach((each, index) => (index ? pen.lineTo(each.x, each.y) : pen.moveTo(each.x, each.y)));
-    pen.strokeStyle = colour;
+    points.forEach((each, index) => (index && !each.gap ? pen.lineTo(each.x, each.y) : pen.moveTo(each.x, each.y)));
+    pen.strokeStyle = stroke;
     pen.setLineDash(dash);
     pen.stroke();
     pen.setLineDash([]);
   }
 
-  drawTrack(track, colour, isSelected) {
+  drawTrack(track, stroke, isSelected) {
     this.context.lineJoin = "round";
     this.context.lineWidth = isSelected ? 2.5 : 1.5;
     this.context.globalAlpha = isSelected ? 0.9 : 0.5;
-    this.line(track.map((each) => this.toScreen(each)), colour);
+    this.line(track.map((each) => ({ ...this.toScreen(each), gap: each.gap })), stroke);
     this.context.globalAlpha = 1;
   }
 
-  drawPlan(items, current, colour) {
-    const pen = this.context, points = items.map((item) => this.place(item.position));
-    pen.lineWidth = 1.5;
-    this.line(points, "#c9d6e6aa", [6, 5]);
+  // Areas to stay inside of are outlined, areas to stay out of are filled.
+  drawFence({ polygons, circles, rally }) {
+    const pen = this.context;
+    pen.lineWidth = 2;
+    const area = (inclusion) => {
+      pen.fillStyle = pen.strokeStyle = colour(inclusion ? "good" : "bad");
+      pen.setLineDash(inclusion ? [10, 4] : []);
+      pen.stroke();
+      pen.setLineDash([]);
+      pen.globalAlpha = 0.18;
+      if (!inclusion) pen.fill();
+      pen.globalAlpha = 1;
+    };
+    for (const { vertices, inclusion } of polygons) {
+      pen.beginPath();
+      for (const each of vertices.map((vertex) => this.place(vertex))) pen.lineTo(each.x, each.y);
+      pen.closePath();
+      area(inclusion);
+    }
+    for (const { center, radius_m, inclusion } of circles) {
+      const at = this.place(center);
+      pen.beginPath();
+      pen.arc(at.x, at.y, radius_m * this.scale, 0, 7);
+      area(inclusion);
+    }
+    for (const each of rally) this.marker(this.place(each), "R", colour("map"), colour("good"), colour("good"));
+  }
+
+  drawPlan(items, current, chosen) {
+    const points = items.map((item) => this.place(item.position));
+    this.context.lineWidth = 1.5;
+    this.line(points, colour("plan"), [6, 5]);
     items.forEach((item, index) => {
       const isCurrent = item.index === current;
-      this.circle(points[index], 10, isCurrent ? colour : "#141b25", isCurrent ? "#fff" : "#c9d6e6");
-      this.text(String(item.index), points[index].x, points[index].y + 4, isCurrent ? "#04202f" : "#e8eef6", "bold 11px", "center");
+      this.marker(points[index], String(item.index), isCurrent ? chosen : colour("map"), isCurrent ? colour("text") : colour("plan"), colour(isCurrent ? "map" : "text"));
     });
   }
+
+  marker(at, text, fill, stroke, ink) {
+    this.circle(at, 10, fill, stroke);
+    this.text(text, at.x, at.y + 4, ink, "bold 11px", "center");
+    this.take(at, 11);
+  }
+
+  take(at, radius) { this.taken.push([at.x - radius, at.y - radius, at.x + radius, at.y + radius]); }
 
   circle(at, radius, fill, stroke) {
     const pen = this.context;
@@ -218,27 +269,25 @@ export class MapView {
     pen.stroke();
   }
 
-  text(text, x, y, colour, font = "12px", align = "left") {
+  text(text, x, y, ink, font = "12px", align = "left") {
     const pen = this.context;
     pen.font = `${font} system-ui, "DejaVu Sans", sans-serif`;
     pen.textAlign = align;
-    pen.fillStyle = colour;
+    pen.fillStyle = ink;
     pen.fillText(text, x, y);
   }
 
-  drawHome(home, colour) {
-    const at = this.place(home);
+  drawHome(home, ink) {
     this.context.lineWidth = 2;
-    this.circle(at, 9, "#0f1620", colour);
-    this.text("H", at.x, at.y + 4, colour, "bold 11px", "center");
+    this.marker(this.place(home), "H", colour("map"), ink, ink);
   }
 
   drawTarget(position, vehicle) {
     const at = this.place(position), pen = this.context;
     pen.lineWidth = 2;
-    if (vehicle && vehicle.position) this.line([this.place(vehicle.position), at], "#ffffff88", [3, 5]);
-    this.line([{ x: at.x - 8, y: at.y }, { x: at.x + 8, y: at.y }], "#fff");
-    this.line([{ x: at.x, y: at.y - 8 }, { x: at.x, y: at.y + 8 }], "#fff");
+    if (vehicle && vehicle.position) this.line([this.place(vehicle.position), at], colour("plan"), [3, 5]);
+    this.line([{ x: at.x - 8, y: at.y }, { x: at.x + 8, y: at.y }], colour("text"));
+    this.line([{ x: at.x, y: at.y - 8 }, { x: at.x, y: at.y + 8 }], colour("text"));
     pen.beginPath();
     pen.arc(at.x, at.y, 5, 0, 7);
     pen.stroke();
@@ -248,38 +297,49 @@ export class MapView {
     const pen = this.context, at = this.place(vehicle.position), isOld = !(vehicle.age <= MAX_AGE_S);
     pen.save();
     pen.translate(at.x, at.y);
-    pen.globalAlpha = isOld ? 0.45 : 1;
     pen.beginPath();
     if (typeof vehicle.heading === "number") {
       pen.rotate(vehicle.heading * Math.PI / 180);
       [[0, -15], [10, 11], [0, 6], [-10, 11]].forEach(([x, y], index) => (index ? pen.lineTo(x, y) : pen.moveTo(x, y)));
       pen.closePath();
     } else pen.arc(0, 0, 8, 0, 7);
-    pen.fillStyle = colourOf(vehicle.id);
+    pen.fillStyle = isOld ? colour("map") : colourOf(vehicle.id); // hollow: the last known position
     pen.fill();
-    pen.lineWidth = isSelected ? 2.5 : 1;
-    pen.strokeStyle = isSelected ? "#fff" : "#04202f";
+    pen.lineWidth = isOld || isSelected ? 2.5 : 1;
+    pen.strokeStyle = isOld ? colourOf(vehicle.id) : colour(isSelected ? "text" : "map");
     pen.stroke();
     pen.restore();
-    this.label(vehicle.label, at.x + 18, at.y - 14, isOld ? "#ffb84d" : "#e8eef6");
+    this.take(at, 14);
   }
 
-  label(text, x, y, colour) {
-    const pen = this.context;
+  // The longest label that has room next to the vehicle.
+  label(vehicle) {
+    const at = this.place(vehicle.position), pen = this.context;
     pen.font = "600 12px system-ui, 'DejaVu Sans', sans-serif";
-    const wide = pen.measureText(text).width + 12;
-    const left = Math.min(x, this.width - wide - 4);
-    pen.fillStyle = "#0c1118cc";
-    pen.fillRect(left - 6, y - 13, wide, 18);
-    this.text(text, left, y, colour, "600 12px");
+    for (const text of vehicle.labels) {
+      const wide = pen.measureText(text).width + 12, left = at.x - wide - 16, middle = at.x - wide / 2;
+      const corners = [[at.x + 16, at.y - 24], [at.x + 16, at.y + 6], [left, at.y - 24], [left, at.y + 6], [middle, at.y - 38], [middle, at.y + 20]];
+      const box = corners.map(([x, y]) => [x, y, x + wide, y + 18]).find((each) => this.isFree(each));
+      if (!box) continue;
+      pen.fillStyle = colour("label");
+      pen.fillRect(box[0], box[1], wide, 18);
+      this.text(text, box[0] + 6, box[1] + 13, colour(vehicle.age <= MAX_AGE_S ? "text" : "warn"), "600 12px");
+      this.taken.push(box);
+      return;
+    }
+  }
+
+  isFree([left, top, right, bottom]) {
+    return left >= 2 && top >= 2 && right <= this.width - 2 && bottom <= this.height - 2
+      && this.taken.every((each) => right < each[0] || left > each[2] || bottom < each[1] || top > each[3]);
   }
 
   drawScale() {
     const step = this.step(), long = step * this.scale, y = this.height - 14;
     this.context.lineWidth = 2;
-    this.line([{ x: 14, y: y - 5 }, { x: 14, y }, { x: 14 + long, y }, { x: 14 + long, y: y - 5 }], "#c9d6e6");
-    this.text(step >= 1000 ? `${step / 1000} km` : `${+step.toPrecision(2)} m`, 14 + long / 2, y - 6, "#c9d6e6", "12px", "center");
-    this.text("N ↑", 14, 22, "#8fa0b5", "bold 12px");
+    this.line([{ x: 14, y: y - 5 }, { x: 14, y }, { x: 14 + long, y }, { x: 14 + long, y: y - 5 }], colour("plan"));
+    this.text(step >= 1000 ? `${step / 1000} km` : `${+step.toPrecision(2)} m`, 14 + long / 2, y - 6, colour("text"), "12px", "center");
+    this.text("N ↑", 14, 22, colour("dim"), "bold 12px");
   }
 
   drawTiles() {

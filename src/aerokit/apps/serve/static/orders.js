@@ -1,6 +1,8 @@
 // Orders: buttons, and the confirmation dialog that names vehicle and order. Every order needs it, and is sent once.
 
-import { byId, element } from "./dom.js";
+import { byId, element, show } from "./dom.js";
+import { aboutParameter } from "./panels.js";
+import { inWords, obstacle } from "./readiness.js";
 import { ask, hasToken, newKey, Refusal, useToken } from "./server.js";
 
 // name, text of the button, text of the dialog, fields [name, label, value, step], class of the button
@@ -27,7 +29,7 @@ export class Orders {
       if (!each) { box.append(element("span", { class: "gap" })); continue; }
       const [name, title, text, fields, kind] = each;
       const clicked = () => (name === "pick" ? page.pick() : this.confirm({ order: name, title, text, fields }));
-      const button = element("button", { type: "button", class: kind, onclick: clicked }, title);
+      const button = element("button", { type: "button", class: kind, onclick: clicked }, element("span", {}, title), element("small", {}));
       button.dataset.order = name;
       this.buttons.push(button);
       box.append(button);
@@ -39,8 +41,36 @@ export class Orders {
     box.append(this.modes);
   }
 
-  enable(isPossible) {
-    for (const each of this.buttons) if (each.disabled === isPossible) each.disabled = !isPossible;
+  // Disables what cannot work now, with the reason below the title.
+  enable(vehicle, page) {
+    for (const button of this.buttons) {
+      const name = button.dataset.order ?? "mode", why = obstacle(name === "pick" ? "go_to" : name, vehicle, page);
+      if (button.disabled !== Boolean(why)) button.disabled = Boolean(why);
+      if (button.title !== why) button.title = why;
+      if (button !== this.modes) show(button.children[1], why);
+    }
+  }
+
+  async upload(file) {
+    const vehicle = this.page.vehicle();
+    if (!vehicle) return;
+    try {
+      const plan = JSON.parse(await file.text());
+      const count = plan.mission.items.length, fence = plan.geoFence ?? {};
+      const areas = (fence.polygons ?? []).length + (fence.circles ?? []).length, rally = (plan.rallyPoints?.points ?? []).length;
+      const parts = [[count, "mission items"], [areas, "fence areas"], [rally, "rally points"]];
+      const replaced = parts.filter(([each]) => each).map(([each, what]) => `${each} ${each === 1 ? what.slice(0, -1) : what}`);
+      this.confirm({
+        order: "mission/upload", title: "Upload", fields: [], fixed: { name: file.name, plan },
+        text: `get ${replaced.join(", ") || "nothing"} from ${file.name}, instead of those it has`,
+        about: [
+          vehicle.states.armed?.value ? "The vehicle is armed." : "",
+          areas && rally ? "" : "What the file does not contain (fence, rally points) stays as it is.",
+        ].filter(Boolean),
+      });
+    } catch {
+      this.page.toast(`${file.name} is not a .plan file of QGroundControl.`, "failed");
+    }
   }
 
   showModes(names) {
@@ -63,7 +93,7 @@ export class Orders {
 
   setParameter(id, parameter) {
     this.confirm({
-      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value}`,
+      vehicle: id, title: `Set ${parameter.name}`, text: `set ${parameter.name}, currently ${parameter.value} ${parameter.unit ?? ""}`.trim(), about: aboutParameter(parameter),
       fields: [["value", "New value", parameter.value, "any"]], order: "parameter", parameter: parameter.name,
     });
   }
@@ -91,9 +121,10 @@ export class Orders {
     dialog.replaceChildren(element("form", { onsubmit: give },
       element("h2", {}, `${wanted.title}?`),
       element("p", {}, element("span", { class: "target" }, `Vehicle ${id}`), ` (${vehicle.firmware}) will ${wanted.text}.`),
+      ...(wanted.about ?? []).map((line) => element("p", { class: "detail" }, line)),
       ...inputs.map(([, , label]) => label),
       token ? element("label", {}, "Token", token) : null,
-      element("div", { class: "buttons" }, cancel, element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.toLowerCase()} · vehicle ${id}`))));
+      element("div", { class: "buttons" }, cancel, element("button", { type: "submit", class: "yes" }, `Yes, ${wanted.title.charAt(0).toLowerCase()}${wanted.title.slice(1)} · vehicle ${id}`))));
     if (dialog.open) dialog.close();
     dialog.showModal();
     (inputs.length ? inputs[0][1] : token ?? cancel).focus();
@@ -112,7 +143,7 @@ export class Orders {
       if (error instanceof Refusal) {
         if (error.problem.status === 401) useToken("");
         if (error.problem.order) this.page.record(error.problem.order);
-        else this.page.toast(`${what}: ${error.message}`, "failed");
+        else this.page.toast(`${what}: ${inWords(error.problem)}`, "failed");
       } else this.page.toast(`${what}: the server did not answer, so it is unknown whether the order was sent. Check the tab Orders.`, "failed");
     }
   }

@@ -1,17 +1,39 @@
 // The panels: mission, parameters, texts and events, orders.
 
-import { clock, element, number, show, UNKNOWN, unitOf } from "./dom.js";
+import { clock, element, number, SEVERITIES, show, spelled, UNKNOWN, unitOf } from "./dom.js";
+import { inWords } from "./readiness.js";
 import { ask } from "./server.js";
 
 export class MissionPanel {
-  constructor(changed) {
+  // upload: called with a File
+  constructor(changed, upload) {
     this.changed = changed;
     this.missions = new Map();
+    this.fences = new Map();
     this.counts = new Map();
     this.body = element("tbody", {});
     this.note = element("span", { class: "note" });
     const load = element("button", { type: "button", onclick: () => this.load(this.vehicle, true) }, "Read from vehicle");
-    this.node = element("div", {}, element("div", { class: "bar" }, load, this.note), element("table", {}, this.body));
+    const file = element("input", { type: "file", accept: ".plan,.json", hidden: true, onchange: () => { if (file.files[0]) upload(file.files[0]); file.value = ""; } });
+    const choose = element("button", { type: "button", onclick: () => file.click() }, "Upload a .plan …");
+    this.node = element("div", {}, element("div", { class: "bar" }, choose, load, file), this.note,
+      element("p", { class: "note" }, "You can also drop a .plan file of QGroundControl anywhere on this page."), element("table", {}, this.body));
+  }
+
+  // {polygons, circles, rally} of a vehicle
+  fence(id) { return this.fences.get(id) || { polygons: [], circles: [], rally: [] }; }
+
+  async loadFence(id, query) {
+    const read = (what) => ask("GET", `api/vehicles/${id}/${what}${query}`).catch(() => ({ polygons: [], circles: [], items: [] }));
+    const fence = await read("fence"), rally = await read("rally");
+    this.fences.set(id, { ...fence, rally: rally.items.map((each) => each.position).filter(Boolean) });
+    this.changed();
+  }
+
+  // Reads the mission again from the server, which reads it from the vehicle if it has changed.
+  reload(id) {
+    this.missions.delete(id);
+    this.load(id);
   }
 
   items(id) { return (this.missions.get(id) || { items: [] }).items; }
@@ -19,8 +41,9 @@ export class MissionPanel {
   async load(id, refresh = false) {
     if (id === undefined || (!refresh && this.missions.has(id))) return;
     this.missions.set(id, { items: [], note: "reading …" });
+    const query = refresh ? "?refresh=true" : "";
     try {
-      const found = await ask("GET", `api/vehicles/${id}/mission${refresh ? "?refresh=true" : ""}`);
+      const found = await ask("GET", `api/vehicles/${id}/mission${query}`);
       const what = found.items.length ? `${found.items.length} items` : "the vehicle has no mission";
       this.missions.set(id, { items: found.items, note: `${what}, read at ${clock(Date.now() / 1000 - found.age_s)}`, isRead: true });
     } catch (error) {
@@ -28,6 +51,7 @@ export class MissionPanel {
     }
     this.drawn = undefined;
     this.changed();
+    await this.loadFence(id, query);
   }
 
   // Reads the mission again, once, when the vehicle reports another number of items.
@@ -35,8 +59,7 @@ export class MissionPanel {
     const id = vehicle.system_id, count = vehicle.mission_items ?? null;
     if (!mission.isRead || count === null || count === mission.items.length || this.counts.get(id) === count) return;
     this.counts.set(id, count);
-    this.missions.delete(id);
-    this.load(id);
+    this.reload(id);
   }
 
   show(vehicle) {
@@ -51,7 +74,7 @@ export class MissionPanel {
     this.body.replaceChildren(...mission.items.map((item) => {
       const place = item.position ? `${item.position.latitude_deg.toFixed(6)}, ${item.position.longitude_deg.toFixed(6)}` : "";
       const height = item.position || item.z ? number(item.z, 1, "m") : "";
-      const name = item.name.replace(/^(NAV|DO)_/, "").replaceAll("_", " ").toLowerCase();
+      const name = spelled(item.name.replace(/^(NAV|DO)_/, ""));
       return element("tr", item.index === current ? { class: "current" } : {},
         element("td", { class: "number" }, String(item.index)), element("td", {}, name),
         element("td", { class: "name" }, place), element("td", { class: "number" }, height));
@@ -62,18 +85,16 @@ export class MissionPanel {
 // Numbered like the mission. The state mission_current counts home too, if the autopilot does.
 export const currentItem = (vehicle) => vehicle.mission_item ?? null;
 
-const MAX_SHOWN = 400;
-
 export class ParameterPanel {
   constructor(setParameter) {
     this.setParameter = setParameter;
     this.tables = new Map();
     this.body = element("tbody", {});
-    this.note = element("span", { class: "note" });
-    this.search = element("input", { type: "search", placeholder: "search …", autocomplete: "off", spellcheck: false, oninput: () => this.draw() });
+    this.note = element("p", { class: "note" });
+    this.search = element("input", { type: "search", placeholder: "Search names and descriptions …", autocomplete: "off", spellcheck: false, oninput: () => this.filter() });
     this.search.setAttribute("aria-label", "Search parameters");
     const load = element("button", { type: "button", onclick: () => this.load(this.vehicle, true) }, "Read");
-    this.node = element("div", {}, element("div", { class: "bar" }, this.search, load), this.note, element("table", {}, this.body));
+    this.node = element("div", {}, element("div", { class: "bar" }, this.search, load), this.note, element("table", { class: "parameters" }, this.body));
   }
 
   async load(id, refresh = false) {
@@ -91,7 +112,7 @@ export class ParameterPanel {
 
   changed(id, name, value) {
     const row = (this.tables.get(id) || { rows: [] }).rows.find((each) => each.name === name);
-    if (row) row.value = value;
+    if (row) Object.assign(row, { value, meaning: undefined }); // the server has the meaning of the value that it sent
     if (row && id === this.vehicle) this.draw();
   }
 
@@ -104,21 +125,56 @@ export class ParameterPanel {
 
   draw() {
     const table = this.tables.get(this.vehicle) || { rows: [], note: "" };
-    const wanted = this.search.value.trim().toUpperCase();
-    const found = table.rows.filter((each) => each.name.toUpperCase().includes(wanted));
-    show(this.note, table.note ?? `${found.length} of ${table.rows.length}${found.length > MAX_SHOWN ? `, showing the first ${MAX_SHOWN}` : ""}`);
-    this.body.replaceChildren(...found.slice(0, MAX_SHOWN).map((each) => {
-      const differs = each.default !== null && each.default !== each.value;
-      return element("tr", { class: "clickable", title: "set …", onclick: () => this.setParameter(this.vehicle, each) },
-        element("td", {}, each.name),
-        element("td", { class: "number" }, each.value === null ? UNKNOWN : String(+each.value.toPrecision(7))),
-        element("td", { class: "age" }, differs ? `default ${+each.default.toPrecision(7)}` : ""));
-    }));
+    this.rows = table.rows.map((each) => {
+      const about = each.short_description || each.description;
+      const name = element("button", { type: "button", class: "link", title: "Set …" }, each.name);
+      const facts = [changedFrom(each), range(each)].filter(Boolean).join(" · ");
+      const node = element("tr", { class: "clickable", onclick: () => this.setParameter(this.vehicle, each) },
+        element("td", {}, name, about ? element("div", { class: "detail" }, about) : null),
+        element("td", { class: "number" }, withUnit(each, each.value), element("div", { class: "detail" }, meaning(each) || facts, meaning(each) && facts ? ` · ${facts}` : "")));
+      return { node, text: `${each.name} ${about ?? ""} ${each.description ?? ""}`.toUpperCase() };
+    });
+    this.body.replaceChildren(...this.rows.map((each) => each.node));
+    this.filter();
+  }
+
+  filter() {
+    const words = this.search.value.trim().toUpperCase().split(/\s+/);
+    let count = 0;
+    for (const { node, text } of this.rows) {
+      node.hidden = !words.every((word) => text.includes(word));
+      count += !node.hidden;
+    }
+    const note = (this.tables.get(this.vehicle) || {}).note;
+    show(this.note, note ?? `${count} of ${this.rows.length} parameters`);
   }
 }
 
+const short = (value) => (value === null || value === undefined ? UNKNOWN : String(+value.toPrecision(7)));
+const withUnit = (each, value) => `${short(value)}${each.unit ? ` ${each.unit}` : ""}`;
+const meaning = (each) => (each.meaning && each.meaning !== withUnit(each, each.value) ? each.meaning : "");
+const isKnown = (value) => value !== null && value !== undefined;
+
+function changedFrom(each) {
+  return isKnown(each.default) && each.default !== each.value ? `default ${short(each.default)}` : "";
+}
+
+function range(each) {
+  if (!isKnown(each.minimum) && !isKnown(each.maximum)) return "";
+  return `${isKnown(each.minimum) ? short(each.minimum) : ""} … ${isKnown(each.maximum) ? short(each.maximum) : ""}`;
+}
+
+// What is known about a parameter, one line each, for the dialog that sets it.
+export function aboutParameter(each) {
+  return [
+    each.description || each.short_description,
+    range(each) ? `Recommended: ${range(each)} ${each.unit ?? ""}` : "",
+    isKnown(each.default) ? `Default: ${withUnit(each, each.default)}` : "",
+    each.reboot_required ? "Takes effect after a reboot." : "",
+  ].filter(Boolean);
+}
+
 const MAX_TEXTS = 300;
-const SEVERITIES = ["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"];
 
 export class TextPanel {
   constructor() {
@@ -130,16 +186,21 @@ export class TextPanel {
   add(event) {
     if (this.numbers.has(event.number)) return;
     this.numbers.add(event.number);
+    this.drawn = undefined;
+    const last = this.entries.at(-1);
+    if (event.event === "StreamSlow" && last?.event === "StreamSlow" && last.system_id === event.system_id) {
+      if (!last.message.includes(event.message)) last.message += `, ${event.message}`;
+      return;
+    }
     this.entries.push(event);
     if (this.entries.length > MAX_TEXTS) this.numbers.delete(this.entries.shift().number);
-    this.drawn = undefined;
   }
 
   show(vehicle) {
     const id = vehicle ? vehicle.system_id : 0;
     if (this.drawn === id) return;
     this.drawn = id;
-    const shown = this.entries.filter((each) => each.system_id === 0 || each.system_id === id).reverse();
+    const shown = this.entries.filter((each) => (each.system_id === 0 || each.system_id === id) && describe(each)).reverse();
     this.node.replaceChildren(...shown.map((each) => {
       const severity = each.event === "StatusTextReceived" ? each.severity : 8;
       const kind = severity <= 3 ? "severe" : severity === 4 ? "warning" : severity === 8 ? "note" : "";
@@ -150,8 +211,32 @@ export class TextPanel {
   }
 }
 
+const seconds = (value) => `${number(value, value < 10 ? 1 : 0)} s`;
+const LANDED = { ON_GROUND: "On the ground", IN_AIR: "In the air", TAKEOFF: "Taking off", LANDING: "Landing" };
+
+// Sentences for events; others list their fields.
+const EVENT_TEXTS = {
+  StatusTextReceived: (e) => e.text,
+  ArmedChanged: (e) => (e.is_armed ? "Armed" : "Disarmed"),
+  ModeChanged: (e) => (e.before === null ? `Mode ${e.after}` : `Mode ${e.before} → ${e.after}`),
+  LandedStateChanged: (e) => LANDED[e.after] ?? "Unknown whether it has landed",
+  LinkStateChanged: (e) => (e.after === "LOST" ? "Link lost" : ""), // VehicleSilent and VehicleRecovered say the rest
+  VehicleFound: () => "Vehicle found",
+  VehicleSilent: (e) => `Link silent for ${seconds(e.silent_for_s)}`,
+  VehicleRecovered: (e) => `Link is back after ${seconds(e.silent_for_s)}`,
+  VehicleRebooted: () => "The vehicle has rebooted",
+  MissionItemReached: (e) => `Reached item ${e.item} of its mission`,
+  MissionCurrentChanged: (e) => (e.after === null ? "No current mission item" : `Flies to item ${e.after} of its mission`),
+  MissionFinished: () => "Mission finished",
+  ParameterChanged: (e) => `${e.name} changed from ${short(e.before)} to ${short(e.after)}`,
+  StreamSlow: (e) => `Arrives at less than half the requested rate: ${e.message}`,
+  LoopBlocked: (e) => `The server was busy for ${seconds(e.seconds)}`,
+  StreamUnavailable: (e) => `The vehicle does not send ${e.message}: ${e.reason}`,
+  DuplicateSender: () => "Another sender uses the same system id; it is ignored",
+};
+
 function describe(event) {
-  if (event.event === "StatusTextReceived") return event.text;
+  if (EVENT_TEXTS[event.event]) return EVENT_TEXTS[event.event](event);
   const hidden = new Set(["type", "event", "number", "at", "system_id", "time_unix_s", "missed"]);
   if ("after" in event) hidden.add("before");
   const fields = Object.entries(event).filter(([name]) => !hidden.has(name)).map(([name, value]) => eventField(event, name, value));
@@ -191,7 +276,7 @@ export class OrderPanel {
     this.node.replaceChildren(...shown.map((each) => element("div", { class: "text" },
       element("time", {}, clock(each.given_unix_s)),
       element("span", {}, `vehicle ${each.system_id}: ${orderText(each)}: `, element("b", { class: each.state }, each.state),
-        each.problem ? element("div", { class: "detail" }, each.problem.detail) : null))));
+        each.problem ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
     if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
 }
@@ -200,11 +285,12 @@ export class OrderPanel {
 const ORDER_TEXTS = {
   take_off: ({ altitude_m }) => ` to ${+altitude_m.toFixed(2)} m`,
   mode: ({ mode }) => ` ${mode}`,
+  "mission/upload": ({ name, mission_items }) => ` ${name} (${mission_items} items)`,
   set_parameter: ({ name, value }) => ` ${name} to ${+value.toPrecision(7)}`,
 };
 
 export function orderText(record) {
-  const name = record.order.replace(/[_/]/g, " ").replace("set parameter", "set"), text = ORDER_TEXTS[record.order];
+  const name = record.order.replace("mission/upload", "upload").replace(/[_/]/g, " ").replace("set parameter", "set"), text = ORDER_TEXTS[record.order];
   if (text) return name + text(record.arguments);
   const given = Object.entries(record.arguments).map(([each, value]) => {
     const { label, unit } = unitOf(each);

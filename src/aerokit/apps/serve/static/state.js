@@ -1,6 +1,6 @@
 // State of a vehicle, with ages: the main values, and a table of all states.
 
-import { age, element, number, show, staleness, UNKNOWN, unitOf } from "./dom.js";
+import { age, element, number, SEVERITIES, show, spelled, staleness, UNKNOWN, unitOf } from "./dom.js";
 
 const UNREPEATABLE_COMMANDS = new Set(["home", "origin", "version", "capabilities", "status_text", "mission_reached", "mission_current"]);
 
@@ -36,7 +36,7 @@ function satellites(value) {
 export class BigValues {
   constructor(list) {
     this.cells = BIG.map(([title]) => {
-      const cell = element("dd", { class: "unknown" }, UNKNOWN);
+      const cell = element("dd", { class: "unknown" }, element("span", {}, UNKNOWN), element("small", {}));
       list.append(element("div", {}, element("dt", {}, title), cell));
       return cell;
     });
@@ -49,7 +49,9 @@ export class BigValues {
       const shown = known ? text(entry.value) : UNKNOWN;
       const old = ageOf(entry, receivedAt);
       const kind = shown === UNKNOWN ? "unknown" : staleness(old) || (shown === "ARMED" ? "armed" : "");
-      show(this.cells[index], kind.includes("old") ? `${shown} (${age(old)})` : shown, kind);
+      this.cells[index].className = kind;
+      show(this.cells[index].children[0], shown);
+      show(this.cells[index].children[1], kind === "old" ? `${age(old)} old` : "");
       this.cells[index].title = known ? `received ${age(old)} ago` : "unknown";
     });
   }
@@ -73,8 +75,8 @@ export class StateTable {
     }
     if (!vehicle) return;
     const { link } = vehicle, total = link.frames_received + link.frames_lost;
-    const lost = total ? `${(100 * link.frames_lost / total).toFixed(1)} % lost` : UNKNOWN;
-    show(this.link, `${vehicle.autopilot} ${vehicle.firmware} · link ${link.state ?? UNKNOWN} · ${link.frames_received} frames, ${lost}`);
+    const lost = total ? `${(100 * link.frames_lost / total).toFixed(1)} % of ${total} frames lost` : "";
+    show(this.link, `${vehicle.firmware} · link ${link.state ?? UNKNOWN} · ${lost}`);
     for (const [name, entry] of Object.entries(vehicle.states)) this.row(name, entry, receivedAt);
   }
 
@@ -86,23 +88,54 @@ export class StateTable {
       this.body.append(element("tr", {}, ...cells));
     }
     const old = ageOf(entry, receivedAt), kind = UNREPEATABLE_COMMANDS.has(name) ? "" : staleness(old);
-    show(cells[1], plain(entry.value, unitOf(name)), `value ${kind}`);
-    show(cells[2], age(old), `age ${kind === "very-old" ? "old" : kind}`);
+    show(cells[1], inWords(name, entry.value), "value");
+    show(cells[2], age(old), `age ${kind}`);
   }
 }
 
-const RAW = new Set(["custom_mode", "base_mode"]); // redundant: the mode name is shown
+// Names of bits by state, from the server.
+export const bitNames = {};
+// Redundant: other fields have it in words.
+const RAW = new Set(["custom_mode", "base_mode", "present", "enabled", "capabilities", "number", "message", "at"]);
+
+// Names of the bits of a value; bits without a name are numbered.
+function bits(table, value) {
+  const names = [];
+  for (let bit = 0; bit < 32; bit++) {
+    const mask = 2 ** bit;
+    if (Math.floor(value / mask) % 2) names.push(table?.[mask] ? spelled(table[mask].replace(/^MAV_SYS_STATUS_/, "")) : `bit ${bit}`);
+  }
+  return names.join(", ") || "none";
+}
+
+function inWords(state, value) {
+  if (state === "mode" && value) return value.name;
+  if (state === "sensors" && value) return plain({ ...value, healthy: bits(bitNames.sensors, value.enabled & value.healthy) });
+  if (state === "power" && value) return plain({ ...value, flags: bits(bitNames.power, value.flags) });
+  if (state === "estimator" && value) return plain({ ...value, flags: bits(bitNames[value.message], value.flags) });
+  if (state === "status_text" && value) return `${SEVERITIES[value.severity] ?? "text"}: ${value.text}`;
+  if (state === "system_time" && value?.unix_s) return `${new Date(value.unix_s * 1000).toISOString().slice(0, 19)} UTC · ${number(value.since_boot_s, 0, "s")} since boot`;
+  if (state === "mission_current" && value?.state === "NO_MISSION") return "no mission";
+  return plain(value, unitOf(state));
+}
 
 function plain(value, { unit, digits } = { unit: "" }) {
   if (value === null || value === undefined) return UNKNOWN;
   if (typeof value === "number") return measured(value, unit, digits);
-  if (Array.isArray(value)) return value.length ? value.map((each) => plain(each, { unit, digits })).join(", ") : UNKNOWN;
+  if (Array.isArray(value)) return list(value, { unit, digits });
   if (typeof value === "object") {
-    const shown = Object.entries(value).filter(([name]) => !RAW.has(name));
-    if (shown.length === 1 && shown[0][0] === "name") return String(shown[0][1]);
+    const shown = Object.entries(value).filter(([name, each]) => each !== null && !RAW.has(name));
     return shown.map(([name, each]) => `${unitOf(name).label} ${plain(each, unitOf(name))}`).join(" · ");
   }
-  return typeof value === "boolean" ? (value ? "yes" : "no") : String(value);
+  if (typeof value === "boolean") return value ? "yes" : "no";
+  return /^[A-Z][A-Z0-9]*(_[A-Z0-9]+)*$/.test(value) ? spelled(value) : String(value);
+}
+
+function list(values, { unit, digits }) {
+  if (!values.length) return "none";
+  const isNumeric = values.every((each) => typeof each === "number");
+  const text = values.map((each) => plain(each, { unit: isNumeric ? "" : unit, digits })).join(", ");
+  return isNumeric && unit ? `${text} ${unit}` : text;
 }
 
 function measured(value, unit, digits) {

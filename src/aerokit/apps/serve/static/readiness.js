@@ -1,0 +1,111 @@
+// Readiness and silence in words: what a vehicle lacks, which orders cannot work now and why, and lost vehicles.
+
+import { age, clock, element, number, show } from "./dom.js";
+import { ageOf } from "./state.js";
+
+// Orders that the server also tries on a silent vehicle.
+const SAFE_ORDERS = new Set(["disarm", "hold", "land", "return_to_launch", "mission/pause"]);
+// MAV_TYPE: ground rover, boat, submarine.
+const SURFACE_TYPES = new Set([10, 11, 12]);
+const FLYING = new Set(["IN_AIR", "TAKEOFF", "LANDING"]);
+const MAX_REASONS = 4;
+// What the page calls the library's actions.
+const TITLES = {
+  arm: "Arm", take_off: "Take off", go_to: "Go to …", hold: "Hold", land: "Land", return_to_launch: "Return", disarm: "Disarm",
+  start: "Start mission", pause: "Pause", resume: "Resume", upload: "Upload a .plan …", set_mode: "Mode …",
+};
+
+const valueOf = (vehicle, name) => (vehicle.states[name] || {}).value;
+const MAX_LANDED_AGE_S = 3; // an older state must not keep anyone from landing or disarming
+const landedState = (vehicle) => (vehicle.states.landed_state?.age_s < MAX_LANDED_AGE_S ? valueOf(vehicle, "landed_state") : undefined);
+export const isConnected = (vehicle) => vehicle.link.state === "connected";
+
+// The reason why an order cannot work now, as an instruction where there is one; "" if it may work.
+export function obstacle(order, vehicle, page) {
+  if (!page.isOpen) return "No connection";
+  if (page.isReadOnly) return "Read-only";
+  if (!vehicle) return "No vehicle";
+  if (!isConnected(vehicle)) return SAFE_ORDERS.has(order) ? "" : "Silent";
+  const isArmed = valueOf(vehicle, "armed"), landed = landedState(vehicle);
+  const isOnGround = landed === "ON_GROUND", isFlying = FLYING.has(landed);
+  const mission = valueOf(vehicle, "mission_current"), isSurface = SURFACE_TYPES.has(vehicle.vehicle_type);
+  switch (order) {
+    case "arm":
+      if (isArmed) return "Armed";
+      return vehicle.missing_for_flight.length && valueOf(vehicle, "sensors")?.prearm_checks_pass === false ? "Not ready" : "";
+    case "disarm": return isArmed === false ? "Disarmed" : landed === "IN_AIR" ? "Land first" : "";
+    case "take_off": return isSurface ? "Does not fly" : isArmed === false ? "Arm first" : isFlying ? "Flying" : "";
+    case "go_to": return isArmed === false ? "Arm first" : isOnGround && !isSurface ? "Take off first" : "";
+    case "hold": case "land": case "return_to_launch": return isArmed === false && isOnGround ? "Not flying" : "";
+    case "mission/start": case "mission/resume":
+      return vehicle.mission_items === 0 ? "No mission" : isArmed === false ? "Arm first" : "";
+    case "mission/pause": return isArmed === false || mission?.state === "NO_MISSION" ? "None runs" : "";
+    default: return "";
+  }
+}
+
+// An error of the library for a person: without names of functions and messages.
+export function inWords(problem) {
+  const text = problem.detail
+    .replace(/^(?:[a-z]+\.)?([a-z_]+)(?:\(\))?: /, (prefix, name) => (name in TITLES ? "" : prefix))
+    .replace(/MAV_CMD_\w+ was refused: (\w+)/g, (_, result) => `The vehicle refused (${result.toLowerCase().replaceAll("_", " ")})`)
+    .replace(/\b([a-z_]+)\(\)/g, (_, name) => `“${TITLES[name] ?? name.replaceAll("_", " ")}”`);
+  return capitalized(text);
+}
+
+const capitalized = (text) => text.replace(/^[a-z](?=[a-z]* )/, (letter) => letter.toUpperCase()); // not file names
+
+// [class of the light, title, reasons]
+function readiness(vehicle, page, heartbeatAge) {
+  if (!vehicle) return ["unknown", "No vehicle yet", []];
+  if (!page.isOpen) return ["unknown", "Readiness unknown", ["No connection to the server"]];
+  if (!isConnected(vehicle)) return ["bad", `No contact for ${age(heartbeatAge)}`, []];
+  const missing = vehicle.missing_for_flight, landed = landedState(vehicle);
+  if (valueOf(vehicle, "armed")) {
+    const title = landed === "ON_GROUND" ? "Armed: propellers may turn" : FLYING.has(landed) ? "Flying" : "Armed";
+    return [missing.length || landed === "ON_GROUND" ? "warn" : "good", title, missing];
+  }
+  return missing.length ? ["warn", "Not ready", missing] : ["good", "Ready to arm", []];
+}
+
+export function showReadiness(box, vehicle, page) {
+  const [kind, title, reasons] = readiness(vehicle, page, vehicle && heartbeatAge(vehicle, page));
+  const drawn = [kind, title, ...reasons].join("\n");
+  if (box.dataset.drawn === drawn) return;
+  box.dataset.drawn = drawn;
+  const shown = reasons.slice(0, MAX_REASONS).map((reason) => element("li", {}, capitalized(reason.replace(/ \([A-Z_]+\)$/, ""))));
+  if (reasons.length > MAX_REASONS) shown.push(element("li", {}, `and ${reasons.length - MAX_REASONS} more`));
+  box.className = kind;
+  box.replaceChildren(element("span", { class: "light" }), element("strong", {}, title), element("ul", {}, ...shown));
+}
+
+const heartbeatAge = (vehicle, page) => ageOf({ age_s: vehicle.link.heartbeat_age_s }, page.receivedAt);
+
+// One banner for each vehicle without contact: since when, where it was, and what its failsafe does.
+export function showSilences(box, page) {
+  const lost = page.isOpen ? [...page.vehicles.values()].filter((each) => !isConnected(each)) : [];
+  const ids = lost.map((each) => each.system_id).join();
+  if (box.dataset.ids !== ids) {
+    box.dataset.ids = ids;
+    box.replaceChildren(...lost.map(() => element("div", { class: "silence" },
+      element("strong", { role: "alert" }), element("span", {}), element("span", {}))));
+  }
+  lost.forEach((vehicle, index) => {
+    const [title, place, failsafe] = box.children[index].children, silence = heartbeatAge(vehicle, page);
+    const since = silence === undefined ? "" : ` since ${clock(Math.round(Date.now() / 1000 - silence))}`;
+    show(title, `Vehicle ${vehicle.system_id} is silent${since}`);
+    show(place, `${silence === undefined ? "" : `For ${age(silence)}. `}${lastPosition(vehicle, page)}`);
+    show(failsafe, failsafeText(vehicle.failsafe));
+  });
+}
+
+function lastPosition(vehicle, page) {
+  const entry = vehicle.states.position;
+  if (!entry) return "Its position is unknown.";
+  const { latitude_deg, longitude_deg, altitude_relative_m } = entry.value;
+  const height = typeof altitude_relative_m === "number" ? `, ${number(altitude_relative_m, 1, "m")} above home` : "";
+  return `Last position, ${age(ageOf(entry, page.receivedAt))} old: ${number(latitude_deg, 6)}, ${number(longitude_deg, 6)}${height}.`;
+}
+
+const failsafeText = ({ action, because }) =>
+  action ? `If it lost its ground station too, it ${action} (${because}).` : "What its failsafe does is unknown.";
